@@ -18,7 +18,8 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.judgement.conclusion import named_effects
-from discrepancy.sources.measured_rigs import SIGNAL, write_rig_campaign
+from discrepancy.sources.measured_rigs import write_rig_campaign
+from discrepancy.sources.real_wing import SIGNAL
 from discrepancy.system.structures import WingModel
 from discrepancy.workflow import Investigation, investigate
 

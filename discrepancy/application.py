@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from calibration.result.file import load_calibration, tailoring
-from discrepancy.errors import SENTENCES, DiscrepancyError, ModelError, said
+from discrepancy.errors import DiscrepancyError, ModelError
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, read_residuals
 from discrepancy.model_choice import ModelChoice, ModelKind, model_of
@@ -57,139 +57,243 @@ def apply_verdict(
     replace: bool = False,
     progress: Progress | None = None,
 ) -> Applied:
-    """Write the model of a verdict with the effects that were found and the parameters beside them.
+    """Write the model of a verdict with the effects that were found, and its parameters.
 
     Parameters
     ----------
     verdict : path
         Folder of a verdict, or its `verdict.json`.
     out : path, optional
-        The file: .json, a patch beside the model's file, which is a model itself wherever one is asked for;
-        .toml, a lumped model whose file says it by `[[law]]`; .fmu, a wing with the effects switched on.
-        By default MODEL_patched in the working folder, .toml where that can say it.
+        The file: .json, a patch beside the model's file, which is a model itself wherever one is
+        asked for; .toml, a lumped model whose file says it by `[[law]]`; .fmu, a wing with the
+        effects switched on. By default MODEL_patched in the working folder, .toml where that can
+        say it.
     member : str, optional
-        Of a group: which of `Verdict.group`; the first if left out.
+        Member of a group, one of `Verdict.group`; the first by default.
     replace : bool
-        Whether an existing file may be replaced.
+        True if an existing file may be replaced.
     progress : Progress, optional
         Where the modelling of a wing reports.
 
     Returns
     -------
     Applied
-        The file, and what to say of it.
+        The file, and what to say about it.
 
     Raises
     ------
     DiscrepancyError
-        If the verdict gives nothing to apply, its model has changed or is gone, or the file cannot say it.
+        If the verdict gives nothing to apply, its model has changed or is gone, or the file cannot
+        say it.
     fmu_asset.errors.PatchFileError
         If an FMU cannot carry an effect.
     FileNotWrittenError
         If the file exists, or cannot be written.
     """
-    file = Path(verdict)
-    if file.suffix != ".json":
-        restore_folder(file)
-        file = file / files.VERDICT_NAME
-    stored = files.read_verdict_file(file)
-    found = _found(stored, file, member)
-    choice = model_of(stored.origin, file, progress)
-    patch = changed(found, origin=stored.origin).upon(choice.built_in)
-    plain = choice.kind is ModelKind.LUMPED and all(
-        isinstance(item, PortForce) and not item.windows for item in patch.patch
+    verdict_file = Path(verdict)
+    if verdict_file.suffix != ".json":
+        restore_folder(verdict_file)
+        verdict_file = verdict_file / files.VERDICT_NAME
+    stored = files.read_verdict_file(verdict_file)
+    applied_patch = _patch_to_apply(stored, verdict_file, member)
+    choice = model_of(stored.origin, verdict_file, progress)
+    patch = changed(applied_patch, origin=stored.origin).upon(choice.built_in)
+    has_laws_only = choice.kind is ModelKind.LUMPED and all(
+        isinstance(primitive, PortForce) and not primitive.windows for primitive in patch.patch
     )
-    stem = Path(choice.file or "wing").stem
-    path = Path(f"{stem}_patched{'.toml' if plain else '.json'}" if out is None else out)
-    if path.suffix not in ENDINGS:
-        raise FileNotWrittenError(f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out.")
-    made_of = (choice.file, *choice.beneath, choice.path or "", file, file.parent / files.PATCH_NAME)
-    if path.exists() and path.resolve() in (Path(item).resolve() for item in made_of):
-        raise FileNotWrittenError(f"{path} is what the patched model is made of: choose another --out.")
-    refuse_existing(path, replace=replace)
-    what = " and ".join(f"{item.name}{item.place and f' at {item.place}'}" for item in found.effects)
-    sure = said(f"applied.{found.verdict.name.lower()}", group=", ".join(stored.verdict.group))
-    sentence = f"{capital(what)}, {sure}."
+    if out is None:
+        stem = Path(choice.file or "wing").stem
+        out = f"{stem}_patched{'.toml' if has_laws_only else '.json'}"
+    path = Path(out)
+    _check_destination(path, choice, verdict_file, replace=replace)
+    sentence = f"{_applied_effects(applied_patch)}, {_certainty(applied_patch, stored)}."
     patch = changed(patch, sentence=f"{sentence} {stored.verdict.sentence}")
-    if path.suffix == ".toml":
-        if not plain:
-            raise ModelError(said("applied.no_laws", path=path))
-        atomic_write_text(path, _lumped_text(choice, patch))
-    elif path.suffix == ".fmu":
+    if path.suffix == ".fmu":
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
         return Applied(path, sentence, "")
+    if path.suffix == ".toml":
+        if not has_laws_only:
+            raise ModelError(
+                f"{path}: only laws at the ports of a lumped model can stand in its own file; give "
+                "--out with the ending .json, which is taken wherever a model is."
+            )
+        atomic_write_text(path, _lumped_text(choice, patch))
     else:
         files.write_patch(path, patch)
-    return Applied(path, sentence, _again(stored.origin.command, path))
+    return Applied(path, sentence, _command_with_model(stored.origin.command, path))
+
+
+def _check_destination(
+    path: Path, choice: ModelChoice, verdict_file: Path, *, replace: bool
+) -> None:
+    """Refuse a file of another kind, one that the patched model is made of, and one that exists."""
+    if path.suffix not in ENDINGS:
+        raise FileNotWrittenError(
+            f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out."
+        )
+    patch_file = verdict_file.parent / files.PATCH_NAME
+    sources = (choice.file, *choice.beneath, choice.path or "", verdict_file, patch_file)
+    if path.exists() and path.resolve() in {Path(source).resolve() for source in sources}:
+        raise FileNotWrittenError(
+            f"{path} is what the patched model is made of: choose another --out."
+        )
+    refuse_existing(path, replace=replace)
+
+
+def _applied_effects(patch: files.StoredPatch) -> str:
+    """Return the effects of a patch with their places, as the begin of a sentence."""
+    phrases = []
+    for effect in patch.effects:
+        phrases.append(f"{effect.name} at {effect.place}" if effect.place else effect.name)
+    return capital(" and ".join(phrases))
+
+
+def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
+    """Return how certain the effects of a patch are, as the end of a sentence."""
+    certainty = {
+        VerdictKind.NAMED: "named",
+        VerdictKind.NAMED_IN_PART: "named in part: what is left has no name",
+        VerdictKind.FAMILY: "of which the family is named, not the law",
+        VerdictKind.GROUP: (
+            "one of a group that the data cannot tell apart: no name (of "
+            f"{', '.join(stored.verdict.group)})"
+        ),
+        VerdictKind.UNEXPLAINED: "the best hypothesis for a gap that stays unexplained: no name",
+    }
+    return certainty[patch.verdict]
 
 
 def gives(verdict: Verdict, proof: Proof | None) -> bool:
-    """Return whether a verdict gives something to apply: never that with which the error grows."""
+    """Return whether a verdict gives something to apply.
+
+    Never effects with which the error grows.
+    """
     if proof is not None and proof.grew:
         return False
-    open_gap = verdict.kind is VerdictKind.UNEXPLAINED
-    return verdict.kind in files.PATCHED or (open_gap and _proved_hypothesis(verdict, proof) is not None)
+    if verdict.kind is VerdictKind.UNEXPLAINED:
+        return _proved_hypothesis(verdict, proof) is not None
+    return verdict.kind in files.PATCHED
 
 
-def _found(stored: files.StoredVerdict, file: Path, member: str | None) -> files.StoredPatch:
-    """Return the effects that are applied."""
+def _patch_to_apply(
+    stored: files.StoredVerdict, file: Path, member: str | None
+) -> files.StoredPatch:
+    """Return the patch of the effects that are applied.
+
+    Parameters
+    ----------
+    stored : StoredVerdict
+        The verdict.
+    file : Path
+        Its file.
+    member : str or None
+        Member of a group that is applied; None for the first.
+
+    Raises
+    ------
+    DiscrepancyError
+        If the verdict has no such member, or gives nothing to apply.
+    """
     verdict = stored.verdict
-    if member is not None and (verdict.kind is not VerdictKind.GROUP or member not in verdict.group):
-        known = ", ".join(map(repr, verdict.group)) if verdict.kind is VerdictKind.GROUP else "no group"
-        raise DiscrepancyError(f"--member {member!r} is none of {file}, which has {known}: leave it out.")
+    is_group = verdict.kind is VerdictKind.GROUP
+    if member is not None and (not is_group or member not in verdict.group):
+        members = ", ".join(map(repr, verdict.group)) if is_group else "no group"
+        raise DiscrepancyError(
+            f"--member {member!r} is none of {file}, which has {members}: leave it out."
+        )
     if stored.proof is not None and stored.proof.grew:
         raise DiscrepancyError(
-            f"{file} gives nothing to apply: its proof says that the error grows with what was found."
+            f"{file} gives nothing to apply: its proof says that the error grows with what was "
+            "found."
         )
-    beside = file.parent / files.PATCH_NAME
-    if member is None and verdict.kind in files.PATCHED and beside.is_file():
-        return files.read_patch(beside)
-    best = None
+    patch_file = file.parent / files.PATCH_NAME
+    if member is None and verdict.kind in files.PATCHED and patch_file.is_file():
+        return files.read_patch(patch_file)
+    hypothesis = None
     if verdict.kind is VerdictKind.UNEXPLAINED:
-        best = _proved_hypothesis(verdict, stored.proof)
+        hypothesis = _proved_hypothesis(verdict, stored.proof)
     elif verdict.kind in files.APPLIED:
-        best = _hypothesis(verdict, member)
-    if best is None:
-        key = f"nothing_as_{verdict.kind.name.lower()}"
-        why = said(f"applied.{key}" if key in SENTENCES.tables["applied"] else "applied.nothing_there")
-        raise DiscrepancyError(f"{file} gives nothing to apply: {why}.")
-    residuals = file.parent / RESIDUALS_NAME
-    channels = files.fmu_outputs(read_residuals(residuals).channels) if residuals.is_file() else {}
-    effects = files.patch_effects(best.effects)
-    return files.StoredPatch(verdict.kind, "", effects, channels, best.parameters, stored.origin)
+        hypothesis = _hypothesis(verdict, member)
+    if hypothesis is None:
+        reason = _NOTHING_TO_APPLY.get(verdict.kind, "it lacks what it names")
+        raise DiscrepancyError(f"{file} gives nothing to apply: {reason}.")
+    residuals_file = file.parent / RESIDUALS_NAME
+    channels: dict[str, str] = {}
+    if residuals_file.is_file():
+        channels = files.fmu_outputs(read_residuals(residuals_file).channels)
+    return files.StoredPatch(
+        verdict=verdict.kind,
+        sentence="",
+        effects=files.patch_effects(hypothesis.effects),
+        channels=channels,
+        parameters=hypothesis.parameters,
+        origin=stored.origin,
+    )
+
+
+_NOTHING_TO_APPLY = {
+    VerdictKind.NOTHING_MISSING: "nothing is missing, and the model stands as it is",
+    VerdictKind.BELOW_LIMIT: "what may be missing is too small to tell from noise",
+    VerdictKind.DATA_ERROR: "the data are at fault; mend them first",
+    VerdictKind.UNEXPLAINED: (
+        "its residuals show no hypothesis with which the error is less than without it"
+    ),
+}
+"""Why a verdict gives nothing to apply."""
 
 
 def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
-    """Return what the verdict, or a member of its group, stands for; None where there is nothing."""
-    wanted = tuple(effect.identifier for effect in verdict.effects)
+    """Return the hypothesis of a verdict, or of a member of its group.
+
+    None if it is not recorded.
+    """
     if verdict.kind is VerdictKind.GROUP:
-        wanted = tuple((member or verdict.group[0]).split(" + "))
-    return next((item for item in verdict.hypotheses if set(item.identifiers) == set(wanted)), None)
+        identifiers = {*(member or verdict.group[0]).split(" + ")}
+    else:
+        identifiers = {effect.identifier for effect in verdict.effects}
+    for hypothesis in verdict.hypotheses:
+        if {*hypothesis.identifiers} == identifiers:
+            return hypothesis
+    return None
 
 
 def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | None:
-    """Return the best hypothesis for an unexplained gap: that of the proof, if the error is less with it."""
+    """Return the hypothesis of the proof of an unexplained gap, if it lowers the error.
+
+    Else None.
+    """
     if proof is None or not proof.effects or proof.closed is None or proof.closed.value <= 0.0:
         return None
-    return next((item for item in verdict.hypotheses if item.labels == proof.effects), None)
+    for hypothesis in verdict.hypotheses:
+        if hypothesis.labels == proof.effects:
+            return hypothesis
+    return None
 
 
 def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
-    """Return the file of a lumped model with laws at its ports and calibrated parameters."""
+    """Return the text of a lumped model's file with the laws and the parameters of a patch."""
     file = choice.path or SHIPPED_MODELS / f"{patch.origin.model_file}.toml"
     content: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
-    calibrated = {item.name: item for item in patch.parameters}
-    for row in content.get("parameter", ()):
-        if found := calibrated.get(row["name"]):
-            row |= {"mean": found.mean, "deviation": found.deviation}
+    calibrated = {parameter.name: parameter for parameter in patch.parameters}
+    for table in content.get("parameter", ()):
+        parameter = calibrated.get(table["name"])
+        if parameter is not None:
+            table["mean"] = parameter.mean
+            table["deviation"] = parameter.deviation
     laws = list(content.get("law", ()))
     for effect in patch.effects:
-        for item in effect.patch:
-            name, count = effect.identifier, sum(law["name"].startswith(effect.identifier) for law in laws)
-            laws.append({"name": f"{name}_{count + 1}" if count else name, **item.to_mapping()})
-    content |= {"law": laws, "name": f"{content['name']} with {', '.join(e.name for e in patch.effects)}"}
+        for primitive in effect.patch:
+            name = effect.identifier
+            earlier = sum(law["name"].startswith(name) for law in laws)
+            if earlier:
+                name = f"{name}_{earlier + 1}"
+            laws.append({"name": name, **primitive.to_mapping()})
+    content["law"] = laws
+    effects = ", ".join(effect.name for effect in patch.effects)
+    content["name"] = f"{content['name']} with {effects}"
     LumpedDescription.parse(content, f"{file} with {patch.sentence}")
-    return f"# {patch.sentence}\n# Laws and parameters: {patch.origin.short_command}\n\n{toml_text(content)}"
+    comments = f"# {patch.sentence}\n# Laws and parameters: {patch.origin.short_command}\n"
+    return f"{comments}\n{toml_text(content)}"
 
 
 def pack_patched(
@@ -201,31 +305,68 @@ def pack_patched(
     replace: bool = False,
     progress: Progress | None = None,
 ) -> list[str]:
-    """Pack the FMU of a wing with a patch and the parameters beside it; return the switches of its effects.
+    """Pack the FMU of a wing with a patch and the parameters beside it.
+
+    Parameters
+    ----------
+    choice : ModelChoice
+        The wing.
+    patch : StoredPatch
+        The patch.
+    path : Path
+        The FMU.
+    activate : bool
+        True to switch the effects on.
+    replace : bool
+        True if an existing file may be replaced.
+    progress : Progress, optional
+        Where the modelling of the wing reports.
+
+    Returns
+    -------
+    list of str
+        Names of the FMU's parameters that switch its effects.
 
     Raises
     ------
     ModelError
-        If the model is no wing.
+        If the model is not a wing.
     fmu_asset.errors.PatchFileError
         If an FMU cannot carry an effect.
     """
     if choice.design is None:
-        raise ModelError(said("applied.no_wing", path=path, model=choice.label))
-    rows = [{"id": item.identifier, "primitives": item.patch.to_list()} for item in patch.effects]
-    content = {"schema": SCHEMA, "effects": rows, "channels": dict(patch.channels)}
+        raise ModelError(
+            f"{path}: only a wing is packed with its effects; of {choice.label} give --out with "
+            "the ending .json, which is taken wherever a model is."
+        )
+    effect_tables = []
+    for stored_effect in patch.effects:
+        primitives = stored_effect.patch.to_list()
+        effect_tables.append({"id": stored_effect.identifier, "primitives": primitives})
+    content = {"schema": SCHEMA, "effects": effect_tables, "channels": dict(patch.channels)}
+    effects = parse_patch(json.dumps(content).encode(), "The patch")
     options: dict[str, Any] = {"state": DigitalState()}
     if choice.kind is ModelKind.CALIBRATION and choice.path is not None:
         options = tailoring(load_calibration(choice.path))
-    options["state"] = changed(options["state"], **{item.name: item.mean for item in patch.parameters})
-    effects = parse_patch(json.dumps(content).encode(), "The patch")
-    options |= {"activate": activate, "replace": replace, "progress": progress}
-    pack_wing(choice.design, path, patch=effects, **options)
+    parameters = {parameter.name: parameter.mean for parameter in patch.parameters}
+    options["state"] = changed(options["state"], **parameters)
+    pack_wing(
+        choice.design,
+        path,
+        patch=effects,
+        activate=activate,
+        replace=replace,
+        progress=progress,
+        **options,
+    )
     return [f"effect.{effect.id}.active" for effect in effects.effects]
 
 
 def packed_beside(choice: ModelChoice, patch_file: Path, path: Path) -> str:
-    """Pack the FMU of a wing with the patch of a verdict, its effects off; return what to say of it."""
+    """Pack the FMU of a wing with the patch of a verdict, and return a sentence about it.
+
+    Its effects are switched off.
+    """
     try:
         switches = pack_patched(choice, files.read_patch(patch_file).upon(choice.built_in), path)
     except PatchFileError as cause:
@@ -233,11 +374,13 @@ def packed_beside(choice: ModelChoice, patch_file: Path, path: Path) -> str:
     return f"{path.name} carries it, off until {', '.join(switches)} is set to 1."
 
 
-def _again(command: str, model: Path) -> str:
-    """Return the command of a verdict with another model, and a folder of its own for what it leaves."""
+def _command_with_model(command: str, model: Path) -> str:
+    """Return the command of a verdict with another model and another folder."""
     words = shlex.split(command)
-    source = Path(words[4 if words[3] == "--from-run" else 3]).name
+    campaign_index = 4 if words[3] == "--from-run" else 3
+    campaign = Path(words[campaign_index]).name
     if "--model" in words:
-        at = words.index("--model")
-        del words[at : at + 2]
-    return shlex.join([*words, "--model", str(model), "--out", f"verdicts/{source}_{model.stem}"])
+        index = words.index("--model")
+        del words[index : index + 2]
+    out = f"verdicts/{campaign}_{model.stem}"
+    return shlex.join([*words, "--model", str(model), "--out", out])

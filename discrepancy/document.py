@@ -1,7 +1,7 @@
 """How records stand in JSON: numbers that JSON lacks, and patches by their primitives.
 
-A number that is not a number is null, an infinite one "Infinity" or "-Infinity", because JSON has neither.
-The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
+A number that is not a number is null, an infinite one "Infinity" or "-Infinity", because JSON has
+neither. The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
 """
 
 import json
@@ -24,7 +24,8 @@ from reporting.json_file import read_json
 from reporting.provenance import Provenance
 
 PRIMITIVE_UNITS: dict[str, dict[str, str]] = {kind: item.units for kind, item in PRIMITIVES.items()}
-"""Unit of every real parameter of every primitive (translational or rotational port: the first or second)."""
+"""Unit of every real parameter of every primitive (translational or rotational port: the first
+or second)."""
 
 _WORDS = {None: nan, "Infinity": inf, "-Infinity": -inf}
 _JSON_TYPES: dict[Any, str] = {float: "number", int: "integer", str: "string"}
@@ -44,7 +45,9 @@ _WINDOWS = {
 def _number(value: object) -> float:
     if value is None or isinstance(value, str):
         if value not in _WORDS:
-            raise ValueError(f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came')
+            raise ValueError(
+                f'a number, null, "Infinity" or "-Infinity" is expected, and {value!r} came'
+            )
         return _WORDS[value]
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
         raise ValueError(f"a finite number is expected, and {value!r} came")
@@ -70,7 +73,10 @@ def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
         "type": "object",
         "title": primitive.__name__,
         "description": (primitive.__doc__ or "").split("\n")[0],
-        "properties": {**columns, **({"windows": _WINDOWS} if primitive.can_act_in_windows else {})},
+        "properties": {
+            **columns,
+            **({"windows": _WINDOWS} if primitive.can_act_in_windows else {}),
+        },
         "required": list(columns),
         "additionalProperties": False,
     }
@@ -119,8 +125,9 @@ class Origin:
     provenance : Provenance
         Seed, versions, hashes of the sources.
     model_file : str or None
-        Absolute path of the model's file, or of the mission whose twin's model it is; the name of a shipped
-        model, empty for the shipped wing. None: not known, as of files before it was recorded.
+        Absolute path of the model's file, or of the mission whose twin's model it is; the name of a
+        shipped model, empty for the shipped wing. None: not known, as of files before it was
+        recorded.
     """
 
     campaign: str
@@ -147,19 +154,38 @@ def shipped_schema(name: str) -> dict[str, Any]:
         If there is none of that name.
     """
     if name not in ("verdict", "patch"):
-        raise VerdictFileError(f"There are JSON Schemas for verdict and patch, but not for {name!r}.")
-    text = resources.files("discrepancy").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+        raise VerdictFileError(
+            f"There are JSON Schemas for verdict and patch, but not for {name!r}."
+        )
+    text = (
+        resources.files("discrepancy").joinpath(f"{name}.schema.json").read_text(encoding="utf-8")
+    )
     schema: dict[str, Any] = json.loads(text)
     return schema
 
 
 def plain(value: Any) -> Any:
-    """Return records as plain data that JSON can hold: null, "Infinity" and "-Infinity" for odd numbers."""
-    return json_of(value, lambda odd: None if isnan(odd) else "Infinity" if odd > 0.0 else "-Infinity")
+    """Return records as plain data for JSON; nan is null, infinity is "Infinity"."""
+
+    def not_finite(number: float) -> str | None:
+        if isnan(number):
+            return None
+        return "Infinity" if number > 0.0 else "-Infinity"
+
+    return json_of(value, not_finite)
 
 
 def write_document(path: Path, schema: str, record: object) -> Path:
-    """Check a document, a record with an `origin`, and write it in one step.
+    """Check a document, a record with an `origin`, and write it whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    schema : str
+        Name of the schema.
+    record : dataclass instance
+        The document.
 
     Raises
     ------
@@ -169,9 +195,13 @@ def write_document(path: Path, schema: str, record: object) -> Path:
         If it cannot be written.
     """
     content = plain(record)
-    _checked(type(record), content, f"{Path(path).name} cannot be written: ", ".")
-    whole = {"schema": schema, **content.pop("origin"), **content}
-    return atomic_write_text(path, json.dumps(whole, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    try:
+        _record_of(type(record), content)
+    except _InvalidDocumentError as cause:
+        raise VerdictFileError(f"{Path(path).name} cannot be written: {cause}.") from cause
+    document = {"schema": schema, **content.pop("origin"), **content}
+    text = json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False)
+    return atomic_write_text(path, f"{text}\n")
 
 
 def read_document(
@@ -187,17 +217,17 @@ def read_document(
     Parameters
     ----------
     path : Path
-        Of the file.
+        The file.
     schema : str
-        That of this version.
+        Name of the schema of this version.
     kind : type
-        Of the record.
+        Class of the record.
     older : collection of str
-        Schemas that are read too.
+        Names of earlier schemas that are read, too.
     upgrade : callable, optional
-        Makes the content of an older file that of this version, in place.
+        Changes the content of an older file to this schema, in place.
     **absent
-        What an older file may lack.
+        Keys that an older file may lack, and their values.
 
     Raises
     ------
@@ -206,29 +236,44 @@ def read_document(
     """
     path = Path(path)
     if not path.exists():
-        raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
+        raise VerdictFileError(
+            f"There is no file {path}; give the one that the discrepancy workflow left."
+        )
     content = read_json(path, VerdictFileError)
-    came = content.pop("schema", None) if isinstance(content, dict) else None
-    if came != schema and came not in older:
-        which = f"of the schema {came!r}" if came else "no file of this kind"
-        raise VerdictFileError(f"{path} is {which}, but {schema!r} is needed.")
-    content = {**({} if came == schema else absent), **content}
-    if upgrade is not None and came != schema:
-        try:
-            upgrade(content)
-        except (AttributeError, KeyError, TypeError) as cause:
-            raise VerdictFileError(f"{path} does not fit its schema {came!r}; write it again.") from cause
-    origin = {item.name: content.pop(item.name) for item in fields(Origin) if item.name in content}
-    before, after = f"{path} does not fit its schema: ", "; write it again."
-    return _checked(kind, {**content, "origin": origin}, before, after)
+    schema_of_file = content.pop("schema", None) if isinstance(content, dict) else None
+    if schema_of_file != schema and schema_of_file not in older:
+        what = f"of the schema {schema_of_file!r}" if schema_of_file else "no file of this kind"
+        raise VerdictFileError(f"{path} is {what}, but {schema!r} is needed.")
+    if schema_of_file != schema:
+        content = {**absent, **content}
+        if upgrade is not None:
+            try:
+                upgrade(content)
+            except (AttributeError, KeyError, TypeError) as cause:
+                raise VerdictFileError(
+                    f"{path} does not fit its schema {schema_of_file!r}; write it again."
+                ) from cause
+    names_of_origin = [entry.name for entry in fields(Origin) if entry.name in content]
+    origin = {name: content.pop(name) for name in names_of_origin}
+    try:
+        return _record_of(kind, {**content, "origin": origin})
+    except _InvalidDocumentError as cause:
+        raise VerdictFileError(
+            f"{path} does not fit its schema: {cause}; write it again."
+        ) from cause
 
 
-def _checked(kind: type[_Record], content: dict[str, Any], before: str, after: str) -> _Record:
-    """Return the record of plain data that holds what it should and nothing else."""
+class _InvalidDocumentError(ValueError):
+    """Plain data that are not a document; the message is its first fault."""
+
+
+def _record_of(kind: type[_Record], content: dict[str, Any]) -> _Record:
+    """Return the record of plain data; refuse data that lack something or have something more."""
     try:
         return TypeAdapter(kind).validate_json(json.dumps(content), strict=True, extra="forbid")
     except ValidationError as cause:
-        error = cause.errors()[0]
-        place = ".".join(str(part) for part in error["loc"])
-        more = f" (and {cause.error_count() - 1} more)" if cause.error_count() > 1 else ""
-        raise VerdictFileError(f"{before}{place}: {error['msg']}{more}{after}") from cause
+        first = cause.errors()[0]
+        place = ".".join(str(key) for key in first["loc"])
+        count = cause.error_count()
+        further = f" (and {count - 1} more)" if count > 1 else ""
+        raise _InvalidDocumentError(f"{place}: {first['msg']}{further}") from cause

@@ -1,11 +1,10 @@
-"""Errors of the discrepancy workflow, named by cause, and the sentences that it says."""
+"""Errors of the discrepancy workflow, named by cause, and its tables of sentences."""
 
 from reporting.errors import StandsForOthersError
 from reporting.sentences import Sentences
 
 SENTENCES = Sentences(__file__)
-said = SENTENCES.said
-"""A sentence by "table.name" with its values."""
+"""Proposals of experiments and rules of a verdict, by table."""
 
 
 class DiscrepancyError(StandsForOthersError):
@@ -13,11 +12,11 @@ class DiscrepancyError(StandsForOthersError):
 
 
 class CampaignFileError(DiscrepancyError, ValueError):
-    """A campaign cannot be read: a missing file, key or column, or something that is not of its kind."""
+    """A campaign cannot be read: something is missing or is not of its kind."""
 
 
 class CampaignDataError(DiscrepancyError, ValueError):
-    """Measured data are not fit for use: gaps, NaN, a clipped channel, a unit slip, swapped channels."""
+    """Measured data are not fit for use: gaps, a clipped channel, a unit slip, swapped channels."""
 
 
 class ModelError(DiscrepancyError, ValueError):

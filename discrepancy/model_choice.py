@@ -1,4 +1,4 @@
-"""Which model a campaign is compared with: a wing, a structure, a lumped model, an FMU, or one patched."""
+"""Which model a campaign is compared with: wing, structure, lumped model, FMU, or a patched one."""
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from calibration.joint.wing_table import SHIPPED_PRIOR
 from discrepancy.document import Origin
-from discrepancy.errors import ModelError, VerdictFileError, said
+from discrepancy.errors import ModelError, VerdictFileError
 from discrepancy.files.verdict import StoredPatch, read_patch
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.sources.from_run import run_model
@@ -22,6 +22,7 @@ from fmu_asset.archive.fmu_file import packed_design_hash
 from reporting.files import hash_file, hash_record
 from reporting.progress import Progress
 from reporting.toml_file import read_toml
+from reporting.words import comma_list
 from scenarios import structure_files
 
 
@@ -48,8 +49,9 @@ class ModelChoice:
     label : str
         What the command line names it by, without its folder; empty for the shipped wing.
     source_hash : str
-        SHA-256 of all that it was read from: its file, with the prior for a wing without calibration, with
-        FMU and binding for the description of an FMU, with the patch of a run's twin.
+        SHA-256 of all that it was read from: its file, with the prior for a wing without
+        calibration, with FMU and binding for the description of an FMU, with the patch of a run's
+        twin.
     design : WingDesign or None
         Of a wing.
     path : Path or None
@@ -82,9 +84,9 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
     Parameters
     ----------
     name : str or Path, optional
-        A calibration (.nc); a wing design, a structure, a lumped model or the description of an FMU (.toml);
-        any of these with a patch (.json); the name of a shipped lumped model or structure; the folder of a
-        mission whose twin's model is meant. The shipped wing if left out.
+        A calibration (.nc); a wing design, a structure, a lumped model or the description of an FMU
+        (.toml); any of these with a patch (.json); the name of a shipped lumped model or structure;
+        the folder of a mission whose twin's model is meant. The shipped wing if left out.
     progress : Progress, optional
         Where the modelling of a wing or a structure reports.
 
@@ -101,19 +103,33 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
 
 
 def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
+    """Return the model of a file or a folder, or the shipped one of this name.
+
+    Without its `file`.
+    """
     if path.is_dir():
         return choice_of_run(path)
     if path.suffix == ".fmu":
-        raise ModelError(said("models.bare_fmu", path=path))
+        raise ModelError(
+            f"{path} is an FMU: give a TOML file that says which of its variables are load, "
+            'outputs and ports (kind = "fmu", docs/fmu_models.md), or for the wing its '
+            "calibration.nc or design."
+        )
     if path.suffix and not path.is_file():
-        raise ModelError(f"There is no model file {path}; give a calibration (.nc) or a model (.toml).")
+        raise ModelError(
+            f"There is no model file {path}; give a calibration (.nc) or a model (.toml)."
+        )
     if path.suffix == ".nc":
         return _wing(WingModel.of_calibration(path, progress), ModelKind.CALIBRATION, path)
     if path.suffix == ".json":
         return _patched(path, progress)
     if path.suffix not in ("", ".toml"):
-        names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
-        raise ModelError(said("models.no_model", path=path, names=names))
+        shipped_names = sorted(file.stem for file in SHIPPED_MODELS.glob("*.toml"))
+        raise ModelError(
+            f"{path} is no model: a calibration (.nc), a wing design, a structure or a lumped "
+            "model (.toml), a patch (.json), or the name of a shipped lumped model "
+            f"({comma_list(shipped_names)}) is expected."
+        )
     if path.suffix == ".toml":
         content = read_toml(path, ModelError, what="model")
         if content.get("kind") == "fmu":
@@ -122,12 +138,14 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
             return _structure(path, progress)
         if "format" not in content:  # a wing design has none
             return _wing(WingModel.of_design(path, progress), ModelKind.WING, path)
-    if not path.exists() and str(path) in structure_files():
+    is_name = not path.exists()
+    if is_name and str(path) in structure_files():
         return _structure(structure_files()[str(path)], progress)
     model = LumpedModel.load(path)
-    shipped = not path.suffix and not path.exists()
-    file = SHIPPED_MODELS / f"{path}.toml" if shipped else path
-    return ModelChoice(model, ModelKind.LUMPED, path.name, hash_file(file), path=None if shipped else path)
+    if is_name and not path.suffix:
+        source_hash = hash_file(SHIPPED_MODELS / f"{path}.toml")
+        return ModelChoice(model, ModelKind.LUMPED, path.name, source_hash)
+    return ModelChoice(model, ModelKind.LUMPED, path.name, hash_file(path), path=path)
 
 
 def load_model(name: str | Path | None = None, progress: Progress | None = None) -> Model:
@@ -154,9 +172,9 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
     Parameters
     ----------
     origin : Origin
-        What it was reached from.
+        Origin of the verdict or patch.
     file : Path
-        It; a model's file that is not where it was is looked for beside it.
+        Its file; a model's file that is no longer in its place is searched beside it.
     progress : Progress, optional
         Where the modelling reports.
 
@@ -166,38 +184,53 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
         If the model is gone, has changed since, or is not known.
     """
     if origin.model_file is None:
-        raise VerdictFileError(said("models.earlier", file=file))
-    place = Path(origin.model_file)
-    if place.is_absolute() and not place.exists():
-        place = Path(file).parent / place.name
-        if not place.exists():
-            raise ModelError(said("models.gone", origin=origin, file=file, name=Path(file).name))
-    choice = choose_model(place if origin.model_file else None, progress)
+        raise VerdictFileError(
+            f"{file} was left by an earlier version, which did not record where its model is: run "
+            "`uav-twin discrepancy run` again."
+        )
+    model_file = Path(origin.model_file)
+    if model_file.is_absolute() and not model_file.exists():
+        model_file = Path(file).parent / model_file.name
+        if not model_file.exists():
+            raise ModelError(
+                f"The model {origin.model_file}, on which {file} rests, is gone: put it back "
+                f"there, or beside {Path(file).name}."
+            )
+    choice = choose_model(model_file if origin.model_file else None, progress)
     if choice.source_hash != origin.model_hash:
-        which = choice.file or "of the shipped wing"
-        raise ModelError(said("models.changed", which=which, file=file, choice=choice, origin=origin))
+        model = choice.file or "of the shipped wing"
+        raise ModelError(
+            f"The model {model} has changed since {file} was written (SHA-256 "
+            f"{choice.source_hash:.12}, not {origin.model_hash:.12}): run `uav-twin discrepancy "
+            "run` again."
+        )
     return choice
 
 
 def choice_of_run(folder: Path) -> ModelChoice:
-    """Return the model that the twin of a run folder believed, with its patch if it had one.
+    """Return the model in which the twin of a run folder believed, with its patch if it had one.
 
     Raises
     ------
     CampaignFileError, ModelError
-        As `run_model`.
+        For the causes of `run_model`.
     """
-    model, wing, patch = run_model(folder)
-    choice = _wing(model, ModelKind.CALIBRATION if wing.suffix == ".nc" else ModelKind.WING, wing)
-    if patch is None:
+    model, wing_file, patch_file = run_model(folder)
+    kind = ModelKind.CALIBRATION if wing_file.suffix == ".nc" else ModelKind.WING
+    choice = _wing(model, kind, wing_file)
+    if patch_file is None:
         return choice
-    return replace(choice, source_hash=hash_record({"model": choice.source_hash, "patch": hash_file(patch)}))
+    source_hash = hash_record({"model": choice.source_hash, "patch": hash_file(patch_file)})
+    return replace(choice, source_hash=source_hash)
 
 
 def _patched(path: Path, progress: Progress | None) -> ModelChoice:
+    """Return the model of a patch file: that on which the patch rests, with its effects."""
     stored = read_patch(path)
     base = model_of(stored.origin, path, progress)
-    calibrated = {item.name: (item.mean, item.deviation) for item in stored.parameters}
+    calibrated = {
+        parameter.name: (parameter.mean, parameter.deviation) for parameter in stored.parameters
+    }
     return replace(
         base,
         model=base.model.patched(stored.patch, calibrated),
@@ -209,31 +242,58 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
 
 
 def _structure(path: Path, progress: Progress | None) -> ModelChoice:
+    """Return the model of a structure's file, reduced with its ports."""
     with ModelError.instead_of(FiniteElementError):
         reduced = reduced_model(path, progress=progress, with_ports=True)
         source_hash = structure_hash(load_structure(path), path.parent, with_ports=True)
-    model = StructureModel(reduced)
-    design_hash = reduced.design_hash
-    return ModelChoice(model, ModelKind.STRUCTURE, path.name, source_hash, path=path, design_hash=design_hash)
+    return ModelChoice(
+        StructureModel(reduced),
+        ModelKind.STRUCTURE,
+        path.name,
+        source_hash,
+        path=path,
+        design_hash=reduced.design_hash,
+    )
 
 
 def _fmu(path: Path) -> ModelChoice:
+    """Return the model of an FMU's description.
+
+    Its hash is that of description, FMU and binding.
+    """
     model = FmuModel.load(path)
-    files = {
-        "description": path,
-        "fmu": path.parent / model.description.fmu,
-        "binding": model.description.binding_file(path.parent),
-    }
-    source = hash_record({name: hash_file(file) for name, file in files.items() if file is not None})
-    packed = packed_design_hash(files["fmu"] or path)
-    return ModelChoice(model, ModelKind.FMU, path.name, source, path=path, design_hash=packed)
+    fmu_file = path.parent / model.description.fmu
+    binding_file = model.description.binding_file(path.parent)
+    hashes = {"description": hash_file(path), "fmu": hash_file(fmu_file)}
+    if binding_file is not None:
+        hashes["binding"] = hash_file(binding_file)
+    return ModelChoice(
+        model,
+        ModelKind.FMU,
+        path.name,
+        hash_record(hashes),
+        path=path,
+        design_hash=packed_design_hash(fmu_file),
+    )
 
 
 def _wing(model: WingModel, kind: ModelKind, path: Path | None) -> ModelChoice:
+    """Return the model of a wing, from its calibration or design.
+
+    Without a file the shipped design.
+    """
     if path is not None and kind is ModelKind.CALIBRATION:
-        source = hash_file(path)
+        source_hash = hash_file(path)
     else:
         prior = {name: list(values) for name, values in SHIPPED_PRIOR.items()}
-        source = hash_record({"design": hash_file(path or SHIPPED_DESIGN), "prior": prior})
-    label, made_of = "" if path is None else path.name, "" if model.design is None else model.design.hash
-    return ModelChoice(model, kind, label, source, model.design, path, made_of)
+        design_file = path or SHIPPED_DESIGN
+        source_hash = hash_record({"design": hash_file(design_file), "prior": prior})
+    return ModelChoice(
+        model,
+        kind,
+        label="" if path is None else path.name,
+        source_hash=source_hash,
+        design=model.design,
+        path=path,
+        design_hash="" if model.design is None else model.design.hash,
+    )

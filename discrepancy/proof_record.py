@@ -16,20 +16,24 @@ class Scores:
     rms : mapping of str to float
         Root mean square residual by channel [channel's unit].
     chi_square_per_sample : float
-        Mean square residual over the variance of the noise, of channels with a noise record; nan without one.
+        Mean square residual over the variance of the noise, of channels with a noise record; nan
+        without one.
     log_score : float
         Mean predictive log density of a sample, standardised by its noise.
     coverage_50, coverage_90 : float
         Share of samples within the central predictive intervals.
     whiteness : float
-        p-value of the Ljung-Box test, the least over dynamic channels (Holm); nan without dynamic trials.
+        p-value of the Ljung-Box test, the least over dynamic channels (Holm); nan without dynamic
+        trials.
     sample_count : int
         Used samples.
     chi_square_expected, chi_square_deviation : float
-        Mean and standard deviation of `chi_square_per_sample` if the model is right, from what the fit
-        absorbs or leaves open and the degrees of freedom of the noise records; nan without a noise record.
+        Mean and standard deviation of `chi_square_per_sample` if the model is right, from what the
+        fit absorbs or leaves open and the degrees of freedom of the noise records; nan without a
+        noise record.
     pit : tuple of float
-        Shares of the probability integral transforms in ten equal bins; 0.1 each if predictions are right.
+        Shares of the probability integral transforms in ten equal bins; 0.1 each if predictions are
+        right.
     pit_p_value : float
         Of their uniformity, with the effective number of samples; nan with fewer than ten.
     """
@@ -48,17 +52,18 @@ class Scores:
 
 
 LEAST_GROWTH = 0.02
-"""Share below zero from which on an error has grown whatever its interval: by a hundredth of its size."""
+"""Share below zero from which on an error has grown whatever its interval: by a hundredth of its
+size."""
 
 
 @dataclass(frozen=True)
 class ClosedShare:
-    """The share of the mean square error that a hypothesis takes away: 1 - (rms after / rms before)^2.
+    """The fraction of the mean square error that a hypothesis removes: 1 - (after / before)^2.
 
-    Both errors are of the same samples and of the same kind of prediction: a simulation of the whole trial,
-    with no more than its own beginning and zeros fitted to it. Channels are pooled in units of their noise,
-    which is the same before and after; where no noise is recorded, of what the model as it was leaves of the
-    channel in fitted trials.
+    Both errors are of the same samples and of the same kind of prediction: a simulation of the
+    whole trial, with no more than its own beginning and zeros fitted to it. Channels are pooled in
+    units of their noise, which is the same before and after; where no noise is recorded, of what
+    the model as it was leaves of the channel in fitted trials.
 
     Attributes
     ----------

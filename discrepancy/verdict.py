@@ -17,7 +17,9 @@ class VerdictKind(StrEnum):
 
     NOTHING_MISSING = "nothing missing"  # the model explains the data
     NAMED = "named"  # one effect, or a set of effects
-    NAMED_IN_PART = "named in part"  # they close most of the gap; the rest is no noise and has no name
+    NAMED_IN_PART = (
+        "named in part"  # they close most of the gap; the rest is no noise and has no name
+    )
     FAMILY = "family"  # an effect of this family with a shape of its own
     GROUP = "group"  # one of a group that these data cannot separate
     UNEXPLAINED = "unexplained"  # a gap that no hypothesis fits
@@ -49,8 +51,9 @@ class GapWindow:
     first, last : float
         Times of the first and the last sample of the record [s].
     size : float
-        Root mean square residual in it over the noise, of the channel with the largest. Where no noise is
-        recorded, over what the model as it was leaves in fitted trials, before and with the effect.
+        Root mean square residual in it over the noise, of the channel with the largest. Where no
+        noise is recorded, over what the model as it was leaves in fitted trials, before and with
+        the effect.
     with_effect : bool
         Whether it is left by the best hypothesis; else by the model as it was.
     """
@@ -79,7 +82,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class NamedEffect:
-    """An effect in a hypothesis: identifier, standard name, place, parameters with intervals, its patch."""
+    """An effect in a hypothesis: identifier, name, place, parameters with intervals, patch."""
 
     identifier: str
     name: str
@@ -91,13 +94,13 @@ class NamedEffect:
 
 
 def effect_label(identifier: str, place: str, *, free_shape: bool = False) -> str:
-    """Return an effect with its place, as in "coulomb_friction@slide", marked where its shape is free."""
+    """Return an effect with its place, "coulomb_friction@slide", and a mark of a free shape."""
     return f"{identifier}{FREE_SHAPE if free_shape else ''}@{place}"
 
 
 @dataclass(frozen=True)
 class CalibratedParameter:
-    """A calibrated parameter as a hypothesis has it: posterior mean and standard deviation, in `unit`."""
+    """A calibrated parameter of a hypothesis: posterior mean and standard deviation, in `unit`."""
 
     name: str
     mean: Number
@@ -197,7 +200,8 @@ class ForceLeft:
     Attributes
     ----------
     left, whole : float
-        Root mean squares of the force beside the law and of the force without any effect, in its unit.
+        Root mean squares of the force beside the law and of the force without any effect, in its
+        unit.
     trials : int
         How many.
     tested : bool
@@ -212,7 +216,7 @@ class ForceLeft:
 
 @dataclass(frozen=True)
 class ForceMoment:
-    """A missing force at a moment: trial, time [s], force, displacement [m or rad] and speed of its port."""
+    """A missing force at a moment: trial, time [s], force, displacement and speed of its port."""
 
     trial: str
     time: Number
@@ -230,11 +234,11 @@ class ForceAtPort:
     port : str
         Its name.
     unit : str
-        Of the force: "N", "N m", or "N or N m" where the model does not say whether the port turns; at a
-        port of a state that of its flow.
+        Of the force: "N", "N m", or "N or N m" where the model does not say whether the port turns;
+        at a port of a state that of its flow.
     rms, displacement, speed : float
-        Root mean squares of the force, and of how far and how fast the port moves [m or rad, and its rate];
-        of a port of a state of its integral, and of the state.
+        Root mean squares of the force, and of how far and how fast the port moves [m or rad, and
+        its rate]; of a port of a state of its integral, and of the state.
     largest : ForceMoment
         Where the force is largest.
     evidence : mapping of str to float
@@ -242,11 +246,13 @@ class ForceAtPort:
     correlation_time : float
         Of the force [s].
     orders : mapping of str to float
-        Share of the force's variance that its mean at like displacement, velocity, amplitude or time is.
+        Share of the force's variance that its mean at like displacement, velocity, amplitude or
+        time is.
     ordered_by : tuple of str
         Those that order it, as well as the best one does; empty where none does.
     law : str
-        What was drawn through it, with their places where laws act at several ports; empty: nothing.
+        What was drawn through it, with their places where laws act at several ports; empty:
+        nothing.
     fitted, held_out : ForceLeft or None
         What the law leaves of the force, of those at all ports where laws act at several.
     """
@@ -270,8 +276,8 @@ class ForceAtPort:
 class UnfittedRecord:
     """A record that the model is not fitted to: the fit leaves more than the signal's own variance.
 
-    `left` is the rms residual, `varies` the standard deviation of the readings about their mean [channel's
-    unit].
+    `left` is the rms residual, `varies` the standard deviation of the readings about their mean
+    [channel's unit].
     """
 
     trial: str
@@ -282,12 +288,13 @@ class UnfittedRecord:
 
 @dataclass(frozen=True)
 class MovedUnknown:
-    """A parameter, gain or zero that the model without any effect moves far from what is stated of it.
+    """A parameter, gain or zero that a fit without effects moves far from what is stated.
 
     Attributes
     ----------
     name : str
-        Of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT in TRIAL".
+        Of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT in
+        TRIAL".
     stated, deviation : float
         What is stated of it, and its standard deviation [`unit`].
     value : float
@@ -336,13 +343,15 @@ class Verdict:
     sentence : str
         It in one sentence.
     probability : float
-        Among the hypotheses compared: of the named set with all that hold it, of the group together, of
-        'none' (nothing missing), of the candidates with 'none' (below detectability). Of a family: of it
-        and its members; where only the shape gate found it, of its member. Of an unexplained gap nothing.
+        Among the hypotheses compared: of the named set with all that hold it, of the group
+        together, of 'none' (nothing missing), of the candidates with 'none' (below detectability).
+        Of a family: of it and its members; where only the shape gate found it, of its member. Of an
+        unexplained gap nothing.
     log_bayes_factor : float
         ln of evidence of the best hypothesis over that of 'none'.
     effects : tuple of NamedEffect
-        The set that is named; members of the group where a group is; the shape's nearest where a family is.
+        The set that is named; members of the group where a group is; the shape's nearest where a
+        family is.
     group : tuple of str
         Identifiers that these data cannot separate.
     family : str
@@ -364,17 +373,18 @@ class Verdict:
     not_fitted : tuple of NotFitted
         Effects of the catalogue that were not.
     windows : tuple of GapWindow
-        Since when and until when there is a gap in each record: of the model as it was, and of what the best
-        hypothesis leaves.
+        Since when and until when there is a gap in each record: of the model as it was, and of what
+        the best hypothesis leaves.
     parameters : tuple of CalibratedParameter
         Of the model, in the hypothesis that stands for the verdict.
     force : ForceAtPort or None
         That is missing; None where none is, or none can be seen.
     unfitted : tuple of UnfittedRecord
-        Records that the hypothesis of the verdict leaves more of than their own variance: it is not fitted.
+        Records that the hypothesis of the verdict leaves more of than their own variance: it is not
+        fitted.
     moved : tuple of MovedUnknown
-        Parameters, gains and zeros that the model without any effect moves by more than two of their stated
-        deviations, the farthest first.
+        Parameters, gains and zeros that the model without any effect moves by more than two of
+        their stated deviations, the farthest first.
     """
 
     kind: VerdictKind

@@ -1,9 +1,11 @@
-"""The folder that an investigation leaves: verdict, patch, residuals, figures, report; whole or not."""
+"""The folder that an investigation leaves: verdict, patch, residuals, figures, report.
+
+Whole or not.
+"""
 
 from dataclasses import replace
 from pathlib import Path
 
-from discrepancy.errors import said
 from discrepancy.files import verdict as files
 from discrepancy.files.residuals import RESIDUALS_NAME, write_residuals
 from discrepancy.judgement.conclusion import named_effects
@@ -25,12 +27,15 @@ FIGURES = "figures"
 
 
 def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
-    """Look at the place before the work begins; a verdict that a killed process had moved aside comes back.
+    """Look at the place before the work begins.
+
+    A verdict that a killed process had moved aside comes back.
 
     Raises
     ------
     FileNotWrittenError
-        If it is no folder, holds something else than a verdict, or a verdict that is not to be replaced.
+        If it is no folder, holds something else than a verdict, or a verdict that is not to be
+        replaced.
     """
     restore_folder(folder)
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
@@ -41,9 +46,14 @@ def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
     if names <= {SO_FAR_NAME}:  # nothing, or what an interrupted search left
         return
     if not (folder / files.VERDICT_NAME).is_file():
-        raise FileNotWrittenError(said("models.no_verdict", folder=folder, name=files.VERDICT_NAME))
+        raise FileNotWrittenError(
+            f"{folder} exists and holds no {files.VERDICT_NAME}, so it is not touched: choose "
+            "another --out."
+        )
     if not replace_it:
-        raise FileNotWrittenError(said("models.verdict_there", folder=folder))
+        raise FileNotWrittenError(
+            f"{folder} holds a verdict already: choose another --out or give --replace."
+        )
 
 
 def write_verdict_folder(
@@ -70,7 +80,8 @@ def write_verdict_folder(
     Raises
     ------
     FileNotWrittenError
-        As `check_verdict_folder`, or if the disk is full or the place not writable; the folder is as it was.
+        As `check_verdict_folder`, or if the disk is full or the place not writable; the folder is
+        as it was.
     """
     check_verdict_folder(folder, replace_it=replace_it)
     with whole_folder(folder) as fresh:
@@ -79,32 +90,55 @@ def write_verdict_folder(
 
 
 def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
-    found, origin = content.investigation, content.origin
-    verdict = found.verdict
-    files.write_verdict(folder / files.VERDICT_NAME, verdict, found.proof, origin)
-    if found.problem is not None and found.fit is not None and found.fit.candidate.terms:
-        if verdict.kind in files.PATCHED:
-            draws = patch_draws(found.problem, found.fit, origin.provenance.seed or 0)
-            effects = files.patch_effects(named_effects(found.problem, found.fit), draws)
-            content = replace(content, intervals=[effect.intervals for effect in effects])
-            outputs = files.fmu_outputs(found.campaign.channels)
-            patch = files.StoredPatch(
-                verdict.kind, verdict.sentence, effects, outputs, verdict.parameters, origin
-            )
-            files.write_patch(folder / files.PATCH_NAME, patch)
-        if verdict.kind is VerdictKind.NAMED and content.pack is not None:
-            content = replace(content, fmu=content.pack(folder / files.PATCH_NAME, folder / FMU_NAME))
-    if found.after is not None:
-        label = added_label(found) or "nothing added"
-        write_residuals(
-            folder / RESIDUALS_NAME, found.after,
-            {"hypothesis": label, "verdict": verdict.sentence, "data_hash": origin.data_hash,
-             "command": origin.command},
-        )  # fmt: skip
+    """Write all files of an investigation into an empty folder."""
+    investigation = content.investigation
+    origin = content.origin
+    files.write_verdict(
+        folder / files.VERDICT_NAME, investigation.verdict, investigation.proof, origin
+    )
+    content = _with_patch_files(folder, content)
+    if investigation.after is not None:
+        attributes = {
+            "hypothesis": added_label(investigation) or "nothing added",
+            "verdict": investigation.verdict.sentence,
+            "data_hash": origin.data_hash,
+            "command": origin.command,
+        }
+        write_residuals(folder / RESIDUALS_NAME, investigation.after, attributes)
     if content.self_calibration is not None:
-        write_self_calibration(folder / SELF_CALIBRATION_NAME, content.self_calibration, origin)
+        path = folder / SELF_CALIBRATION_NAME
+        write_self_calibration(path, content.self_calibration, origin)
     if not report:
         return
     figures = report_figures(content)
-    drawings = {name: save_figure(item.figure, folder / FIGURES, name) for name, item in figures.items()}
+    drawings = {}
+    for name, figure in figures.items():
+        drawings[name] = save_figure(figure.figure, folder / FIGURES, name)
     atomic_write_text(folder / REPORT_NAME, render_report(content, drawings, figures))
+
+
+def _with_patch_files(folder: Path, content: ReportInput) -> ReportInput:
+    """Write patch and FMU of a verdict that has them, and return the input with their entries."""
+    investigation = content.investigation
+    problem = investigation.problem
+    fit = investigation.fit
+    verdict = investigation.verdict
+    if problem is None or fit is None or not fit.candidate.terms:
+        return content
+    patch_file = folder / files.PATCH_NAME
+    if verdict.kind in files.PATCHED:
+        draws = patch_draws(problem, fit, content.origin.provenance.seed or 0)
+        effects = files.patch_effects(named_effects(problem, fit), draws)
+        content = replace(content, intervals=[effect.intervals for effect in effects])
+        patch = files.StoredPatch(
+            verdict=verdict.kind,
+            sentence=verdict.sentence,
+            effects=effects,
+            channels=files.fmu_outputs(investigation.campaign.channels),
+            parameters=verdict.parameters,
+            origin=content.origin,
+        )
+        files.write_patch(patch_file, patch)
+    if verdict.kind is VerdictKind.NAMED and content.pack is not None:
+        content = replace(content, fmu=content.pack(patch_file, folder / FMU_NAME))
+    return content

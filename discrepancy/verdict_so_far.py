@@ -1,4 +1,4 @@
-"""What an interrupted search has found: `verdict_so_far.json`, in the folder of the verdict to come."""
+"""What an interrupted search has found: `verdict_so_far.json` in the folder of the verdict."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -36,8 +36,8 @@ class VerdictSoFar:
 
 
 REMARK = (
-    "The search was interrupted: probabilities are among the hypotheses fitted until then, no gate was "
-    "applied, and nothing was proved on held-out trials."
+    "The search was interrupted: probabilities are among the hypotheses fitted until then, no gate "
+    "was applied, and nothing was proved on held-out trials."
 )
 
 
@@ -58,7 +58,10 @@ class SearchInProgress:
         self.search = search
 
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """Return what the latest search has fitted, the most probable first; nothing before it has begun."""
+        """Return what the latest search has fitted, the most probable first.
+
+        Nothing before it has begun.
+        """
         if self.search is None:
             return ()
         probabilities = list(self.search.set_probabilities().items())[:MOST_HYPOTHESES]
@@ -69,7 +72,9 @@ class SearchInProgress:
 
 
 def write_so_far(folder: Path, hypotheses: Sequence[Hypothesis], origin: Origin) -> Path | None:
-    """Write what was found into the folder of the verdict, which is made; None where nothing was found yet.
+    """Write what was found into the folder of the verdict, which is made.
+
+    None where nothing was found yet.
 
     Raises
     ------

@@ -1,10 +1,10 @@
-"""The whole way from a campaign to a verdict: check, locate, name, prove, propose the next experiment."""
+"""From a campaign to a verdict: check, locate, name, prove, propose the next experiment."""
 
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from math import isnan, nan
+from math import nan
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,11 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import BoolArray, Campaign, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
-from discrepancy.catalogue.needs import NO_PORT
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
-from discrepancy.errors import CampaignDataError, said
+from discrepancy.errors import CampaignDataError
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
@@ -45,15 +44,13 @@ from discrepancy.search.whole_search import OnSearch, ignore_search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
-from discrepancy.system.lumped_model import LumpedModel
-from discrepancy.verdict import Experiment, GapWindow, NotFitted, Verdict, VerdictKind, effect_label
+from discrepancy.verdict import Experiment, GapWindow, Verdict, VerdictKind, effect_label
+from discrepancy.verdict_remarks import not_fitted, strained, without_port
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
-from reporting.words import brief, is_or_are, listing
+from reporting.words import brief, is_or_are
 
 DRAWS = 400
-IMPLAUSIBLE = 4.0
-"""Prior deviations from which on a parameter or a gain is remarked on."""
 CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA_ERROR)
 """Verdicts after which no experiment is proposed."""
 
@@ -79,7 +76,8 @@ class Investigation:
     proof : Proof or None
         Where an effect was named, or is the most probable one.
     before, after : ResidualSet or None
-        Residuals without and with it, over the same noise; None where faults of the data stopped the work.
+        Residuals without and with it, over the same noise; None where faults of the data stopped
+        the work.
     problem, search, fit : Problem, Search, CandidateFit or None
         What the naming side worked with; `fit` stands for the verdict.
     seconds : dict of str to float
@@ -114,37 +112,33 @@ def investigate(
     progress: Progress | None = None,
     on_search: OnSearch = ignore_search,
 ) -> Investigation:
-    """Find out what a model lacks.
+    """Return what a model lacks beside measured data: the verdict, its evidence and its proof.
 
     Parameters
     ----------
     campaign : Campaign or path
         Measured data: a campaign, its folder, or the folder of a mission whose flight is meant.
     model : Model or path, optional
-        The model that is to explain them, as `load_model` takes it: that of the mission's twin if left out
-        beside a mission, else the shipped wing.
+        The model that is to explain them, as `load_model` takes it: that of the mission's twin if
+        left out beside a mission, else the shipped wing.
     effects : sequence of Effect, optional
-        The catalogue; the shipped one with the user's installed entries if left out.
+        The catalogue; by default the shipped one with the user's installed entries.
     seed : int
-        Of all draws.
+        Seed of all draws.
     thorough : bool
-        False: no map of residuals and no next experiment, for studies over many campaigns.
+        False to leave out the map of residuals and the next experiment, for studies over many
+        campaigns.
     progress : Progress, optional
-        Where to report.
+        Where progress is reported.
     on_search : callable, optional
-        Takes each search as it begins, to look at while it goes on.
-
-    Returns
-    -------
-    Investigation
-        Verdict, evidence, proof.
+        Called with each search as it begins, to follow it.
 
     Raises
     ------
     DiscrepancyError
         If the campaign cannot be compared with the model at all.
     """
-    campaign, model = _given(campaign, model)
+    campaign, model = _read_input(campaign, model)
     shown, seconds = reporter(progress), {}
 
     @contextmanager
@@ -166,16 +160,25 @@ def investigate(
         problem = without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = reach_verdict(problem, catalogue, on_progress=tell, on_search=on_search)
+        verdict, search, fit = reach_verdict(
+            problem, catalogue, on_progress=tell, on_search=on_search
+        )
         verdict = with_untested(verdict, setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
         share = time_step_error(problem, fit)
         if share > SEARCH.solver_share:
-            remarks.append(said("remarks.time_steps", share=share, wanted=SEARCH.solver_share))
+            remarks.append(
+                f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
+                f"{SEARCH.solver_share:g} that is wanted: probabilities may be too sharp."
+            )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.no_effect, sensitivities=thorough)
-        after = residual_set(problem, fit, sensitivities=False) if fit is not search.no_effect else before
+        after = (
+            residual_set(problem, fit, sensitivities=False)
+            if fit is not search.no_effect
+            else before
+        )
     location, missing, proof = None, None, None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
@@ -198,45 +201,79 @@ def investigate(
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
-        verdict, sentence=with_date(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
-        not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
-        parameters=calibrated_parameters(problem, fit), force=None if missing is None else missing.at_port,
-    )  # fmt: skip
+        verdict,
+        sentence=with_date(verdict, windows),
+        remarks=tuple(remarks),
+        next_experiments=experiments,
+        not_fitted=not_fitted(problem.setting, catalogue, search),
+        windows=windows,
+        parameters=calibrated_parameters(problem, fit),
+        force=None if missing is None else missing.at_port,
+    )
     return Investigation(
-        campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds,
-        missing,
-    )  # fmt: skip
+        campaign=campaign,
+        model=model,
+        faults=faults,
+        verdict=verdict,
+        location=location,
+        proof=proof,
+        before=before,
+        after=after,
+        problem=problem,
+        search=search,
+        fit=fit,
+        seconds=seconds,
+        missing=missing,
+    )
 
 
 def added_effects(fit: CandidateFit) -> tuple[str, ...]:
     """Return the effects of a fit with their places, sorted, as `Hypothesis.labels` has them."""
     terms = fit.candidate.terms
-    labels = [effect_label(term.effect.identifier, term.place, free_shape=term.free_shape) for term in terms]
+    labels = [
+        effect_label(term.effect.identifier, term.place, free_shape=term.free_shape)
+        for term in terms
+    ]
     return tuple(sorted(labels))
 
 
 def _remarks(
-    problem: Problem, catalogue: Sequence[Effect], verdict: Verdict, search: Search, fit: CandidateFit
+    problem: Problem,
+    catalogue: Sequence[Effect],
+    verdict: Verdict,
+    search: Search,
+    fit: CandidateFit,
 ) -> list[str]:
-    """Return what has to be said beside a verdict."""
-    remarks = [*problem.campaign.remarks, *strained(problem, fit), *without_port(problem.setting, catalogue)]
+    """Return the remarks that belong to a verdict, beside those on its residuals."""
+    remarks = [*problem.campaign.remarks]
+    remarks += strained(problem, fit)
+    remarks += without_port(problem.setting, catalogue)
     if verdict.kind not in NO_GAP:
         remarks += exact_sensor_remarks(problem, search.no_effect)
-    alike = look_alike_remark(verdict, search.effects)
-    remarks += [] if alike is None else [alike]
+    look_alikes = look_alike_remark(verdict, search.effects)
+    if look_alikes is not None:
+        remarks.append(look_alikes)
     if not problem.model.parameters:
-        remarks.append(said("remarks.no_parameter", model=problem.model.name))
+        remarks.append(
+            f"The model {problem.model.name!r} has no uncertain parameter, so a stiffness or "
+            "damping a little off can be taken for an effect: give it some with their deviations."
+        )
     if fit.candidate.terms and not fit.converged:
-        remarks.append(said("remarks.not_settled"))
+        remarks.append(
+            "The fit of the verdict had not settled when it ended: its intervals may be too narrow."
+        )
     return remarks
 
 
-def _given(campaign: Campaign | str | Path, model: Model | str | Path | None) -> tuple[Campaign, Model]:
-    """Return campaign and model, read where a path was given."""
+def _read_input(
+    campaign: Campaign | str | Path, model: Model | str | Path | None
+) -> tuple[Campaign, Model]:
+    """Return campaign and model, read from files where paths are given."""
     if not isinstance(campaign, Campaign):
-        flown = (Path(campaign) / RUN_FILE).is_file()
-        model = Path(campaign) if model is None and flown else model
-        campaign = run_campaign(campaign) if flown else read_campaign(Path(campaign))
+        is_run_folder = (Path(campaign) / RUN_FILE).is_file()
+        if is_run_folder and model is None:
+            model = Path(campaign)
+        campaign = run_campaign(campaign) if is_run_folder else read_campaign(Path(campaign))
     if model is None or isinstance(model, str | Path):
         model = load_model(model)
     return campaign, model
@@ -245,20 +282,30 @@ def _given(campaign: Campaign | str | Path, model: Model | str | Path | None) ->
 def checked(
     campaign: Campaign, model: Model, *, hold_out: bool = True
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
-    """Return the campaign with outliers marked and trials held out, and what is wrong with it.
+    """Return the campaign with outliers marked and trials held out, and the faults of its data.
 
-    Without `hold_out` only those trials are held out that the campaign marks.
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign as it was read.
+    model : Model
+        The model without a patch.
+    hold_out : bool
+        False to hold out only the trials that the campaign marks.
 
     Raises
     ------
     CampaignDataError
         If the campaign states a calibrated parameter that the model does not have.
     """
-    known = [item.name for item in model.parameters]
+    names = [parameter.name for parameter in model.parameters]
     for parameter in campaign.parameters:
-        if parameter not in known:
-            told = {"model": model.name, "known": ", ".join(known) or "none"}
-            raise CampaignDataError(said("remarks.unknown_parameter", parameter=parameter, **told))
+        if parameter not in names:
+            raise CampaignDataError(
+                f"The campaign states the parameter {parameter!r}, which {model.name} does not "
+                f"have; it has {', '.join(names) or 'none'}: correct the name, or leave "
+                f"[parameters.{parameter}] out."
+            )
     faults = check_data(campaign)
     campaign = mark_outliers(campaign)
     faults = (*faults, *check_against_model(campaign, model))
@@ -266,106 +313,79 @@ def checked(
 
 
 def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
-    """Return the problem of campaign and model, single wrong readings at the ends of records left out.
+    """Return the problem of a campaign and a model, without wrong readings at the ends of records.
 
-    The model as it is need not fit: see `outliers.wrong_ends`.
+    The model need not fit; `outliers.wrong_ends` states the rule.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    none = refit_from_first_readings(problem, fit_to(problem, Candidate(), problem.start(Candidate())))
+    from_start = fit_to(problem, Candidate(), problem.start(Candidate()))
+    none = refit_from_first_readings(problem, from_start)
     fits = [(problem, none)]
     if problem.campaign.held_out:
         fits.append(held_out_fit(problem, none))
     trials = {trial.name: trial for trial in problem.campaign.trials}
-    remarks = list(problem.campaign.remarks)
-    for part, fitted in fits:
-        for data, residual in zip(part.trials, fitted.residuals, strict=True):
+    new_remarks: list[str] = []
+    for problem_of_trials, fitted in fits:
+        for data, residual in zip(problem_of_trials.trials, fitted.residuals, strict=True):
             trial = trials[data.trial.name]
             if not trial.is_dynamic:
                 continue
+            # residuals are in standard deviations of the noise, where it is known
             has_noise = [campaign.channels[name].noise is not None for name in trial.channels]
-            noise = np.array(has_noise, dtype=float)  # residuals are in deviations of the noise
-            found = wrong_ends(residual, data.weight > 0.0, noise) & ~_taken_as_right(campaign, trial)
-            for number in np.flatnonzero(found.any(axis=0)):
-                count = int(found[:, number].sum())
-                told = {"channel": trial.channels[number], "trial": trial.name, "are": is_or_are(count)}
-                remarks.append(said("remarks.wrong_ends", count=count, total=len(found), **told))
-            trials[trial.name] = replace(trial, used=trial.used & ~found)
-    if len(remarks) == len(problem.campaign.remarks):
+            noise = np.array(has_noise, dtype=float)
+            is_wrong = wrong_ends(residual, data.weight > 0.0, noise)
+            is_wrong &= ~_accepts_outliers(campaign, trial)
+            for column in np.flatnonzero(is_wrong.any(axis=0)):
+                count = int(is_wrong[:, column].sum())
+                new_remarks.append(
+                    f"{count} of {len(is_wrong)} readings of {trial.channels[column]!r} in the "
+                    f"trial {trial.name!r}, at its ends, {is_or_are(count)} far off model and "
+                    "neighbours and left out."
+                )
+            trials[trial.name] = replace(trial, used=trial.used & ~is_wrong)
+    if not new_remarks:
         return problem
-    campaign = replace(problem.campaign, trials=tuple(trials.values()), remarks=tuple(remarks))
+    remarks = (*problem.campaign.remarks, *new_remarks)
+    campaign = replace(problem.campaign, trials=tuple(trials.values()), remarks=remarks)
     return Problem(campaign, problem.model, replace(problem.setting, campaign=campaign))
 
 
-def _taken_as_right(campaign: Campaign, trial: Trial) -> BoolArray:
-    """Return the channels (C,) of a trial of which the campaign accepts readings that look like outliers."""
+def _accepts_outliers(campaign: Campaign, trial: Trial) -> BoolArray:
+    """Return for which channels (C,) of a trial the campaign accepts readings like outliers."""
     word = FaultKind.OUTLIERS.value
     return np.array([word in campaign.accepted(name, trial.name) for name in trial.channels])
 
 
-def strained(problem: Problem, fit: CandidateFit) -> list[str]:
-    """Return a sentence for each calibrated parameter and gain that a fit takes far from its prior.
-
-    What an implausible nuisance has taken up leaves no residual; the absolute gate judges all gains together,
-    and all parameters.
-    """
-    names = [f"The parameter {item.name!r}" for item in problem.model.parameters]
-    names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
-    rows = zip(names, fit.point.shared, problem.shared.precision, strict=True)
-    return [
-        said("remarks.strained", name=name, off=abs(u))
-        for name, u, precision in rows
-        if precision > 0.0 and abs(u) > IMPLAUSIBLE
-    ]
-
-
-def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
-    """Return a sentence on the effects that were not tested because the model has no port, if there are."""
-    names = [effect.name for effect in effects if NO_PORT in (effect.unavailable(setting) or "")]
-    if not names:
-        return []
-    model, such_as = setting.model, ""
-    if isinstance(model, LumpedModel) and model.description.input:
-        first = model.description.input[0]
-        vector = ", ".join(f"{value:g}" for value in first.vector)
-        such_as = said("remarks.such_as", vector=vector, first=first.name)
-    return [said("remarks.no_port", names=listing(names), such_as=such_as)]
-
-
-def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> tuple[NotFitted, ...]:
-    """Return the effects of a catalogue that were not fitted, each with the reason."""
-    along = {term.effect.identifier for item in search.force_hypotheses for term in item.candidate.terms}
-    fitted, rows = search.fitted_effects() | along, []
-    for effect in effects:
-        unavailable = effect.unavailable(setting)
-        if unavailable is not None:
-            rows.append(NotFitted(effect.identifier, unavailable))
-        elif effect.identifier not in fitted:
-            gain = search.screened_gains.get(effect.identifier, nan)
-            why = said("remarks.screened_out", gain=gain)
-            cause = search.problem.refusals.get(effect.identifier)
-            if cause is not None and not 0.0 < gain < SEARCH.worth_fitting:
-                why = said("remarks.could_not", cause=cause)
-            elif isnan(gain):
-                where = "along the missing force" if along else "at first sight"
-                why = said("remarks.less_promising", where=where)
-            rows.append(NotFitted(effect.identifier, why, gain))
-    return tuple(rows)
-
-
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:
-    """Return the most probable hypotheses with their probabilities, different sets of effects."""
+    """Return the most probable sets of effects: the best fit and the probability of each."""
     ranked = list(search.set_probabilities().items())[:count]
     return [(search.best_of(identifiers), probability) for identifiers, probability in ranked]
 
 
-def patch_draws(problem: Problem, fit: CandidateFit, seed: int, count: int = DRAWS) -> list[list[ModelPatch]]:
-    """Return for each effect of a fit its patch at draws of the posterior: of the fit, else Gaussian."""
+def patch_draws(
+    problem: Problem, fit: CandidateFit, seed: int, count: int = DRAWS
+) -> list[list[ModelPatch]]:
+    """Return the patches of each effect of a fit at draws of its posterior.
+
+    Draws are those of the fit if it has some, and Gaussian ones otherwise.
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+    fit : CandidateFit
+        The fit.
+    seed : int
+        Seed of the draws.
+    count : int
+        Number of draws.
+    """
     generator = np.random.default_rng(seed)
     if fit.draws is not None:
         draws = generator.choice(fit.draws, count)
     else:
         size = fit.candidate.size
-        root = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
-        draws = fit.point.effect + generator.standard_normal((count, size)) @ root.T
-    drawn = [fit.candidate.patches(problem.setting, draw) for draw in draws]
-    return [list(of_effect) for of_effect in zip(*drawn, strict=True)]
+        factor = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
+        draws = fit.point.effect + generator.standard_normal((count, size)) @ factor.T
+    patches_of_draws = [fit.candidate.patches(problem.setting, draw) for draw in draws]
+    return [list(patches_of_effect) for patches_of_effect in zip(*patches_of_draws, strict=True)]

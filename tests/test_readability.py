@@ -56,7 +56,7 @@ CEILINGS = {
     "fe": Counts(packed=1, bundles=1.9, walrus=0.3, columns=1.6, untyped=3.3, vague=1.6),
     "fmu_asset": Counts(packed=8.5, bundles=3, walrus=1.6, columns=0.5, untyped=11.8, vague=7.6),
     "calibration": Counts(packed=0, bundles=2.3, walrus=0, columns=3.6, untyped=1.2, vague=0.2),
-    "discrepancy": Counts(packed=5.2, bundles=3.2, walrus=1.7, columns=1.6, untyped=3.5, vague=10.2),
+    "discrepancy": Counts(packed=0.6, bundles=1.8, walrus=0, columns=1.1, untyped=1.8, vague=1.2),
     "scenarios": Counts(packed=14.2, bundles=14.2, walrus=0, columns=0, untyped=0, vague=0),
     "twin_master": Counts(packed=14.2, bundles=5, walrus=1.9, columns=4, untyped=13.4, vague=9.6),
     "uav_twin": Counts(packed=0, bundles=0.7, walrus=0, columns=0.7, untyped=5, vague=1.4),

@@ -396,10 +396,10 @@ def import_files(
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
     sheets = [parts.read_sheet(file) for file in files]
-    understanding = parts.Understanding(sheets, answers)
+    understanding = parts.LaboratoryImport(sheets, answers)
     if model is not None:
         quantity_of_output = parts.choose_model(model).model.output_quantity
-        understanding = parts.Understanding(understanding.sheets, answers, quantity_of_output)
+        understanding = parts.LaboratoryImport(understanding.sheets, answers, quantity_of_output)
     _show_understanding(understanding)
     is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
     if is_interactive and (understanding.questions or understanding.assumptions):
@@ -432,7 +432,7 @@ def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
     return answers
 
 
-def _with_answer_of_user(understanding: "parts.Understanding") -> "parts.Understanding":
+def _with_answer_of_user(understanding: "parts.LaboratoryImport") -> "parts.LaboratoryImport":
     """Ask the user one question, and return the understanding with the answer.
 
     Questions that must be answered come first, then those with a default, which an empty line
@@ -455,7 +455,7 @@ def _with_answer_of_user(understanding: "parts.Understanding") -> "parts.Underst
         return understanding
 
 
-def _show_understanding(understanding: "parts.Understanding") -> None:
+def _show_understanding(understanding: "parts.LaboratoryImport") -> None:
     """Print how the columns of files are understood, each with a value that is not zero."""
     rows = []
     for column in understanding.columns:

@@ -31,7 +31,7 @@ from discrepancy.application import gives as gives
 from discrepancy.application import packed_beside as packed_beside
 from discrepancy.campaign.importing import OF_COLUMNS as OF_COLUMNS
 from discrepancy.campaign.importing import OF_FILES as OF_FILES
-from discrepancy.campaign.importing import Understanding as Understanding
+from discrepancy.campaign.importing import LaboratoryImport as LaboratoryImport
 from discrepancy.campaign.reading import read_campaign as read_campaign
 from discrepancy.campaign.records import Campaign as Campaign
 from discrepancy.campaign.sheet import read_sheet as read_sheet
@@ -52,13 +52,13 @@ from discrepancy.model_choice import ModelKind as ModelKind
 from discrepancy.model_choice import choice_of_run as choice_of_run
 from discrepancy.model_choice import choose_model as choose_model
 from discrepancy.parameters.calibration import calibrate_parameters as calibrate_parameters
+from discrepancy.report.decidability_text import group_lines as group_lines
+from discrepancy.report.decidability_text import needs as needs
+from discrepancy.report.decidability_text import neighbours as neighbours
+from discrepancy.report.decidability_text import seen_of as seen_of
 from discrepancy.report.figures import ReportInput as ReportInput
 from discrepancy.report.page import said_on_page as said_on_page
 from discrepancy.report.text import formula as formula
-from discrepancy.report.text import group_lines as group_lines
-from discrepancy.report.text import needs as needs
-from discrepancy.report.text import neighbours as neighbours
-from discrepancy.report.text import seen_of as seen_of
 from discrepancy.report.text import unit_text as unit_text
 from discrepancy.self_calibration import SelfCalibration as SelfCalibration
 from discrepancy.self_calibration import self_calibrate as self_calibrate

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from discrepancy.campaign.noise import pre_trigger_record, repeat_record
+from discrepancy.campaign.noise_records import pre_trigger_record, repeat_record
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import (
     Campaign,

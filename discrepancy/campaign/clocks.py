@@ -1,8 +1,8 @@
-"""Tables whose channels have columns of times of their own: which is whose, and one clock for all.
+"""Tables with several columns of times, put on one clock.
 
-A campaign's trial has one column of times. Its stamps are those of all clocks: each reading stays at its own
-time, and where a channel has none its cell is empty. Only what must be known at each stamp, a load or a
-temperature, is filled in, by what the campaign says it does between its samples.
+A campaign's trial has one column of times. Its stamps are those of all clocks: each reading stays
+at its own time, and where a channel has none its cell is empty. Only what must be known at each
+stamp, a load or a temperature, is filled in, by what the campaign says it does between its samples.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,25 +12,26 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from discrepancy.campaign.columns import INPUT, LEFT_OUT, NOISE, Column
-from discrepancy.campaign.heads import shared_words, words
+from discrepancy.campaign.clock_columns import TIME, TableClock
+from discrepancy.campaign.columns import INPUT, NOISE, LaboratoryColumn
 from discrepancy.campaign.records import FloatArray, Hold, TrialKind
-from discrepancy.campaign.sampling import EVEN, as_meant
-from discrepancy.errors import CampaignDataError, CampaignFileError, said
+from discrepancy.campaign.sampling import EVEN, as_meant, time_goes_back
+from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.words import counted, is_or_are, listing
-
-TIME = "time"
-
-
-class Clock(NamedTuple):
-    """A column of times, and the columns whose readings it stamps."""
-
-    times: Column
-    columns: tuple[Column, ...]
 
 
 class OneClock(NamedTuple):
-    """Cells of a table on one clock, the line of the file for each row, and how it came about."""
+    """A table whose N rows have one clock.
+
+    Attributes
+    ----------
+    cells : dict of str to tuple of str
+        Cells (N,) of each column by its title.
+    lines : tuple of int
+        Line of the file for each row.
+    sentence : str
+        Remark on how the clocks were merged.
+    """
 
     cells: dict[str, tuple[str, ...]]
     lines: tuple[int, ...]
@@ -38,13 +39,13 @@ class OneClock(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Stamps:
+class _ClockTimes:
     """The times of one clock.
 
     Attributes
     ----------
     seconds : (n,) ndarray
-        Strictly increasing.
+        Times [s], strictly increasing.
     rows : list of int
         Rows of the table in which they stand.
     """
@@ -53,210 +54,209 @@ class _Stamps:
     rows: list[int]
 
 
-def own_clocks(columns: Sequence[Column]) -> tuple[Clock, ...]:
-    """Return the clocks of a table and the columns of each.
-
-    A name says it, as `acc2` and `time2`, or else the place: a column of times stands before its columns, or
-    behind them in all cases.
-
-    Parameters
-    ----------
-    columns : sequence of Column
-        Those of one table, in its order.
-
-    Raises
-    ------
-    CampaignFileError
-        If neither names nor places say which clock a column has, or they contradict each other.
-    """
-    times = [column.head for column in columns if column.role == TIME]
-    others = [column.head for column in columns if column.role != TIME]
-    by_name = _by_names(times, others)
-    by_place = _by_places(times, [column.head for column in columns])
-    found = by_name or by_place
-    if found is None or (by_name and by_place and by_name != by_place):
-        why = "names and places contradict each other" if found else "neither names nor places say it"
-        raise CampaignFileError(
-            f"{columns[0].sheet.name} has the times {listing(map(repr, times))}, and which column has which "
-            f"is not clear ({why}): put each column of times before its columns, or leave all but one out "
-            "with --column NAME=-."
-        )
-    used = {column.head: column for column in columns if column.role != LEFT_OUT}
-    clocks = []
-    for head in times:
-        members = tuple(used[member] for member in found[head] if member in used)
-        if members:
-            clocks.append(Clock(used[head], members))
-    return tuple(clocks)
-
-
-def _by_names(times: Sequence[str], others: Sequence[str]) -> dict[str, list[str]] | None:
-    """Return the columns of each clock as names say it; None where they do not for each."""
-    shared = shared_words(times)
-    labels = {head: words(head) - shared for head in times}
-    found: dict[str, list[str]] = {head: [] for head in times}
-    for column in others:
-        matching = [head for head, label in labels.items() if label and label <= words(column)]
-        if len(matching) != 1:
-            return None
-        found[matching[0]].append(column)
-    return found if all(found.values()) else None
-
-
-def _by_places(times: Sequence[str], heads: Sequence[str]) -> dict[str, list[str]] | None:
-    """Return the columns of each clock as the order of heads says it; None where it does not."""
-    in_order = heads if heads[0] in times else heads[::-1]
-    if in_order[0] not in times:
-        return None
-    found: dict[str, list[str]] = {}
-    clock = in_order[0]
-    for head in in_order:
-        if head in times:
-            clock = head
-            found[clock] = []
-        else:
-            found[clock].append(head)
-    if not all(found.values()):
-        return None
-    return {head: [member for member in heads if member in members] for head, members in found.items()}
-
-
-# ---------------------------------------------------------------- one clock
-
-
 def on_one_clock(
-    clocks: Sequence[Clock], kind: str, decimal: str, holds: Mapping[str, str | None]
+    clocks: Sequence[TableClock], kind: str, decimal: str, holds: Mapping[str, str | None]
 ) -> OneClock:
-    """Return the columns of a table in SI on one clock.
+    """Return the columns of a table in SI, with the stamps of all its clocks as one clock.
 
     Parameters
     ----------
-    clocks : sequence of Clock
-        One or more, of one table.
+    clocks : sequence of TableClock
+        One clock or more, of one table.
     kind : str
-        That of its trial, or `NOISE`.
+        Kind of its trial, or `NOISE`.
     decimal : str
-        Mark of its decimals.
+        Decimal mark of its numbers.
     holds : mapping of str to str or None
-        What a load does between its samples, by the head of its column; where nobody said it, straight lines.
+        Course of a load between its samples, by the head of its column; None means linear.
 
     Raises
     ------
     CampaignFileError
-        If a reading has no time, loads are not recorded at the same time as anything else, rows at rest have
-        several times, or samples at rest several intervals.
+        If a reading has no time, the loads are not known at any time at which a channel is read,
+        rows at rest have several times, or samples at rest have several intervals.
     CampaignDataError
         If times do not increase.
     """
-    stamps = [_stamps(clock, decimal) for clock in clocks]
-    seconds, places = _merged(stamps)
-    if all(len(place) == len(seconds) for place in places):
-        sentence = f"{_whose(clocks)}: the clocks are equal and become one"
-    elif kind == NOISE:
-        return _in_order(clocks, stamps, decimal)
-    elif kind in (TrialKind.STATIC, TrialKind.FLIGHT):
+    times = [_clock_times(clock, decimal) for clock in clocks]
+    seconds, positions = _merged_times(times)
+    count = len(seconds)
+    clocks_are_equal = all(len(position) == count for position in positions)
+    if kind == NOISE and not clocks_are_equal:
+        return _rest_samples_in_order(clocks, times, decimal)
+    if kind in (TrialKind.STATIC, TrialKind.FLIGHT) and not clocks_are_equal:
         heads = listing(repr(clock.times.head) for clock in clocks)
         raise CampaignFileError(
-            f"{_file(clocks)}: the times {heads} differ, and a row of a {kind} trial is one state at rest: "
-            "leave all but one out with --column NAME=-."
+            f"{_file(clocks)}: the times {heads} differ, and a row of a {kind} trial is one state "
+            "at rest: leave all but one out with --column NAME=-."
         )
-    else:
+    sentence = f"{_who_is_stamped(clocks)}: the clocks are equal and become one"
+    if not clocks_are_equal:
         sentence = (
-            f"{_whose(clocks)}: one clock has the {len(seconds)} stamps of all, and a channel has no reading "
-            "where its own clock has no stamp"
+            f"{_who_is_stamped(clocks)}: one clock has the {count} stamps of all, and a channel "
+            "has no reading where its own clock has no stamp"
         )
-    cells: dict[str, list[str]] = {TIME: [f"{moment:.15g}" for moment in seconds.tolist()]}
-    inside = np.ones(len(seconds), dtype=bool)
-    filled = []
-    for clock, own, place in zip(clocks, stamps, places, strict=True):
+
+    cells: dict[str, list[str]] = {TIME: _printed(seconds)}
+    loads_are_known = np.ones(count, dtype=bool)
+    filled_loads = []
+    for clock, own_times, position in zip(clocks, times, positions, strict=True):
         for column in clock.columns:
-            column_cells = _placed(column.in_si(decimal), own.rows, place, len(seconds))
-            if _is_known_throughout(column, kind) and len(place) < len(seconds):
-                inside &= (seconds >= own.seconds[0]) & (seconds <= own.seconds[-1])
+            column_cells = _at_positions(column.in_si(decimal), own_times.rows, position, count)
+            if _must_be_known_throughout(column, kind) and len(position) < count:
+                is_after_begin = seconds >= own_times.seconds[0]
+                loads_are_known &= is_after_begin & (seconds <= own_times.seconds[-1])
                 hold = _hold(column, holds)
-                _fill(column_cells, seconds, place, hold)
-                filled.append(f"{column.head!r} ({hold.value.replace('_', ' ')})")
+                _fill_between_samples(column_cells, seconds, position, hold)
+                filled_loads.append(f"{column.head!r} ({hold.value.replace('_', ' ')})")
             cells[column.title] = column_cells
-    kept = np.flatnonzero(inside).tolist()
-    kept_cells = {title: tuple(column[at] for at in kept) for title, column in cells.items()}
-    if unread := [title for title, column in kept_cells.items() if not any(column)]:
+
+    rows = np.flatnonzero(loads_are_known).tolist()
+    cells_of_rows = {title: tuple(column[row] for row in rows) for title, column in cells.items()}
+    unread = [title for title, column in cells_of_rows.items() if not any(column)]
+    if unread:
         raise CampaignFileError(
-            f"{_file(clocks)}: there is no time at which both {listing(filled)} and {unread[0]!r} are known, "
-            "and a load must be known while a channel is read."
+            f"{_file(clocks)}: there is no time at which both {listing(filled_loads)} and "
+            f"{unread[0]!r} are known, and a load must be known while a channel is read."
         )
-    if filled:
-        sentence += f"; loads are filled in there as they go between their samples: {listing(filled)}"
-    if len(kept) < len(seconds):
-        outside = len(seconds) - len(kept)
-        sentence += (
-            f"; {counted(outside, 'stamp')} before or after their records {is_or_are(outside)} left out"
-        )
-    lines = _lines(clocks, stamps, places, len(seconds))
-    return OneClock(kept_cells, tuple(lines[at] for at in kept), sentence)
+    sentence += _remark_on_loads(filled_loads, outside=count - len(rows))
+    lines = _lines(clocks, times, positions, count)
+    return OneClock(cells_of_rows, tuple(lines[row] for row in rows), sentence)
 
 
-def _file(clocks: Sequence[Clock]) -> str:
+def _remark_on_loads(filled_loads: Sequence[str], outside: int) -> str:
+    """Return the end of the remark: which loads were filled in, and how many stamps are left out.
+
+    Parameters
+    ----------
+    filled_loads : sequence of str
+        Loads that were filled in between their samples, and how.
+    outside : int
+        Number of stamps before or after the records of these loads.
+    """
+    remark = ""
+    if filled_loads:
+        remark += (
+            f"; loads are filled in there as they go between their samples: {listing(filled_loads)}"
+        )
+    if outside:
+        stamps = counted(outside, "stamp")
+        remark += f"; {stamps} before or after their records {is_or_are(outside)} left out"
+    return remark
+
+
+def _printed(seconds: FloatArray) -> list[str]:
+    """Return times [s] as cells of a table."""
+    return [f"{moment:.15g}" for moment in seconds.tolist()]
+
+
+def _file(clocks: Sequence[TableClock]) -> str:
+    """Return the name of the file that the clocks are from."""
     return clocks[0].times.sheet.name
 
 
-def _is_known_throughout(column: Column, kind: str) -> bool:
-    """Whether a trial needs a value of a column at each stamp: a load or a temperature."""
+def _must_be_known_throughout(column: LaboratoryColumn, kind: str) -> bool:
+    """Return whether a trial needs a value of a column at each stamp: a load or a temperature."""
     is_force = column.role == "force" and kind == TrialKind.FORCED
     return is_force or INPUT in column.role or column.role == "temperature"
 
 
-def _hold(column: Column, holds: Mapping[str, str | None]) -> Hold:
-    """Return what a load does between its samples; motions are smooth."""
+def _hold(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> Hold:
+    """Return the course of a load between its samples; motions are smooth."""
     if column.quantity is not None and column.quantity.moving:
         return Hold.SMOOTH
     return Hold(holds.get(column.head) or Hold.LINEAR)
 
 
-def _placed(cells: Sequence[str], rows: Sequence[int], place: Sequence[int], count: int) -> list[str]:
-    """Return cells of the rows of a table at their places among `count`; the others are empty."""
-    placed = [""] * count
-    for at, row in zip(place, rows, strict=True):
-        placed[at] = cells[row]
-    return placed
+def _at_positions(
+    cells: Sequence[str], rows: Sequence[int], positions: Sequence[int], count: int
+) -> list[str]:
+    """Return `count` cells, with cells of a table at some positions and empty ones elsewhere.
+
+    Parameters
+    ----------
+    cells : sequence of str
+        Cells of a column of the table.
+    rows : sequence of int
+        Rows of the table whose cells are taken.
+    positions : sequence of int
+        Position of each of them in the result.
+    count : int
+        Number of cells of the result.
+    """
+    result = [""] * count
+    for position, row in zip(positions, rows, strict=True):
+        result[position] = cells[row]
+    return result
 
 
 def _lines(
-    clocks: Sequence[Clock], stamps: Sequence[_Stamps], places: Sequence[Sequence[int]], count: int
+    clocks: Sequence[TableClock],
+    times: Sequence[_ClockTimes],
+    positions: Sequence[Sequence[int]],
+    count: int,
 ) -> list[int]:
-    """Return a line of the file for each of `count` stamps: that of the first clock that has it."""
+    """Return the line in the file of each of `count` stamps, by the first clock that has it."""
+    lines_of_rows = clocks[0].times.sheet.lines
     lines = [0] * count
-    for own, place in reversed([*zip(stamps, places, strict=True)]):
-        for at, row in zip(place, own.rows, strict=True):
-            lines[at] = clocks[0].times.sheet.lines[row]
+    # backwards, so that the first clock is written last
+    for own_times, position in reversed([*zip(times, positions, strict=True)]):
+        for index, row in zip(position, own_times.rows, strict=True):
+            lines[index] = lines_of_rows[row]
     return lines
 
 
-def _in_order(clocks: Sequence[Clock], stamps: Sequence[_Stamps], decimal: str) -> OneClock:
-    """Return samples at rest beside each other: their times do not matter but for the interval."""
-    intervals = [(own.seconds[-1] - own.seconds[0]) / max(len(own.seconds) - 1, 1) for own in stamps]
+def _rest_samples_in_order(
+    clocks: Sequence[TableClock], times: Sequence[_ClockTimes], decimal: str
+) -> OneClock:
+    """Return samples at rest of several clocks side by side: only their interval matters.
+
+    Raises
+    ------
+    CampaignFileError
+        If the clocks have several sampling intervals.
+    """
+    intervals = []
+    for own_times in times:
+        duration = own_times.seconds[-1] - own_times.seconds[0]
+        intervals.append(duration / max(len(own_times.seconds) - 1, 1))
     if max(intervals) - min(intervals) > EVEN * min(intervals):
         each = listing(
             f"{interval:.6g} s by {clock.times.head!r}"
             for clock, interval in zip(clocks, intervals, strict=True)
         )
         raise CampaignFileError(
-            f"{_file(clocks)}: samples at rest were taken every {each}, and a campaign has one interval for "
-            "all: save those of one rate, or state `noise` of the other channels in campaign.toml."
+            f"{_file(clocks)}: samples at rest were taken every {each}, and a campaign has one "
+            "interval for all: save those of one rate, or state `noise` of the other channels in "
+            "campaign.toml."
         )
-    longest = max(stamps, key=lambda own: len(own.seconds))
+    longest = max(times, key=lambda own_times: len(own_times.seconds))
     count = len(longest.seconds)
-    cells = {TIME: tuple(f"{moment:.15g}" for moment in longest.seconds.tolist())}
-    for clock, own in zip(clocks, stamps, strict=True):
+    cells = {TIME: tuple(_printed(longest.seconds))}
+    for clock, own_times in zip(clocks, times, strict=True):
+        first_positions = range(len(own_times.rows))
         for column in clock.columns:
-            first = range(len(own.rows))
-            cells[column.title] = tuple(_placed(column.in_si(decimal), own.rows, first, count))
+            column_cells = _at_positions(
+                column.in_si(decimal), own_times.rows, first_positions, count
+            )
+            cells[column.title] = tuple(column_cells)
     lines = tuple(clocks[0].times.sheet.lines[row] for row in longest.rows)
-    return OneClock(cells, lines, f"{_whose(clocks)}: samples at rest stand in their order")
+    sentence = f"{_who_is_stamped(clocks)}: samples at rest stand in their order"
+    return OneClock(cells, lines, sentence)
 
 
-def _stamps(clock: Clock, decimal: str) -> _Stamps:
-    """Return the times of a clock, even ones on their grid."""
-    sheet, cells = clock.times.sheet, clock.times.in_si(decimal)
+def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
+    """Return the times of a clock; those that are even to their printed digits lie on an even grid.
+
+    Raises
+    ------
+    CampaignFileError
+        If a reading has no time.
+    CampaignDataError
+        If times do not increase.
+    """
+    sheet = clock.times.sheet
+    cells = clock.times.in_si(decimal)
     rows = [row for row, cell in enumerate(cells) if cell]
     for column in clock.columns:
         for row, cell in enumerate(column.in_si(decimal)):
@@ -269,53 +269,93 @@ def _stamps(clock: Clock, decimal: str) -> _Stamps:
     seconds = np.array([float(cell) for cell in printed])
     backwards = np.flatnonzero(np.diff(seconds) <= 0.0)
     if backwards.size:
-        at = int(backwards[0])
-        told = {"at": at + 1, "time": printed[at], "then": printed[at + 1]}
         user = f"the column {clock.times.head!r}"
-        raise CampaignDataError(said("campaign.time_goes_back", file=sheet.name, user=user, **told))
-    return _Stamps(as_meant(seconds, printed) if len(rows) > 1 else seconds, rows)
+        raise CampaignDataError(time_goes_back(sheet.name, user, printed, int(backwards[0])))
+    if len(rows) > 1:
+        seconds = as_meant(seconds, printed)
+    return _ClockTimes(seconds, rows)
 
 
-def _merged(stamps: Sequence[_Stamps]) -> tuple[FloatArray, list[list[int]]]:
-    """Return the times of all clocks, and where those of each stand among them.
+def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[int]]]:
+    """Return the times of all clocks in one order.
 
-    Times of two clocks that differ by less than a thousandth of the shorter interval are one.
+    Times of two clocks that differ by less than a thousandth of the shortest interval become one.
+
+    Parameters
+    ----------
+    times : sequence of _ClockTimes
+        Times of each clock.
+
+    Returns
+    -------
+    seconds : (N,) ndarray
+        The common times [s].
+    positions : list of list of int
+        Positions of the times of each clock among them.
     """
-    steps = [float(np.median(np.diff(own.seconds))) for own in stamps if len(own.seconds) > 1]
+    steps = [
+        float(np.median(np.diff(own_times.seconds)))
+        for own_times in times
+        if len(own_times.seconds) > 1
+    ]
     tolerance = EVEN * min(steps, default=0.0)
-    moments = np.concatenate([own.seconds for own in stamps])
-    owners = np.repeat(np.arange(len(stamps)), [len(own.seconds) for own in stamps])
-    order = np.lexsort((owners, moments))
-    places: list[list[int]] = [[] for _ in stamps]
+    moments = np.concatenate([own_times.seconds for own_times in times])
+    counts = [len(own_times.seconds) for own_times in times]
+    clock_numbers = np.repeat(np.arange(len(times)), counts)
+    order = np.lexsort((clock_numbers, moments))
+
+    positions: list[list[int]] = [[] for _ in times]
     seconds: list[float] = []
-    present: set[int] = set()
-    for moment, owner in zip(moments[order].tolist(), owners[order].tolist(), strict=True):
-        if not seconds or owner in present or moment - seconds[-1] > tolerance:
+    clocks_at_last: set[int] = set()  # clocks that have the last of the common times
+    for moment, clock in zip(moments[order].tolist(), clock_numbers[order].tolist(), strict=True):
+        is_new = not seconds or moment - seconds[-1] > tolerance
+        if is_new or clock in clocks_at_last:
             seconds.append(moment)
-            present = set()
-        present.add(owner)
-        places[owner].append(len(seconds) - 1)
-    return np.array(seconds), places
+            clocks_at_last = set()
+        clocks_at_last.add(clock)
+        positions[clock].append(len(seconds) - 1)
+    return np.array(seconds), positions
 
 
-def _fill(cells: list[str], seconds: FloatArray, place: Sequence[int], hold: Hold) -> None:
-    """Write values of a load between its samples, as its hold has them; an empty sample stays empty."""
-    if len(place) < 2 or not all(cells[at] for at in place):
+def _fill_between_samples(
+    cells: list[str], seconds: FloatArray, positions: Sequence[int], hold: Hold
+) -> None:
+    """Write the values of a load between its samples into its empty cells.
+
+    A load with an empty sample, or with a single one, stays as it is.
+
+    Parameters
+    ----------
+    cells : list of str
+        Cells (N,) of the load, changed in place.
+    seconds : (N,) ndarray
+        Times of all cells [s].
+    positions : sequence of int
+        Positions of the load's own samples.
+    hold : Hold
+        Course between the samples.
+    """
+    if len(positions) < 2 or not all(cells[position] for position in positions):
         return
-    samples = np.array([float(cells[at]) for at in place])
-    own = seconds[list(place)]
+    samples = np.array([float(cells[position]) for position in positions])
+    sample_times = seconds[list(positions)]
     if hold is Hold.ZERO_ORDER:
-        values = samples[np.clip(np.searchsorted(own, seconds, side="right") - 1, 0, None)]
+        last_sample = np.searchsorted(sample_times, seconds, side="right") - 1
+        values = samples[np.clip(last_sample, 0, None)]
     elif hold is Hold.SMOOTH:
-        values = CubicSpline(own, samples)(seconds)
+        values = CubicSpline(sample_times, samples)(seconds)
     else:
-        values = np.interp(seconds, own, samples)
-    for at in sorted({*range(len(seconds))} - {*place}):
-        cells[at] = f"{values[at]:.15g}"
+        values = np.interp(seconds, sample_times, samples)
+    sampled = set(positions)
+    for index in range(len(seconds)):
+        if index not in sampled:
+            cells[index] = f"{values[index]:.15g}"
 
 
-def _whose(clocks: Sequence[Clock]) -> str:
-    return listing(
-        f"{listing(repr(column.head) for column in clock.columns)} by {clock.times.head!r}"
-        for clock in clocks
-    )
+def _who_is_stamped(clocks: Sequence[TableClock]) -> str:
+    """Return which columns have which column of times, as the begin of a remark."""
+    phrases = []
+    for clock in clocks:
+        heads = listing(repr(column.head) for column in clock.columns)
+        phrases.append(f"{heads} by {clock.times.head!r}")
+    return listing(phrases)

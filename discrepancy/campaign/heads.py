@@ -1,4 +1,4 @@
-"""What the heads of a table's columns say: names, units, and which columns are times."""
+"""Heads of the columns of a laboratory's table: their names and units, and which are times."""
 
 import re
 from collections.abc import Sequence
@@ -7,7 +7,9 @@ from discrepancy.campaign.quantity import Quantity
 from discrepancy.campaign.units import conversion, quantities_of
 
 _LONGEST_HEAD = 200
-_HEAD = re.compile(r"(.+?)(?:(?!\S\d+\S$)\s*(?:\[([^][]+)\]|\(([^()]+)\))|\s+/\s+(.+)|,\s+(.+)|\s+in\s+(.+))")
+_HEAD = re.compile(
+    r"(.+?)(?:(?!\S\d+\S$)\s*(?:\[([^][]+)\]|\(([^()]+)\))|\s+/\s+(.+)|,\s+(.+)|\s+in\s+(.+))"
+)
 """Name and unit; a number that touches its name, as in `strain[1]`, is part of it."""
 _WORD = re.compile(r"[A-Z]?[^\W\d_A-Z]+|[A-Z]+|\d+")
 _TIME_NAME = re.compile(r"(?:.*\.)?(?:time|x_value)[ _]?\d*", re.IGNORECASE)
@@ -15,22 +17,33 @@ _TIME_NAME = re.compile(r"(?:.*\.)?(?:time|x_value)[ _]?\d*", re.IGNORECASE)
 
 
 def named(text: str, unit: str) -> tuple[str, str]:
-    """Return name and unit of a head such as `Weg [mm]`, `F (kN)` or `t / s`; a row of units goes first."""
-    found = _HEAD.fullmatch(text[:_LONGEST_HEAD])
-    said = "" if found is None else next(filter(None, found.groups()[1:]), "").strip()
-    if found is not None and is_unit(said):
-        return found[1].strip(), unit or plain_unit(said)
-    return text, unit
+    """Return the name and the unit of a column's head such as `Weg [mm]`, `F (kN)` or `t / s`.
+
+    Parameters
+    ----------
+    text : str
+        The head.
+    unit : str
+        Unit from a row of units below the heads, which comes first; empty if there is none.
+    """
+    match = _HEAD.fullmatch(text[:_LONGEST_HEAD])
+    if match is None:
+        return text, unit
+    name, *forms_of_unit = match.groups()
+    unit_of_head = next(filter(None, forms_of_unit), "").strip()
+    if not is_unit(unit_of_head):
+        return text, unit
+    return name.strip(), unit or plain_unit(unit_of_head)
 
 
 def plain_unit(text: str) -> str:
-    """Return a unit without brackets; a dash is that of a plain number."""
+    """Return a unit without brackets; a dash stands for a plain number."""
     text = text.strip("[]() ")
     return "1" if text in ("-", "–") else text
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is a unit of a quantity that is measured here, or of time."""
+    """Return whether a text is a unit of time, or of a quantity that channels measure."""
     unit = plain_unit(text)
     try:
         return bool(quantities_of(unit)) or bool(conversion(unit, "s"))
@@ -39,7 +52,7 @@ def is_unit(text: str) -> bool:
 
 
 def load_or_time(unit: str) -> str:
-    """Return "time" or "force" where a unit is one of them."""
+    """Return "time" or "force" for a unit of one of them, else an empty text."""
     try:
         return "time" if conversion(unit, "s") else ""
     except ValueError:
@@ -47,24 +60,32 @@ def load_or_time(unit: str) -> str:
 
 
 def times_among(heads: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
-    """Return the columns of times of a table: one, or several of names of one kind as `time1` and `time2`.
+    """Return the heads of the columns of times of a table.
 
-    None where several have nothing in common: one may be a delay, or another clock of the same rows.
+    There may be one, or several with similar names such as `time1` and `time2`. If several have no
+    word in common the result is empty: one may be a delay, or another clock of the same rows.
+
+    Parameters
+    ----------
+    heads : sequence of str
+        Names of the columns.
+    units : sequence of str
+        Their units; empty where a unit is not known.
     """
-    times = [
-        head
-        for head, unit in zip(heads, units, strict=True)
-        if load_or_time(unit) == "time" or (not unit and _TIME_NAME.fullmatch(head))
-    ]
+    times = []
+    for head, unit in zip(heads, units, strict=True):
+        is_named_so = not unit and _TIME_NAME.fullmatch(head)
+        if is_named_so or load_or_time(unit) == "time":
+            times.append(head)
     return tuple(times) if times and shared_words(times) else ()
 
 
 def words(head: str) -> frozenset[str]:
-    """Return the words and numbers that a head is made of, as `acc` and `1` of `acc1`."""
+    """Return the words and numbers in a head, in lower case: `acc` and `1` for `acc1`."""
     return frozenset(word.casefold() for word in _WORD.findall(head))
 
 
 def shared_words(heads: Sequence[str]) -> frozenset[str]:
-    """Return the words that all of some heads have, without numbers."""
+    """Return the words, without numbers, that all of several heads have in common."""
     common = frozenset.intersection(*map(words, heads))
     return frozenset(word for word in common if not word.isdigit())

@@ -1,15 +1,14 @@
-"""Which trials are kept for proof: whole trials or whole load levels, never samples of one record."""
+"""Which trials are held out for proof: whole trials or load levels, never samples of one record."""
 
-from collections import Counter
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 import numpy as np
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
-from discrepancy.errors import said
 
 SHARE = 0.25
-"""Share of the trials of a kind that is held out."""
+"""Fraction of the trials of a kind that is held out."""
 LEAST_TRIALS = 3
 """Fewest trials of a kind of which one can be spared."""
 LEAST_LEVELS = 6
@@ -17,91 +16,158 @@ LEAST_LEVELS = 6
 
 
 def choose_held_out(campaign: Campaign) -> Campaign:
-    """Return the campaign with trials held out; unchanged if some are already.
+    """Return the campaign with trials held out for proof; unchanged if it holds some out already.
 
-    The rule, by kind of trial, is the same for the same campaign:
+    The rule is deterministic, and applied to each kind of trial:
 
-    1. Of three or more trials, a quarter (rounded, at least one) is held out. Candidates come in the order of
-       their level (release displacement, largest force or load factor), those inside the range of levels
-       first, from the middle outwards, because proof between levels is asked for and not beyond them; of
-       equal levels the later trial. A trial is spared only if every channel, every run and every set of
-       inputs' kind that it has stays with the trials that are left.
-    2. If that spares none of a static or flight kind, every third interior load level of each trial with at
-       least six levels is held out as a trial of its own, if its load rises or falls all the way (a loading
-       path that turns must stay whole).
+    1. Of three or more trials, a quarter (rounded, at least one) is held out. Candidates are
+       ordered by their level (release displacement, largest force or load factor): those between
+       the extreme levels come first, from the middle outwards, because a model is to be proved
+       between levels and not beyond them; of equal levels the later trial comes first. A trial is
+       held out only if its channels, its run and its load place still occur in the trials that
+       remain.
+    2. If that holds out no static or flight trial, every third interior load level of each such
+       trial with at least six levels is held out as a trial of its own. The load must rise or fall
+       throughout, because a load cycle has to stay whole.
 
     Returns
     -------
     Campaign
-        With a remark on what was held out, or on why nothing was.
+        The campaign with a remark on what is held out, or on why nothing is.
     """
     if campaign.held_out:
         return campaign
-    chosen: set[str] = set()
+    names = {trial.name for trial in campaign.trials}
+    held_out: set[str] = set()
     split: dict[str, tuple[Trial, Trial]] = {}
     for kind in TrialKind:
         trials = [trial for trial in campaign.trials if trial.kind is kind]
-        spared = _spared(trials, campaign, chosen)
-        chosen |= spared
+        spared = _spared_trials(trials, campaign, held_out)
+        held_out |= spared
         if not spared and kind in (TrialKind.STATIC, TrialKind.FLIGHT):
             for trial in trials:
-                parts = _split(trial, {item.name for item in campaign.trials})
-                if parts:
-                    split[trial.name] = parts
-    kept: list[Trial] = []
+                fitted_and_held_out = _split_by_levels(trial, names)
+                if fitted_and_held_out is not None:
+                    split[trial.name] = fitted_and_held_out
+    trials_marked: list[Trial] = []
     for trial in campaign.trials:
-        kept += split.get(trial.name, (replace(trial, held_out=trial.name in chosen),))
-    held = ", ".join(trial.name for trial in kept if trial.held_out)
-    remark = said("remarks.held_out", names=held) if held else said("remarks.nothing_held_out")
-    return replace(campaign, trials=tuple(kept), remarks=(*campaign.remarks, remark))
+        if trial.name in split:
+            trials_marked += split[trial.name]
+        else:
+            trials_marked.append(replace(trial, held_out=trial.name in held_out))
+    remark = _remark(trials_marked)
+    return replace(campaign, trials=tuple(trials_marked), remarks=(*campaign.remarks, remark))
 
 
-def _spared(trials: list[Trial], campaign: Campaign, taken: set[str]) -> set[str]:
-    if len(trials) < LEAST_TRIALS:
-        return set()
-    wanted = max(1, round(SHARE * len(trials)))
-    levels = np.array([trial.level for trial in trials])
-    middle = 0.5 * (levels.min() + levels.max())
-    inside = (levels > levels.min()) & (levels < levels.max())
-    # Stable: inside first, then by distance from the middle, then the later trial.
-    order = sorted(range(len(trials)), key=lambda i: (not inside[i], float(abs(levels[i] - middle)), -i))
-    spared: set[str] = set()
-    for index in order:
-        if len(spared) == wanted:
-            break
-        left = [trial for trial in trials if trial.name not in spared | {trials[index].name}]
-        others = [
-            trial
-            for trial in campaign.trials
-            if trial.kind is not trials[index].kind and trial.name not in taken
-        ]
-        if _stays_covered(trials[index], left, others):
-            spared.add(trials[index].name)
-    return spared
-
-
-def _stays_covered(trial: Trial, left: list[Trial], others: list[Trial]) -> bool:
-    """Return whether channels, run, place and level of a trial are still there without it."""
-    channels = Counter(name for item in left for name in item.channels)
-    levels = [item.level for item in left]
+def _remark(trials: Sequence[Trial]) -> str:
+    """Return the sentence on which of the trials are held out."""
+    names = [trial.name for trial in trials if trial.held_out]
+    if names:
+        return f"Held out for proof by the rule of the workflow: {', '.join(names)}."
     return (
-        all(channels[name] for name in trial.channels)
-        and any(item.run == trial.run for item in left + others)
-        and any(item.load_place == trial.load_place for item in left)
-        # Without the extreme level the model would be proved beyond what it has seen.
-        and min(levels) <= trial.level * (1.0 + 1e-9)
-        and max(levels) >= trial.level * (1.0 - 1e-9)
+        "Nothing is held out for proof: there are too few trials to spare one. Mark a trial with "
+        "`held_out = true`, or measure one more at another level."
     )
 
 
-def _split(trial: Trial, names: set[str]) -> tuple[Trial, Trial] | None:
-    """Return a trial without every third interior level, and those levels as a trial that is held out."""
-    load, steps = trial.load, np.diff(trial.load)
+def _spared_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[str]) -> set[str]:
+    """Return the names of the trials of one kind that can be held out.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        All trials of the kind.
+    campaign : Campaign
+        The whole campaign.
+    held_out : set of str
+        Names of trials of other kinds that are held out already.
+    """
+    if len(trials) < LEAST_TRIALS:
+        return set()
+    count = max(1, round(SHARE * len(trials)))
+    spared: set[str] = set()
+    for index in _order_of_candidates(trials):
+        if len(spared) == count:
+            break
+        candidate = trials[index]
+        remaining = [trial for trial in trials if trial.name not in spared | {candidate.name}]
+        of_other_kinds = [
+            trial
+            for trial in campaign.trials
+            if trial.kind is not candidate.kind and trial.name not in held_out
+        ]
+        if _stays_covered(candidate, remaining, of_other_kinds):
+            spared.add(candidate.name)
+    return spared
+
+
+def _order_of_candidates(trials: Sequence[Trial]) -> list[int]:
+    """Return the indices of trials in the order in which they are tried as held out."""
+    levels = np.array([trial.level for trial in trials])
+    lowest = levels.min()
+    highest = levels.max()
+    middle = 0.5 * (lowest + highest)
+    is_inside = (levels > lowest) & (levels < highest)
+
+    def priority(index: int) -> tuple[bool, float, int]:
+        # inside the range first, then by distance from its middle, then the later trial
+        return not is_inside[index], float(abs(levels[index] - middle)), -index
+
+    return sorted(range(len(trials)), key=priority)
+
+
+def _stays_covered(
+    candidate: Trial, remaining: Sequence[Trial], of_other_kinds: Sequence[Trial]
+) -> bool:
+    """Return whether the trials that remain cover a candidate: channels, run, load place and level.
+
+    Parameters
+    ----------
+    candidate : Trial
+        The trial that may be held out.
+    remaining : sequence of Trial
+        The other trials of its kind that are fitted.
+    of_other_kinds : sequence of Trial
+        Fitted trials of other kinds, which cover the run only.
+    """
+    channels = {name for trial in remaining for name in trial.channels}
+    if not channels.issuperset(candidate.channels):
+        return False
+    if not any(trial.run == candidate.run for trial in (*remaining, *of_other_kinds)):
+        return False
+    if not any(trial.load_place == candidate.load_place for trial in remaining):
+        return False
+    # without the extreme level the model would be proved beyond the levels that it was fitted to
+    levels = [trial.level for trial in remaining]
+    is_above_lowest = min(levels) <= candidate.level * (1.0 + 1e-9)
+    is_below_highest = max(levels) >= candidate.level * (1.0 - 1e-9)
+    return is_above_lowest and is_below_highest
+
+
+def _split_by_levels(trial: Trial, names: Set[str]) -> tuple[Trial, Trial] | None:
+    """Return a trial in two: without every third interior load level, and those levels held out.
+
+    Parameters
+    ----------
+    trial : Trial
+        A static or flight trial.
+    names : set of str
+        Names that the trial of the held-out levels must not have.
+
+    Returns
+    -------
+    (Trial, Trial) or None
+        The trial to fit and the trial held out; None with too few levels, or with a load that
+        turns.
+    """
+    load = trial.load
+    steps = np.diff(load)
     levels = np.unique(load)
-    if len(levels) < LEAST_LEVELS or not (np.all(steps >= 0.0) or np.all(steps <= 0.0)):
+    is_monotonic = np.all(steps >= 0.0) or np.all(steps <= 0.0)
+    if len(levels) < LEAST_LEVELS or not is_monotonic:
         return None
-    spared = np.isin(load, levels[2:-1:3])
+    is_held_out = np.isin(load, levels[2:-1:3])
     name = f"{trial.name}, levels held out"
     while name in names:
         name += "'"
-    return trial.rows(~spared), trial.rows(spared, name=name, held_out=True)
+    return trial.rows(~is_held_out), trial.rows(is_held_out, name=name, held_out=True)

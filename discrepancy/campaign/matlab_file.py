@@ -1,9 +1,8 @@
-"""MATLAB files as tables: vectors of one length are columns, by the names of variables and fields."""
+"""MATLAB files as tables: vectors of one length are columns."""
 
 import warnings
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from itertools import zip_longest
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -24,7 +23,17 @@ _HDF5_OFFSET = 512
 
 
 class MatlabTable(NamedTuple):
-    """Names and cells of the columns of a MATLAB file, and what was passed over."""
+    """The table in a MATLAB file.
+
+    Attributes
+    ----------
+    heads : tuple of str
+        Names of its C columns.
+    columns : tuple of tuple of str
+        Cells (C, N).
+    remark : str
+        How many rows there are, and which variables are left out.
+    """
 
     heads: tuple[str, ...]
     columns: tuple[tuple[str, ...], ...]
@@ -32,10 +41,10 @@ class MatlabTable(NamedTuple):
 
 
 def read_matlab(path: Path) -> MatlabTable:
-    """Return the table of a file of version 4 to 7.3.
+    """Return the table in a MATLAB file of version 4 to 7.3.
 
-    Vectors, the columns of matrices with up to 32 of them, and the same in fields of a struct are columns.
-    They have one length, or several where each length has a time of its own.
+    Its columns are vectors, the columns of matrices with at most 32 of them, and the same in the
+    fields of a struct. They have one length, or several if each length has a column of times.
 
     Raises
     ------
@@ -45,56 +54,71 @@ def read_matlab(path: Path) -> MatlabTable:
     columns: dict[str, np.ndarray] = {}
     passed_over: list[str] = []
     for name, value in _variables(path):
-        found = dict(_columns(name, value))
-        columns |= found
-        if not found:
+        columns_of_variable = _columns(name, value)
+        columns |= columns_of_variable
+        if not columns_of_variable:
             passed_over.append(name)
     if not columns:
-        has = listing(map(repr, passed_over)) or "nothing"
+        content = listing(map(repr, passed_over)) or "nothing"
         raise CampaignFileError(
-            f"{path.name} holds no vectors of numbers (it has {has}): save columns as plain vectors; a table "
-            "as S = table2struct(T, 'ToScalar', true), and a datetime as seconds(t - t(1))."
+            f"{path.name} holds no vectors of numbers (it has {content}): save columns as plain "
+            "vectors; a table as S = table2struct(T, 'ToScalar', true), and a datetime as "
+            "seconds(t - t(1))."
         )
-    table = _of_fitting_lengths(columns)
+    table = _columns_of_fitting_lengths(columns)
     passed_over += [name for name in columns if name not in table]
-    cells = zip(*zip_longest(*map(_cells, table.values()), fillvalue=""), strict=True)
-    count = max(map(len, table.values()))
-    remark = f"rows 1 to {count} of {counted(len(table), 'vector')}"
+    cells = [_cells(column) for column in table.values()]
+    row_count = max(map(len, cells))
+    # shorter columns end with empty cells
+    padded = tuple((*column, *[""] * (row_count - len(column))) for column in cells)
+    remark = f"rows 1 to {row_count} of {counted(len(table), 'vector')}"
     if passed_over:
         remark += f"; left out: {listing(map(repr, passed_over))}"
-    return MatlabTable(tuple(table), tuple(cells), remark)
+    return MatlabTable(tuple(table), padded, remark)
 
 
 def _variables(path: Path) -> Iterator[tuple[str, object]]:
-    """Yield the variables of a file, and the fields of structs as `NAME.FIELD`."""
+    """Yield the names and values of variables of a file; fields of structs are called `NAME.FIELD`.
+
+    Raises
+    ------
+    CampaignFileError
+        If the file cannot be read.
+    """
     try:
-        with path.open("rb") as stream:
-            start = stream.read(_HDF5_OFFSET + len(_HDF5))
-        is_hdf5 = start.endswith(_HDF5) or start.startswith(_HDF5)
-        content = _hdf5_content(path) if is_hdf5 else _plain_content(path)
-    except Exception as cause:  # readers of damaged files raise nearly anything
+        content = _hdf5_content(path) if _is_hdf5(path) else _content_before_hdf5(path)
+    except Exception as cause:  # the libraries raise almost any error for damaged files
         raise CampaignFileError(
             f"{path} cannot be read as a MATLAB file ({one_line(cause)}): save it anew with "
             "save('FILE.mat', '-v7')."
         ) from cause
     for name, value in content.items():
         if isinstance(value, Mapping):
-            for field, inner in value.items():
-                yield f"{name}.{field}", inner
+            for field, field_value in value.items():
+                yield f"{name}.{field}", field_value
         else:
             yield name, value
 
 
-def _plain_content(path: Path) -> dict[str, object]:
-    """Return the variables of a file of version 4 to 7, structs as mappings."""
+def _is_hdf5(path: Path) -> bool:
+    """Return whether a file is of version 7.3: HDF5, with or without a user block before it."""
+    with path.open("rb") as stream:
+        start = stream.read(_HDF5_OFFSET + len(_HDF5))
+    return start.endswith(_HDF5) or start.startswith(_HDF5)
+
+
+def _content_before_hdf5(path: Path) -> dict[str, object]:
+    """Return the variables of a file of version 4 to 7.
+
+    A single struct is a mapping of its fields.
+    """
     with warnings.catch_warnings(action="ignore"):
         content = loadmat(path, squeeze_me=False, struct_as_record=True)
-    variables = {name: value for name, value in content.items() if not name.startswith("__")}
-    return {name: _struct(value) for name, value in variables.items()}
+    return {name: _struct(value) for name, value in content.items() if not name.startswith("__")}
 
 
 def _struct(value: object) -> object:
-    """Return a single struct as a mapping of its fields, anything else as it is."""
+    """Return a single struct as a mapping of its fields, and any other value as it is."""
     if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1:
         record = value.reshape(-1)[0]
         return {field: record[field] for field in value.dtype.names}
@@ -102,43 +126,73 @@ def _struct(value: object) -> object:
 
 
 def _hdf5_content(path: Path) -> dict[str, object]:
-    """Return the variables of a file of version 7.3, which stores matrices transposed."""
+    """Return the variables of a file of version 7.3; a struct is a mapping of its fields.
 
-    def value(item: h5py.Dataset | h5py.Group, depth: int = 0) -> object:
-        if isinstance(item, h5py.Group):
-            return {name: value(inner, 1) for name, inner in item.items()} if depth == 0 else None
-        is_text = item.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"string")
-        return None if is_text or "MATLAB_empty" in item.attrs else np.transpose(item[()])
-
+    Structs within structs are None, and so are texts and empty arrays.
+    """
+    variables: dict[str, object] = {}
     with h5py.File(path, "r") as file:
-        return {name: value(item) for name, item in file.items() if not name.startswith("#")}
+        for name, stored in file.items():
+            if name.startswith("#"):  # references that the format keeps for itself
+                continue
+            if isinstance(stored, h5py.Group):
+                variables[name] = {field: _hdf5_array(value) for field, value in stored.items()}
+            else:
+                variables[name] = _hdf5_array(stored)
+    return variables
 
 
-def _columns(name: str, value: object) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield the columns of a variable; none of what is no real vector, or no matrix of few columns."""
+def _hdf5_array(stored: h5py.Dataset | h5py.Group) -> np.ndarray | None:
+    """Return a matrix, which HDF5 has transposed; None for a group, a text or an empty array."""
+    if isinstance(stored, h5py.Group):
+        return None
+    is_text = stored.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"string")
+    if is_text or "MATLAB_empty" in stored.attrs:
+        return None
+    return np.transpose(stored[()])
+
+
+def _columns(name: str, value: object) -> dict[str, np.ndarray]:
+    """Return the columns of a variable by name; none unless it is a vector or a narrow matrix.
+
+    A matrix NAME has columns NAME 1, NAME 2, and so on, along its longer side.
+    """
     if isinstance(value, MatlabOpaque | MatlabFunction) or not isinstance(value, np.ndarray):
-        return
-    if value.dtype.kind not in "iufb" or value.ndim != 2 or value.size < 2:
-        return
+        return {}
+    is_real = value.dtype.kind in "iufb"
+    if not is_real or value.ndim != 2 or value.size < 2:
+        return {}
     if min(value.shape) == 1:
-        yield name, value.reshape(-1)
-    elif min(value.shape) <= _MOST_COLUMNS:
-        matrix = value if value.shape[1] <= value.shape[0] else value.T
-        for number, column in enumerate(matrix.T, start=1):
-            yield f"{name} {number}", column
+        return {name: value.reshape(-1)}
+    if min(value.shape) > _MOST_COLUMNS:
+        return {}
+    matrix = value if value.shape[1] <= value.shape[0] else value.T
+    return {f"{name} {number}": column for number, column in enumerate(matrix.T, start=1)}
 
 
-def _of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns of the length that most numbers have, and of others that have times of their own."""
+def _columns_of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the columns that can stand in one table.
+
+    These are the columns of the length that holds most numbers. If columns of times have several
+    lengths, the columns of these lengths are in the table, too.
+    """
     lengths = Counter(len(column) for column in columns.values())
-    main = max(lengths, key=lambda length: (length * lengths[length], length))
+    main_length = max(lengths, key=lambda length: (length * lengths[length], length))
     times = times_among([*columns], [""] * len(columns))
-    timed = {len(columns[name]) for name in times}
-    kept = timed | {main} if len(timed) > 1 else {main}
-    return {name: column for name, column in columns.items() if len(column) in kept}
+    accepted = {len(columns[name]) for name in times}
+    if len(accepted) > 1:
+        accepted.add(main_length)
+    else:
+        accepted = {main_length}
+    return {name: column for name, column in columns.items() if len(column) in accepted}
 
 
-def _cells(column: np.ndarray) -> Sequence[str]:
-    """Return the cells of a column; one that is not a number is empty."""
-    values = cast("list[float]", (column.astype(int) if column.dtype == bool else column).tolist())
-    return ["" if value != value else repr(value) for value in values]
+def _cells(column: np.ndarray) -> list[str]:
+    """Return the cells of a column as texts; a value that is not a number is an empty cell."""
+    if column.dtype == bool:
+        column = column.astype(int)
+    cells = []
+    for value in cast("list[float]", column.tolist()):
+        is_nan = value != value
+        cells.append("" if is_nan else repr(value))
+    return cells

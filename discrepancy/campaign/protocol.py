@@ -1,45 +1,59 @@
-"""How trials began and what happened in them, as files and models have it: one record each."""
+"""Releases and events: how ring-downs began, and what happened during trials.
+
+The same records are read from files and used by models.
+"""
 
 from dataclasses import field
 from keyword import iskeyword
 from math import inf, isinf
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, PlainSerializer, WrapValidator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    WrapValidator,
+)
 from pydantic.dataclasses import dataclass
 from pydantic_core import PydanticKnownError
 
-from discrepancy.errors import CampaignFileError, said
+from discrepancy.errors import CampaignFileError
 from fe.runtime.expression import RESERVED
 from reporting.toml_file import Name, NotNegative, Number, Positive
 
 MOST_MODES = 100
 IN_FILES = ConfigDict(extra="forbid", strict=False)
-"""How a table of a file becomes a record: unknown keys are refused; fields say how strict they are."""
+"""How a table of a file becomes a record: unknown keys are refused, and types are converted."""
 LIST = BeforeValidator(lambda value: tuple(value) if isinstance(value, list) else value)
-"""What a list of the file becomes before it is checked."""
+"""Turns a list of the file into a tuple before it is checked."""
 
 
-def _refused(value: object) -> object:
+def _refuse_key(value: object) -> object:
+    """Refuse a key as one that no file may have."""
     raise PydanticKnownError("unexpected_keyword_argument")
 
 
-def _needed(value: str) -> str:
+def _refuse_empty_text(value: str) -> str:
+    """Return a text; refuse an empty one as a missing key."""
     if not value:
         raise PydanticKnownError("missing")
     return value
 
 
-NOT_IN_FILES = BeforeValidator(_refused)
-"""Of a key that the tables of samples at rest say, and a file cannot."""
-InFiles = Annotated[str, AfterValidator(_needed), Field(max_length=200, validate_default=True)]
-"""What all have that are in files."""
+NOT_IN_FILES = BeforeValidator(_refuse_key)
+"""Marks a field that is read from the tables, and that the TOML file must not state."""
+InFiles = Annotated[
+    str, AfterValidator(_refuse_empty_text), Field(max_length=200, validate_default=True)
+]
+"""A text that every file must state, although records in memory may leave it empty."""
 Deviation = Annotated[
     NotNegative,
     WrapValidator(lambda value, check: inf if value == "free" else check(value)),
     PlainSerializer(lambda value: "free" if isinf(value) else value, when_used="json"),
 ]
-"""In files an infinite one is "free"."""
+"""A standard deviation; an infinite one is written "free" in files."""
 
 ACCEPTABLE = (
     "clipped",
@@ -57,13 +71,16 @@ ACCEPTABLE = (
 """Faults of data that a campaign may accept, as `discrepancy.checks.fault.FaultKind` calls them."""
 
 
-def _is_acceptable(word: str) -> str:
+def _checked_fault(word: str) -> str:
+    """Return the name of an acceptable fault; raise ValueError for any other word."""
     if word not in ACCEPTABLE:
-        raise ValueError(f"{word!r} is no fault that can be accepted; these are {', '.join(ACCEPTABLE)}")
+        raise ValueError(
+            f"{word!r} is no fault that can be accepted; these are {', '.join(ACCEPTABLE)}"
+        )
     return word
 
 
-Accepted = Annotated[tuple[Annotated[str, AfterValidator(_is_acceptable)], ...], LIST]
+Accepted = Annotated[tuple[Annotated[str, AfterValidator(_checked_fault)], ...], LIST]
 """Faults of data that a campaign, a channel or a trial accepts: words of `ACCEPTABLE`."""
 
 
@@ -76,22 +93,23 @@ class Release:
     displacement : float
         Nominal displacement of the release point before the release [`unit`], not zero.
     deviation : float
-        Prior relative standard deviation of it [1].
+        Prior standard deviation of the displacement, as a fraction of it [1].
     at_rest : bool
-        True: the first sample is at the release, from the static shape under the holding force, and higher
-        modes start as that shape says, within `deviation`; False: the record starts later, and displacement
-        and velocity of each of `mode_count` modes are free.
+        True: the first sample is at the release, from the static shape under the holding force, and
+        higher modes start as that shape says, within `deviation`; False: the record starts later,
+        and displacement and velocity of each of `mode_count` modes are free.
     mode_count : int
-        Modes whose initial state is free, at least 1: the first entry is the amplitude, within `deviation`.
+        Modes whose initial state is free, at least 1: the first entry is the amplitude, within
+        `deviation`.
     time_zero_deviation : float
         Prior standard deviation of the time between release and first sample [s].
     unit : str
-        m or V, or 1 of another signal; of a file any that is known, until it is read.
+        Unit of the displacement: m, V, or 1 for another signal. A file may also say mm, um or mV.
 
     Raises
     ------
     ValueError
-        A value is out of its range, such as a displacement of zero.
+        If a value is out of its range, such as a displacement of zero.
     """
 
     displacement: Number
@@ -105,30 +123,35 @@ class Release:
 
     def __post_init__(self) -> None:
         if self.displacement == 0.0:
-            raise CampaignFileError(said("campaign.no_side"))
+            raise CampaignFileError(
+                "The displacement of a release must not be zero: its sign is the side to which the "
+                "structure is held."
+            )
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in trials, known from a protocol.
+    """Something that happened during trials at a known time, such as a screw that was loosened.
 
     Attributes
     ----------
     name : str
-        As expressions use it; `name_until` is its end.
+        Name in expressions, where ``NAME`` is its time and ``NAME_until`` its end.
     trials : tuple of str
-        Trials in which it happened.
+        Names of the trials in which it happened.
     time : float
-        Since each trial's start [s].
+        Time since the start of each of these trials [s].
     until : float or None
-        When it was over [s]; None where nothing is said.
+        Its end [s]; None if it is not stated.
     trial : str or None
-        Of a file, in the place of `trials`; without both it happened in all that are samples in time.
+        A single trial, which a file may state in place of `trials`. Without both the event happened
+        in all trials that are records in time.
 
     Raises
     ------
     ValueError
-        The name cannot be used in expressions, or trials or end are none.
+        If the name cannot be used in expressions, `trial` and `trials` are both stated, or the end
+        is not after the begin.
     """
 
     name: Name
@@ -140,17 +163,28 @@ class Event:
     __pydantic_config__ = IN_FILES
 
     def __post_init__(self) -> None:
-        for wrong, sentence in (
-            (not self.name.isidentifier(), "event_name"),
-            (self.name in RESERVED or iskeyword(self.name), "event_reserved"),
-            (self.trial is not None and self.trials != (), "event_trials"),
-            (self.until is not None and self.until <= self.time, "event_end"),
-        ):
-            if wrong:
-                raise CampaignFileError(said(f"campaign.{sentence}", event=self))
+        subject = f"the event {self.name!r}"
+        if not self.name.isidentifier():
+            raise CampaignFileError(
+                f"{subject} is used in expressions, so its name must be of letters, digits and "
+                "underscores, a letter first"
+            )
+        if self.name in RESERVED or iskeyword(self.name):
+            raise CampaignFileError(
+                f"{subject} has a name that means something else in an expression: rename it"
+            )
+        if self.trial is not None and self.trials != ():
+            raise CampaignFileError(f"{subject} has `trial` and `trials`: give one of the two")
+        if self.until is not None and self.until <= self.time:
+            raise CampaignFileError(
+                f"{subject} begins at {self.time:g} s and must end later, but `until` is "
+                f"{self.until:g} s"
+            )
 
     @property
     def moments(self) -> dict[str, float]:
-        """Begin and end, where it has one, by the names that expressions use [s]."""
-        begin = {self.name: self.time}
-        return begin if self.until is None else {**begin, f"{self.name}_until": self.until}
+        """Times of its begin and, if it is stated, of its end [s], by the names in expressions."""
+        moments = {self.name: self.time}
+        if self.until is not None:
+            moments[f"{self.name}_until"] = self.until
+        return moments

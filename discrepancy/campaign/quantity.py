@@ -4,7 +4,7 @@ from enum import StrEnum
 
 
 class Quantity(StrEnum):
-    """What a channel or an input is; the unit of its values here is that of `units.UNITS`."""
+    """The physical quantity of a channel or an input; `units.UNITS` has the units of each."""
 
     STRAIN = "strain"
     DISPLACEMENT = "displacement"
@@ -27,25 +27,28 @@ class Quantity(StrEnum):
 
     @property
     def moving(self) -> "tuple[Quantity, ...]":
-        """The quantity, if it is of a motion, among those that follow one another by derivation."""
-        return next((family for family in _MOVING if self in family), ())
+        """A quantity of motion with its time derivatives, from displacement to acceleration.
+
+        Empty for a quantity that is not one of motion.
+        """
+        return next((family for family in _MOTIONS if self in family), ())
 
     @property
     def order(self) -> int:
-        """How often a displacement is derived to be this; if it is, it is nought at rest."""
+        """Order of the time derivative of a displacement or an angle: 1 for a velocity."""
         return _ORDERS.get(self, 0)
 
     def derivatives_of(self, output: "Quantity") -> int:
-        """Return how often an output of a model is derived in time for a channel of this quantity."""
+        """Return how often a model's output is differentiated in time to give this quantity."""
         return max(self.order - output.order, 0) if output in self.moving else 0
 
     def shows(self, output: "Quantity") -> bool:
-        """Whether a channel of this quantity can measure what an output of a model is."""
+        """Return whether a channel of this quantity can measure an output of another quantity."""
         return self is output or self is Quantity.SIGNAL or self.derivatives_of(output) > 0
 
 
-_MOVING = (
+_MOTIONS = (
     (Quantity.DISPLACEMENT, Quantity.VELOCITY, Quantity.ACCELERATION),
     (Quantity.ANGLE, Quantity.ANGULAR_VELOCITY, Quantity.ANGULAR_ACCELERATION),
 )
-_ORDERS = {quantity: order for family in _MOVING for order, quantity in enumerate(family)}
+_ORDERS = {quantity: order for family in _MOTIONS for order, quantity in enumerate(family)}

@@ -1,6 +1,7 @@
 """A measurement campaign: trials, channels, noise records and states, as records in SI units.
 
-`discrepancy.campaign.reading` reads one from a folder; strain is dimensionless here, displacement in metres.
+`discrepancy.campaign.reading` reads one from a folder; strain is dimensionless here, displacement
+in metres.
 """
 
 from collections.abc import Collection, Iterator, Mapping
@@ -8,30 +9,24 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from itertools import product
-from math import inf
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
-from discrepancy.campaign.protocol import IN_FILES, NOT_IN_FILES, Accepted, Deviation, Event, InFiles, Release
+from discrepancy.campaign.channels import BoolArray as BoolArray
+from discrepancy.campaign.channels import Channel as Channel
+from discrepancy.campaign.channels import FloatArray as FloatArray
+from discrepancy.campaign.channels import Hold as Hold
+from discrepancy.campaign.channels import InTables as InTables
+from discrepancy.campaign.channels import IntArray as IntArray
+from discrepancy.campaign.channels import NoiseRecord as NoiseRecord
+from discrepancy.campaign.channels import RecordedInput as RecordedInput
+from discrepancy.campaign.protocol import Accepted, Event, InFiles, Release
 from discrepancy.campaign.quantity import Quantity as Quantity
 from discrepancy.campaign.sampling import nearly_even
-from reporting.toml_file import Name, NotNegative, Number, Positive
+from reporting.toml_file import Name, Number, Positive
 from reporting.words import brief
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-IntArray = NDArray[np.int64]
-
-
-class Hold(StrEnum):
-    """What an input does between its samples."""
-
-    ZERO_ORDER = "zero_order"  # each value is held until the next sample, as a converter does
-    LINEAR = "linear"  # straight lines
-    SMOOTH = "smooth"  # a cubic spline through all samples
 
 
 class Start(StrEnum):
@@ -52,151 +47,38 @@ class TrialKind(StrEnum):
     FLIGHT = "flight"  # rows are steady turns: a load factor
 
 
-@dataclass(frozen=True)
-class NoiseRecord:
-    """What is known of a channel's noise; `noise` of a channel in a file.
-
-    Attributes
-    ----------
-    standard_deviation : float
-        s0 [channel's unit].
-    degrees_of_freedom : float
-        n0; infinite if the standard deviation is taken as exact.
-    samples : (n,) ndarray or None
-        The recorded noise itself, mean removed, if there is one.
-    interval : float or None
-        Sampling interval of `samples` [s].
-    source : str
-        "pre-trigger", "repeats" or "stated".
-    file : str
-        That holds `samples`; empty where there is none.
-    """
-
-    standard_deviation: Positive
-    degrees_of_freedom: Positive = inf
-    samples: Annotated[FloatArray | None, NOT_IN_FILES] = None
-    interval: Annotated[float | None, NOT_IN_FILES] = None
-    source: Literal["pre-trigger", "repeats", "stated"] = "stated"
-    file: Annotated[str, NOT_IN_FILES] = field(default="", compare=False)
-
-    __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
-
-
-@dataclass(frozen=True)
-class InTables:
-    """What has a column of a campaign's tables.
-
-    Attributes
-    ----------
-    name : str
-        Unique in the campaign; also the column of the tables unless the file says otherwise.
-    quantity : Quantity
-        What it is.
-    column, unit : str
-        Of the files; empty where there are none, or the column is called as the name.
-    """
-
-    name: Name
-    quantity: Quantity
-    column: Name = field(default="", compare=False, kw_only=True)
-    unit: InFiles = field(default="", compare=False, kw_only=True)
-
-    __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
-
-    @property
-    def table_column(self) -> str:
-        """Column of the tables."""
-        return self.column or self.name
-
-
-@dataclass(frozen=True)
-class RecordedInput(InTables):
-    """What one input of a model was in a trial; without its values `[[input]]` of a file.
-
-    Attributes
-    ----------
-    name : str
-        Input of the model.
-    values : (N,) ndarray
-        At the samples [SI].
-    hold : Hold or None
-        Between them; None: nobody said it, and it is taken as linear.
-    offset_deviation : float
-        Prior standard deviation of a constant that the record lacks in this trial [SI]; zero: none.
-    reference : bool
-        Of a motion in a file: it is none of the structure, so that it need not be smooth.
-    """
-
-    values: Annotated[FloatArray, NOT_IN_FILES, Field(default=np.empty(0), exclude=True)]
-    hold: Hold | None = None
-    offset_deviation: NotNegative = 0.0
-    reference: Annotated[bool, Field(strict=True)] = field(default=False, compare=False)
-
-
-@dataclass(frozen=True)
-class Channel(InTables):
-    """One measuring channel; `[[channel]]` of a file, until it is read in its unit.
-
-    Attributes
-    ----------
-    output : str
-        The model's output that it is compared with, such as "strain[17]" or "tip_displacement".
-    noise : NoiseRecord or None
-        None: nothing is known, and no absolute statement about the fit can be made.
-    gain_deviation : float
-        Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of unknown
-        scale (one of them is then the scale of the release amplitudes).
-    offset_deviation : float
-        Prior standard deviation of its zero in each trial [channel's unit]; infinite: a free zero.
-    station : float or None
-        Place along the span [m], for maps.
-    chord : float or None
-        Place along the chord [fraction], for maps.
-    accept : tuple of str
-        Faults of its data that are no faults, in all trials: words of `ACCEPTABLE`.
-    """
-
-    output: Name
-    noise: NoiseRecord | None = None
-    gain_deviation: Deviation = 0.0
-    offset_deviation: Deviation = 0.0
-    station: Number | None = None
-    chord: Number | None = None
-    accept: Accepted = ()
-
-    def noise_in(self, trial: "Trial") -> float:
-        """Return the deviation of its noise in a trial [its unit], 0 where it is not known."""
-        return 0.0 if self.noise is None else self.noise.standard_deviation * trial.noise_factor
-
-
 USUAL_REGIONS = ("z1", "z2")
-"""Damage regions that every trial knows: those of the shipped wing."""
+"""Damage regions of the shipped wing, which every trial has."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialKeys:
-    """What a trial has as its file says it: a name that is unique in the campaign, and what was done.
+    """What the file of a campaign states of a trial, and a trial in memory keeps as it is.
 
     Attributes
     ----------
+    name : str
+        Name, unique in the campaign.
+    kind : TrialKind
+        What was done.
     file : str
-        That holds it; empty where there is none.
+        Name of its table; empty if it was not read from a file.
     run : str
         Label of the run (set-up) that the trial belongs to.
     held_out : bool
         True: not used to find or fit anything, only for proof.
     noise_factor : float
-        Standard deviation of the noise in this trial over that of the channels' noise records, as known from
-        the acquisition (averaging, another range) [1].
+        Standard deviation of the noise in this trial over that of the channels' noise records, as
+        known from the acquisition (averaging, another range) [1].
     load_place : str or tuple of float
-        Where the force acts: a named place of the model ("tip_load" is the wing's own), or (y [m] from the
-        root, x [fraction of the chord]).
+        Point at which the force acts: a name that the model knows ("tip_load" of the wing), or (y
+        [m] from the root, x [fraction of the chord]).
     release : Release or None
-        Ring-downs only.
+        How a ring-down began; None for other kinds.
     hold : Hold or None
-        Forced trials: as that of an input, for the force.
+        Course of the force of a forced trial between its samples.
     accept : tuple of str
-        Faults of its data that are no faults, in all channels: words of `ACCEPTABLE`.
+        Faults of its data that the user accepts, in all channels: words of `ACCEPTABLE`.
     """
 
     name: Name
@@ -211,14 +93,27 @@ class TrialKeys:
     accept: Accepted = ()
 
     @property
-    def said(self) -> dict[str, Any]:
-        """All of this by name, for another record of the trial."""
+    def keys_in_file(self) -> dict[str, Any]:
+        """The entries that the file states, by name, to build another record of the same trial."""
         return {key: getattr(self, key) for key in TrialKeys.__dataclass_fields__}
+
+
+_FIELDS_OF_ROWS = (
+    "values",
+    "used",
+    "time",
+    "force",
+    "load_factor",
+    "temperature",
+    "health",
+    "health_deviation",
+)
+"""Fields of a trial that are arrays with an entry, or a row, for each of its rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trial(TrialKeys):
-    """One trial: known inputs, measured values, labels of its state.
+    """One trial of N rows: what acted, what C channels measured, and the state of the structure.
 
     Attributes
     ----------
@@ -227,10 +122,11 @@ class Trial(TrialKeys):
     values : (N, C) ndarray
         Measured values, units of the channels.
     used : (N, C) ndarray of bool
-        False where a sample is left out (an outlier, a gap), with the reason in the campaign's `remarks`.
+        False where a sample is left out (an outlier, a gap), with the reason in the campaign's
+        `remarks`.
     time : (N,) ndarray
-        Ring-down, forced: time since the trial's start [s], strictly increasing. Static, flight: time of each
-        row since the campaign's start [s].
+        Ring-down, forced: time since the trial's start [s], strictly increasing. Static, flight:
+        time of each row since the campaign's start [s].
     force : (N,) ndarray
         Applied force [N], upwards positive; zero in ring-downs and flights.
     load_factor : (N,) ndarray
@@ -240,16 +136,17 @@ class Trial(TrialKeys):
     start : float
         Start of the trial since the campaign's start [s].
     health : (N, K) ndarray
-        Known stiffness losses of `regions` (fractions); prior means where `health_deviation` is positive.
+        Stiffness losses of the K `regions` [fraction]; prior means where `health_deviation` is
+        positive.
     health_deviation : (N, K) ndarray
-        Prior standard deviations; zero where they are known.
+        Prior standard deviations of the losses; zero where they are known.
     begins : Start
         How a forced or driven trial began.
     begin_assumed : bool
-        Nobody said so.
+        True if the file does not state `begins`.
     inputs : tuple of RecordedInput
-        Driven trials: what acted. `force` is then the first force or torque among them, or zero. Static
-        trials: what was held in each row beside the force.
+        Driven trials: what acted; `force` is then the first force or torque among them, or zero.
+        Static trials: what was held in each row beside the force.
     regions : tuple of str
         Names of the damage regions, z1 and z2 first.
     """
@@ -271,29 +168,68 @@ class Trial(TrialKeys):
 
     @classmethod
     def plain(
-        cls, name: str, kind: TrialKind, channels: tuple[str, ...], time: FloatArray, **given: Any
+        cls, name: str, kind: TrialKind, channels: tuple[str, ...], time: FloatArray, **fields: Any
     ) -> "Trial":
-        """Return a trial of which only this and `given` are said: readings of zero, no force, healthy."""
-        zeros, shape, pair = np.zeros(len(time)), (len(time), len(channels)), np.zeros((len(time), 2))
-        usual = {
-            "values": np.zeros(shape), "used": np.ones(shape, dtype=bool), "force": zeros,
-            "load_factor": zeros, "temperature": zeros, "health": pair, "health_deviation": pair,
-        }  # fmt: skip
-        return cls(name=name, kind=kind, channels=channels, time=time, **{**usual, **given})
+        """Return a trial of a healthy structure, without force and with readings of zero.
+
+        Parameters
+        ----------
+        name : str
+            Name of the trial.
+        kind : TrialKind
+            What is done in it.
+        channels : tuple of str
+            Names of the C measured channels.
+        time : (N,) ndarray
+            Times of the rows [s].
+        **fields : object
+            Fields of the trial that differ from these defaults.
+        """
+        row_count = len(time)
+        zeros = np.zeros(row_count)
+        no_losses = np.zeros((row_count, len(USUAL_REGIONS)))
+        defaults = {
+            "values": np.zeros((row_count, len(channels))),
+            "used": np.ones((row_count, len(channels)), dtype=bool),
+            "force": zeros,
+            "load_factor": zeros,
+            "temperature": zeros,
+            "health": no_losses,
+            "health_deviation": no_losses,
+        }
+        return cls(name=name, kind=kind, channels=channels, time=time, **{**defaults, **fields})
 
     def rows(self, rows: BoolArray | IntArray | slice, **changes: Any) -> "Trial":
-        """Return the trial with its rows as an index chooses them, and other fields changed."""
-        keys = ("values", "used", "time", "force", "load_factor", "temperature", "health", "health_deviation")
-        of_rows: dict[str, Any] = {key: getattr(self, key)[rows] for key in keys}
-        inputs = tuple(replace(item, values=item.values[rows]) for item in self.inputs)
-        return replace(self, inputs=inputs, **{**of_rows, **changes})
+        """Return the trial with some of its rows, and with other fields changed.
+
+        Parameters
+        ----------
+        rows : (N,) ndarray of bool, (M,) ndarray of int, or slice
+            The rows that stay.
+        **changes : object
+            New values of other fields, such as its name.
+        """
+        fields: dict[str, Any] = {}
+        for key in _FIELDS_OF_ROWS:
+            fields[key] = getattr(self, key)[rows]
+        inputs = tuple(replace(recorded, values=recorded.values[rows]) for recorded in self.inputs)
+        return replace(self, inputs=inputs, **{**fields, **changes})
+
+    def noise_deviation(self, channel: Channel) -> float:
+        """Return the standard deviation of a channel's noise here [its unit].
+
+        0 if it is not known.
+        """
+        if channel.noise is None:
+            return 0.0
+        return channel.noise.standard_deviation * self.noise_factor
 
     @property
     def input_names(self) -> tuple[str, ...]:
         """Names of what is recorded beside the channels; the force of a forced trial is "force"."""
         if self.kind is TrialKind.FORCED:
             return ("force",)
-        return tuple(item.name for item in self.inputs)
+        return tuple(recorded.name for recorded in self.inputs)
 
     @property
     def load(self) -> FloatArray:
@@ -319,36 +255,41 @@ class Trial(TrialKeys):
 
     @cached_property
     def whitened_at(self) -> float | None:
-        """Interval [s] at which noise of a dynamic trial can be whitened; None at too uneven stamps."""
+        """Interval [s] at which noise of a dynamic trial can be whitened.
+
+        None at too uneven stamps.
+        """
         return self.interval if self.is_dynamic and nearly_even(self.time) else None
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """All trials of one structure.
+    """A measurement campaign: all trials of one structure, in SI.
 
     Attributes
     ----------
     name : str
         Title.
     channels : mapping of str to Channel
-        By name.
+        The channels by name.
     trials : tuple of Trial
         In the order of the file.
     reference_temperature : float or None
-        [degC]; None where temperatures were not recorded.
+        Reference temperature [degC]; None if temperatures were not recorded.
     parameters : mapping of str to (float, float)
         Mean and standard deviation that replace the model's own prior of calibrated parameters.
     data_hash : str
         SHA-256 of the campaign's files.
     remarks : tuple of str
-        What the reader noticed and did: samples left out and why, a missing noise record.
+        Sentences on what the reader noticed and did, such as samples that were left out, and why.
     loggers : mapping of str to tuple of str
-        Channels and inputs ("force": of forced trials) that share a clock, by logger; empty: one has all.
+        Channels and inputs ("force": of forced trials) that share a clock, by logger; empty: one
+        has all.
     events : tuple of Event
-        In the order of the file; those of one name follow each other in a trial, or are in different ones.
+        Events in the order of the file; those of one name follow each other in a trial, or are in
+        different trials.
     accept : tuple of str
-        Faults of the data that are no faults, in all channels and trials: words of `ACCEPTABLE`.
+        Faults of the data that the user accepts, in all channels and trials: words of `ACCEPTABLE`.
     """
 
     name: str
@@ -366,13 +307,20 @@ class Campaign:
         return brief(self, name=self.name, trials=len(self.trials), channels=self.channels)
 
     def accepted(self, channel: str = "", trial: str = "") -> frozenset[str]:
-        """Return the faults of data that are accepted in a channel and a trial; an empty name is none."""
-        words = list(self.accept)
+        """Return the faults of data that the campaign accepts in a channel of a trial.
+
+        Parameters
+        ----------
+        channel, trial : str
+            Their names; an empty name leaves out what is accepted in a channel, or in a trial.
+        """
+        faults = set(self.accept)
         if channel in self.channels:
-            words += self.channels[channel].accept
-        for item in self.trials:
-            words += item.accept if item.name == trial else ()
-        return frozenset(words)
+            faults.update(self.channels[channel].accept)
+        for candidate in self.trials:
+            if candidate.name == trial:
+                faults.update(candidate.accept)
+        return frozenset(faults)
 
     def moment_names(self, trial: str) -> frozenset[str]:
         """Return the names by which expressions know the moments of events in a trial."""
@@ -390,35 +338,37 @@ class Campaign:
         trial : str
             Name of the trial.
         names : collection of str
-            The moments that an expression uses: `pump_on`, `pump_on_until`.
+            Names of the moments that an expression uses, such as `pump_on` and `pump_on_until`.
 
         Returns
         -------
         list of dict of str to float
-            Moments by name [s]. Where several events are used, every occurrence of the one is combined with
-            every occurrence of the other. Empty where a name has no moment in the trial.
+            Moments by name [s]. If several events are used, every occurrence of one is combined
+            with every occurrence of the other. Empty if a name has no moment in the trial.
         """
         occurrences: dict[str, list[dict[str, float]]] = {}
         for event in self.events:
-            wanted = event.moments.keys() & set(names)
-            if trial in event.trials and wanted:
+            is_used = not event.moments.keys().isdisjoint(names)
+            if trial in event.trials and is_used:
                 occurrences.setdefault(event.name, []).append(event.moments)
         combined = []
         for combination in product(*occurrences.values()):
-            moments = {name: time for event in combination for name, time in event.items()}
+            moments: dict[str, float] = {}
+            for moments_of_event in combination:
+                moments |= moments_of_event
             if moments.keys() >= set(names):
                 combined.append(moments)
         return combined
 
     def records(self, channel: str) -> Iterator[tuple[Trial, FloatArray, BoolArray]]:
-        """Yield each trial that has a channel, what it read there (N,), and which readings count."""
+        """Yield the trials of a channel, with its readings (N,) and which of them are used (N,)."""
         for trial in self.trials:
             if channel in trial.channels:
                 column = trial.channels.index(channel)
                 yield trial, trial.values[:, column], trial.used[:, column]
 
     def outputs(self, trial: Trial) -> tuple[tuple[str, Quantity], ...]:
-        """Return the outputs that the channels of a trial measure, and as what quantity."""
+        """Return the model output of each channel of a trial, and the quantity that it reads."""
         channels = (self.channels[name] for name in trial.channels)
         return tuple((channel.output, channel.quantity) for channel in channels)
 
@@ -429,22 +379,36 @@ class Campaign:
 
     @property
     def held_out(self) -> tuple[Trial, ...]:
-        """Trials kept for proof."""
+        """Trials that are not fitted, but kept to prove a verdict."""
         return tuple(trial for trial in self.trials if trial.held_out)
 
     @property
     def sizes(self) -> dict[str, float]:
-        """Largest force [N] and load factor, longest dynamic record and time from first to last sample [s].
+        """The scales of its loads and times, which effects use for their own scales.
 
-        Times that nothing tells are one.
+        ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],
+        ``duration`` the longest record of a motion [s], ``campaign_time`` the time from the first
+        sample to the last [s]. Durations that no trial has are one second.
         """
-        trials = self.trials
-        moments = [trial.start + trial.time if trial.is_dynamic else trial.time for trial in trials]
-        span = float(max(map(np.max, moments)) - min(map(np.min, moments))) if moments else 0.0
-        lengths = (float(trial.time[-1] - trial.time[0]) for trial in trials if trial.is_dynamic)
+        force = load_factor = 0.0
+        durations: list[float] = []
+        sample_times: list[FloatArray] = []
+        for trial in self.trials:
+            force = max(force, float(np.max(np.abs(trial.force))))
+            load_factor = max(load_factor, float(np.max(np.abs(trial.load_factor))))
+            if trial.is_dynamic:
+                durations.append(float(trial.time[-1] - trial.time[0]))
+                sample_times.append(trial.start + trial.time)
+            else:
+                sample_times.append(trial.time)
+        campaign_time = 0.0
+        if sample_times:
+            first = min(float(np.min(times)) for times in sample_times)
+            last = max(float(np.max(times)) for times in sample_times)
+            campaign_time = last - first
         return {
-            "force": max((float(np.max(np.abs(trial.force))) for trial in trials), default=0.0),
-            "load_factor": max((float(np.max(np.abs(trial.load_factor))) for trial in trials), default=0.0),
-            "duration": max(lengths, default=1.0),
-            "campaign_time": span or 1.0,
+            "force": force,
+            "load_factor": load_factor,
+            "duration": max(durations, default=1.0),
+            "campaign_time": campaign_time or 1.0,
         }

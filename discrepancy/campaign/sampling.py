@@ -1,104 +1,153 @@
-"""Sampling in time: strictly increasing stamps, even to a thousandth of the interval or as they came."""
+"""Sampling in time: times of records, evenly spaced or not, and quanta of readings."""
 
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from discrepancy.errors import CampaignDataError, said
+from discrepancy.errors import CampaignDataError
 from reporting.words import counted
 
 FloatArray = NDArray[np.float64]
 
 EVEN = 1e-3
-"""Largest departure of a sample from the even grid, as a share of the interval."""
+"""Largest departure of a sample from the even grid, as a fraction of the interval."""
 LEAST_SAMPLES = 8
 """Fewest samples of a dynamic record."""
 _EXACT = 1e-9
+"""Departure from an even grid, in intervals, below which times stay as they are."""
 LEAST_LEVELS = 5
 """Fewest values at which neighbouring readings must repeat to show a sensor's quantum."""
 OFF_LATTICE = 0.1
 """Largest departure of a value from a lattice, in its steps."""
 ON_LATTICE = 0.8
-"""Least share of the distances between repeated values that are whole numbers of a lattice's steps."""
+"""Least fraction of distances between repeated values that are whole numbers of steps."""
 ROUNDING_GAP = 10.0
 """Least ratio of a true difference to the largest one that rounding leaves."""
 LEAST_ROUNDED = 8
 """Fewest differences that are taken as left by rounding."""
 ALIKE = 0.1
-"""Largest departure of a step, as a share of the interval, at which a filter of even samples holds."""
+"""Largest relative departure of a step from the mean one for filters of even samples."""
 
 
 def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str) -> FloatArray:
-    """Return the times of a record: on the even grid where they are even as printed, else as they came.
-
-    Times may be printed with few decimals: half a unit of the last one is allowed in addition, and the times
-    are then put on the even grid that is nearest to all of them, through zero where they begin there. Times
-    that are even to 1e-9 stay as they are.
+    """Return the times of a record, on an even grid if they are even to their printed digits.
 
     Parameters
     ----------
     time : (N,) ndarray
-        [s].
+        Times [s].
     cells : sequence of str
-        The same as printed.
+        The same times as printed in the file.
     user, file : str
-        Whose they are, for error messages.
+        Whose times they are, and the file, for messages.
+
+    Returns
+    -------
+    (N,) ndarray
+        Times [s]; see `as_meant`.
 
     Raises
     ------
     CampaignDataError
-        Too few samples, or a time that does not increase.
+        If there are too few samples, or a time does not increase.
     """
     count = len(time)
     if count < LEAST_SAMPLES:
-        samples = counted(count, "sample")
         raise CampaignDataError(
-            said("campaign.few_samples", file=file, samples=samples, user=user, least=LEAST_SAMPLES)
+            f"{file} holds {counted(count, 'sample')} of {user}: a record in time needs at least "
+            f"{LEAST_SAMPLES}."
         )
     steps = np.diff(time)
-    back = int(np.argmin(steps))
-    if steps[back] <= 0.0:
-        told = {"at": back + 1, "time": cells[back], "then": cells[back + 1]}
-        raise CampaignDataError(said("campaign.time_goes_back", file=file, user=user, **told))
+    least = int(np.argmin(steps))
+    if steps[least] <= 0.0:
+        raise CampaignDataError(time_goes_back(file, user, cells, least))
     return as_meant(time, cells)
 
 
+def time_goes_back(file: str, user: str, cells: Sequence[str], index: int) -> str:
+    """Return the message that a time does not increase.
+
+    Parameters
+    ----------
+    file, user : str
+        The file, and whose times they are.
+    cells : sequence of str
+        Times as printed [s].
+    index : int
+        Index of the time that the next one does not exceed.
+    """
+    return (
+        f"{file}: the time of {user} does not increase after sample {index + 1} "
+        f"({cells[index]} s, then {cells[index + 1]} s); put the samples in order and keep each "
+        "once."
+    )
+
+
 def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
-    """Return the times (N,) of printed cells, in any unit: on an even grid where they are even as printed."""
-    # Trailing zeros may be dropped in print, so the finest cell says how many decimals there are.
-    rounding = min(_last_digit(cell) for cell in cells)  # twice half of it
+    """Return times on an even grid if printing with few decimals explains why they are not even.
+
+    Half a unit of the last decimal is allowed for each time, in addition to `EVEN`. The grid is the
+    least squares one, through zero if the times begin there. Times that are even to 1e-9 stay as
+    they are.
+
+    Parameters
+    ----------
+    time : (N,) ndarray
+        Times in any unit.
+    cells : sequence of str
+        The same times as printed.
+    """
+    # trailing zeros may be dropped in print, so the cell with most decimals says how many there are
+    rounding_of_a_step = min(
+        _last_digit(cell) for cell in cells
+    )  # half a digit at each of its ends
     interval = (time[-1] - time[0]) / (len(time) - 1)
-    if not _EXACT < unevenness(time) <= EVEN + rounding / interval:
+    if not _EXACT < unevenness(time) <= EVEN + rounding_of_a_step / interval:
         return time
-    place = np.arange(len(time)) - (0.0 if time[0] == 0.0 else 0.5 * (len(time) - 1))
-    about = 0.0 if time[0] == 0.0 else time.mean()
-    return np.asarray(about + place * (place @ (time - about)) / (place @ place))
+    if time[0] == 0.0:
+        index = np.arange(len(time)) - 0.0
+        origin = 0.0
+    else:
+        index = np.arange(len(time)) - 0.5 * (len(time) - 1)
+        origin = time.mean()
+    return np.asarray(origin + index * (index @ (time - origin)) / (index @ index))
 
 
 def unevenness(time: FloatArray) -> float:
-    """Return how far times (N,) are off the even grid through first and last [intervals]."""
+    """Return the largest departure of times (N,) from an even grid, as a fraction of its interval.
+
+    The grid goes through the first and the last time.
+    """
     interval = (time[-1] - time[0]) / max(len(time) - 1, 1)
-    off = np.abs(time - time[0] - interval * np.arange(len(time)))
-    return float(off.max() / abs(interval or 1.0))
+    departure = np.abs(time - time[0] - interval * np.arange(len(time)))
+    return float(departure.max() / abs(interval or 1.0))
 
 
 def is_even(time: FloatArray) -> bool:
-    """Whether samples lie on an even grid to a thousandth of the interval."""
+    """Return whether times (N,) lie on an even grid to a thousandth of its interval."""
     return unevenness(time) <= EVEN
 
 
 def nearly_even(time: FloatArray) -> bool:
-    """Whether every step is within a tenth of the interval, so that a filter of even samples still holds."""
+    """Return whether every step of times (N,) is within a tenth of the mean step.
+
+    A filter for evenly spaced samples then still holds.
+    """
+    if len(time) < 2:
+        return True
     steps = np.diff(time)
-    return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0)) if len(steps) else True
+    return bool(np.allclose(steps, steps.mean(), rtol=ALIKE, atol=0.0))
 
 
 def quantum_of(values: FloatArray) -> float:
-    """Return the step between two readings of a sensor, 0 where all readings (N,) are alike.
+    """Return the quantum of a sensor: the step between two of its readings (N,).
 
-    It is the step of the lattice on which the readings repeat (`lattice_step`). Where they do not repeat it
-    is the least difference of two readings that is more than the rounding of their printed decimals.
+    0 if all are equal.
+
+    It is the step of the lattice on which the readings repeat (`lattice_step`). If they do not
+    repeat, it is the least difference between readings that rounding of printed decimals does not
+    explain.
     """
     step = lattice_step(values)
     if step is not None:
@@ -109,9 +158,9 @@ def quantum_of(values: FloatArray) -> float:
 def lattice_step(values: FloatArray) -> float | None:
     """Return the step of the lattice on which the readings (N,) of a quantised sensor stand still.
 
-    An encoder of 4096 steps, printed with six decimals, has steps of 0.001534 and 0.001533: the quantum is
-    the step and not their difference. Resampled by straight lines it also shows readings between its steps,
-    but does not repeat them.
+    An encoder of 4096 steps, printed with six decimals, has steps of 0.001534 and 0.001533: the
+    quantum is the step and not their difference. Resampled by straight lines it also shows readings
+    between its steps, but does not repeat them.
 
     Parameters
     ----------
@@ -121,8 +170,8 @@ def lattice_step(values: FloatArray) -> float | None:
     Returns
     -------
     float or None
-        The step; None where neighbouring readings repeat at fewer than `LEAST_LEVELS` values, or at values
-        that are not evenly spaced.
+        The step; None where neighbouring readings repeat at fewer than `LEAST_LEVELS` values, or at
+        values that are not evenly spaced.
     """
     repeats = np.diff(values) == 0.0
     levels = np.unique(values[1:][repeats])
@@ -136,32 +185,47 @@ def lattice_step(values: FloatArray) -> float | None:
 
 
 def least_beyond_rounding(differences: FloatArray) -> float:
-    """Return the least positive difference that is not left by the rounding of printed decimals; 0 if none.
+    """Return the least positive difference (M,) that the rounding of decimals does not explain.
 
-    Differences left by rounding are many, and far below all others.
+    Rounding leaves many differences, far below all others: the first jump of the sorted differences
+    by more than `ROUNDING_GAP` ends them, if at least `LEAST_ROUNDED` lie below it. 0 if none is
+    positive.
     """
-    sizes = np.sort(differences[differences > 0.0])
-    if not sizes.size:
+    ordered = np.sort(differences[differences > 0.0])
+    if not ordered.size:
         return 0.0
-    gaps = np.flatnonzero(sizes[1:] > ROUNDING_GAP * sizes[:-1]) + 1
-    beyond = gaps[gaps >= LEAST_ROUNDED]
-    return float(sizes[beyond[0]] if beyond.size else sizes[0])
+    jumps = np.flatnonzero(ordered[1:] > ROUNDING_GAP * ordered[:-1]) + 1
+    jumps_above_rounding = jumps[jumps >= LEAST_ROUNDED]
+    first = jumps_above_rounding[0] if jumps_above_rounding.size else 0
+    return float(ordered[first])
 
 
 def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
-    """Return what a reader has to know of uneven stamps, by trial; None where all are even."""
+    """Return the remark on unevenly spaced samples; None if all trials are evenly sampled.
+
+    Parameters
+    ----------
+    times : mapping of str to (N,) ndarray
+        Times [s] by the name of the trial.
+    """
     uneven = {name: time for name, time in times.items() if not is_even(time)}
     if not uneven:
         return None
     steps = np.concatenate([np.diff(time) for time in uneven.values()])
     usual = float(np.median(steps))
-    names = f"trial{'s' * (len(uneven) > 1)} {', '.join(map(repr, uneven))}"
-    text = said("remarks.uneven", trials=names, least=steps.min(), most=steps.max(), usual=usual)
+    plural = "s" if len(uneven) > 1 else ""
+    names = ", ".join(map(repr, uneven))
+    sentence = (
+        f"The samples of the trial{plural} {names} are not evenly spaced (steps of "
+        f"{steps.min():.4g} to {steps.max():.4g} s, usually {usual:.4g} s): they are taken as "
+        "stamped, and spectra are approximate."
+    )
     if steps.max() > 1.5 * usual:
-        name, time = max(uneven.items(), key=lambda item: float(np.diff(item[1]).max()))
-        at = float(time[int(np.argmax(np.diff(time)))])
-        text += said("remarks.widest_gap", most=steps.max(), at=at, trial=name)
-    return text
+        widest_steps = {name: float(np.diff(time).max()) for name, time in uneven.items()}
+        name = max(widest_steps, key=lambda trial: widest_steps[trial])
+        begin = float(uneven[name][int(np.argmax(np.diff(uneven[name])))])
+        sentence += f" The widest gap, {steps.max():.4g} s, begins at {begin:.6g} s of {name!r}."
+    return sentence
 
 
 def _last_digit(cell: str) -> float:

@@ -1,4 +1,7 @@
-"""The schema of `campaign.toml`: what it may say, checked strictly; units are still those of the file."""
+"""The schema of `campaign.toml`, checked strictly.
+
+Units are still those of the file.
+"""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -10,24 +13,32 @@ import pydantic
 from discrepancy.campaign import records
 from discrepancy.campaign.protocol import IN_FILES, LIST, Accepted, Event, Release
 from discrepancy.campaign.units import conversion, conversion_of
-from discrepancy.errors import CampaignFileError, said
+from discrepancy.errors import CampaignFileError
 from fe.runtime.patch import EVERY_CHANNEL
 from reporting.toml_file import Fault, Name, NotNegative, Number, Positive, Section, validate
+from reporting.words import comma_list
 
 FORMAT = 1
 """Version of the format."""
 INPUT_COLUMNS = (
-    "time", "force", "load_factor", "temperature", "z1", "z2", "z1_deviation", "z2_deviation",
-)  # fmt: skip
-"""Columns of the tables that are no channels."""
+    "time",
+    "force",
+    "load_factor",
+    "temperature",
+    "z1",
+    "z2",
+    "z1_deviation",
+    "z2_deviation",
+)
+"""Columns of the tables that are not channels."""
 FORCE_UNIT = "N"
 """Unit of the column `force` where the file says no other."""
 OF_REGION = "health."
-"""Begins the column of the losses of a damage region by its name."""
+"""Prefix of the columns with the losses of a damage region, before the region's name."""
 
 
-class ParameterSection(Section):
-    """`[parameters.NAME]`: what replaces the model's own prior [SI]."""
+class StatedPriorSection(Section):
+    """`[parameters.NAME]`: mean and standard deviation that replace the model's own prior [SI]."""
 
     mean: Number
     deviation: NotNegative
@@ -40,54 +51,91 @@ class NoiseFileSection(Section):
     interval: Positive | None = None
 
 
-def _factor(item: records.InTables) -> float:
+def _unit_in_si(recorded: records.InTables) -> float:
+    """Return what one of the unit of a channel or input is in SI."""
     try:
-        return conversion_of(item.quantity, item.unit)
+        return conversion_of(recorded.quantity, recorded.unit)
     except ValueError as cause:
-        raise ValueError(f"the unit of {item.name!r}: {cause}") from None
+        raise ValueError(f"the unit of {recorded.name!r}: {cause}") from None
 
 
-def _scaled(channel: records.Channel, scale: float) -> records.Channel:
-    """Return a channel with its deviations in another unit."""
+def _with_scaled_deviations(channel: records.Channel, scale: float) -> records.Channel:
+    """Return a channel with its standard deviations multiplied by a scale."""
     noise = channel.noise
-    noise = noise and replace(noise, standard_deviation=scale * noise.standard_deviation)
+    if noise is not None:
+        noise = replace(noise, standard_deviation=scale * noise.standard_deviation)
     return replace(channel, noise=noise, offset_deviation=scale * channel.offset_deviation)
 
 
-def _read(channel: records.Channel) -> records.Channel:
+def _channel_in_si(channel: records.Channel) -> records.Channel:
+    """Return a channel of a file with its standard deviations in SI.
+
+    Raises
+    ------
+    ValueError
+        If the name cannot be that of a channel, or the unit does not fit the quantity.
+    """
     if channel.name == EVERY_CHANNEL or channel.name.startswith("#"):
         raise ValueError(f"a channel cannot be called {channel.name!r}")
-    return _scaled(channel, _factor(channel))
+    return _with_scaled_deviations(channel, _unit_in_si(channel))
 
 
-def _written(channel: records.Channel, dump: pydantic.SerializerFunctionWrapHandler) -> object:
-    return dump(_scaled(channel, 1.0 / _factor(channel)))
+def _dump_channel_in_unit(
+    channel: records.Channel, dump: pydantic.SerializerFunctionWrapHandler
+) -> object:
+    """Return what a file says of a channel, with its standard deviations in its unit."""
+    return dump(_with_scaled_deviations(channel, 1.0 / _unit_in_si(channel)))
 
 
-ChannelInFile = Annotated[records.Channel, pydantic.AfterValidator(_read), pydantic.WrapSerializer(_written)]
+ChannelInFile = Annotated[
+    records.Channel,
+    pydantic.AfterValidator(_channel_in_si),
+    pydantic.WrapSerializer(_dump_channel_in_unit),
+]
 """Its deviations are in its unit there."""
 
 
-def _read_input(item: records.RecordedInput) -> records.RecordedInput:
-    held = _factor(item) * item.offset_deviation
-    if item.table_column in INPUT_COLUMNS and item.table_column != "force":
-        raise ValueError(said("campaign.reserved", item=item))
-    smooth = item.quantity.moving and not item.reference
-    if smooth and item.hold not in (None, records.Hold.SMOOTH):
-        raise ValueError(said("campaign.motion", item=item))
-    return replace(item, offset_deviation=held, hold=records.Hold.SMOOTH if smooth else item.hold)
+def _input_in_si(recorded: records.RecordedInput) -> records.RecordedInput:
+    """Return an input of a file with its offset's deviation in SI, and a motion as smooth.
+
+    Raises
+    ------
+    ValueError
+        If its column is reserved, or a motion goes in steps or corners.
+    """
+    deviation = _unit_in_si(recorded) * recorded.offset_deviation
+    column = recorded.table_column
+    if column in INPUT_COLUMNS and column != "force":
+        raise ValueError(
+            f"the column {column!r} is reserved: give the input {recorded.name!r} another column"
+        )
+    hold = recorded.hold
+    if recorded.quantity.moving and not recorded.reference:
+        if hold not in (None, records.Hold.SMOOTH):
+            raise ValueError(
+                f"the input {recorded.name!r} is a motion, which no drive makes in steps or "
+                "corners: leave `hold` out, or say smooth, or reference = true where it is what a "
+                "controller shall follow"
+            )
+        hold = records.Hold.SMOOTH
+    return replace(recorded, offset_deviation=deviation, hold=hold)
 
 
-def _force_unit(unit: str) -> str:
+def _checked_force_unit(unit: str) -> str:
+    """Return a unit of force; raise ValueError if it is a unit of something else."""
     conversion_of(records.Quantity.FORCE, unit)
     return unit
 
 
-def _in_si(release: Release) -> Release:
+def _release_in_si(release: Release) -> Release:
     """Return a release in metres, volts or as a plain number."""
-    unit: Literal["m", "V", "1"]
-    unit = "m" if release.unit.endswith("m") else "V" if release.unit.endswith("V") else "1"
-    return replace(release, displacement=conversion(release.unit, unit) * release.displacement, unit=unit)
+    unit: Literal["m", "V", "1"] = "1"
+    if release.unit.endswith("m"):
+        unit = "m"
+    elif release.unit.endswith("V"):
+        unit = "V"
+    displacement = conversion(release.unit, unit) * release.displacement
+    return replace(release, displacement=displacement, unit=unit)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,11 +147,11 @@ class TrialSection(records.TrialKeys):
     start: NotNegative | None = None
     temperature: Number | None = None
     health: dict[Name, NotNegative] = field(default_factory=dict)
-    release: Annotated[Release, pydantic.AfterValidator(_in_si)] | None = None
+    release: Annotated[Release, pydantic.AfterValidator(_release_in_si)] | None = None
     channels: Annotated[tuple[Name, ...], LIST] | None = None
-    left_out: dict[str, Annotated[tuple[Annotated[int, pydantic.Field(strict=True, ge=1)], ...], LIST]] = (
-        field(default_factory=dict)
-    )
+    left_out: dict[
+        str, Annotated[tuple[Annotated[int, pydantic.Field(strict=True, ge=1)], ...], LIST]
+    ] = field(default_factory=dict)
     begins: records.Start | None = None
 
     @pydantic.model_validator(mode="before")
@@ -116,29 +164,43 @@ class TrialSection(records.TrialKeys):
 
     @pydantic.field_validator("load_place", mode="before")
     @classmethod
-    def _place(cls, value: object) -> object:
-        if isinstance(value, list):
-            if len(value) != 2:
-                raise ValueError(said("campaign.load_place", value=value))
-            return tuple(value)
-        return value
+    def _load_position(cls, value: object) -> object:
+        """Return a position [y, x] as a tuple, and a name as it is."""
+        if not isinstance(value, list):
+            return value
+        if len(value) != 2:
+            raise ValueError(
+                "`load_place` must be a name or [y, x] (m from the root, fraction of the chord), "
+                f"and {comma_list(map(str, value))} came"
+            )
+        return tuple(value)
 
     def __post_init__(self) -> None:
-        kinds = {
-            "release": {records.TrialKind.RINGDOWN},
-            "begins": {records.TrialKind.FORCED, records.TrialKind.DRIVEN},
-        }
-        for key, allowed in {**kinds, "hold": {records.TrialKind.FORCED}}.items():
-            if getattr(self, key) is not None and self.kind not in allowed:
-                raise ValueError(said(f"campaign.no_{key}", trial=self))
+        kind = self.kind
+        if self.release is not None and kind is not records.TrialKind.RINGDOWN:
+            raise ValueError(f"the trial {self.name!r} is no ring-down and cannot have a `release`")
+        recorded_in_time = (records.TrialKind.FORCED, records.TrialKind.DRIVEN)
+        if self.begins is not None and kind not in recorded_in_time:
+            raise ValueError(
+                f"the trial {self.name!r} is {kind.value}, and `begins` is for forced and driven "
+                "ones; a ring-down says it by its `release`"
+            )
+        if self.hold is not None and kind is not records.TrialKind.FORCED:
+            raise ValueError(
+                f"the trial {self.name!r} is {kind.value}, and its `hold` is for the force of a "
+                "forced one: say that of a driven one in its [[input]]"
+            )
         for region, loss in self.health.items():
             if region != "deviation" and loss > 1.0:
-                raise ValueError(f"the loss of {region!r} is a fraction from 0 to 1, and {loss:g} came")
+                raise ValueError(
+                    f"the loss of {region!r} is a fraction from 0 to 1, and {loss:g} came"
+                )
 
 
-def _twice(names: Iterable[str]) -> str | None:
-    """Return the first name in the alphabet that comes more than once."""
-    return min((name for name, count in Counter(names).items() if count > 1), default=None)
+def _first_repeated(names: Iterable[str]) -> str | None:
+    """Return the name that comes more than once, of several the first in the alphabet."""
+    repeated = [name for name, count in Counter(names).items() if count > 1]
+    return min(repeated, default=None)
 
 
 class CampaignSection(Section):
@@ -148,13 +210,13 @@ class CampaignSection(Section):
 
     format: Literal[1]
     name: str
-    force_unit: Annotated[Name, pydantic.AfterValidator(_force_unit)] = FORCE_UNIT
+    force_unit: Annotated[Name, pydantic.AfterValidator(_checked_force_unit)] = FORCE_UNIT
     reference_temperature: Annotated[Number, pydantic.Field(ge=-273.15)] | None = None
-    parameters: dict[Name, ParameterSection] = pydantic.Field(default_factory=dict)
+    parameters: dict[Name, StatedPriorSection] = pydantic.Field(default_factory=dict)
     noise: NoiseFileSection | None = None
     channel: Annotated[tuple[ChannelInFile, ...], pydantic.Field(min_length=1), LIST]
     input: Annotated[
-        tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_read_input)], ...], LIST
+        tuple[Annotated[records.RecordedInput, pydantic.AfterValidator(_input_in_si)], ...], LIST
     ] = ()
     trial: Annotated[tuple[TrialSection, ...], pydantic.Field(min_length=1), LIST]
     event: Annotated[tuple[Event, ...], LIST] = ()
@@ -168,57 +230,111 @@ class CampaignSection(Section):
         return (*self.channel, *self.input)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what does not fit together."""
-        for kind in ("channel", "input", "trial"):
-            twice = _twice(item.name for item in getattr(self, kind))
-            yield twice, f"there is more than one {kind} called {twice!r}: rename one"
-        lost = self.input and not any(
-            item.kind in (records.TrialKind.DRIVEN, records.TrialKind.STATIC) for item in self.trial
-        )
-        yield lost, '[[input]] is for trials of the kind "driven" or "static", and there is none'
-        twice, what = (
-            _twice(item.table_column for item in self.columns),
-            "channel or input" if self.input else "channel",
-        )
-        yield twice, f"more than one {what} reads the column {twice!r}: give each its own `column`"
-        # the force is one of static and forced trials only: a load cell may be called so in a driven one
-        forced = any(item.kind in (records.TrialKind.STATIC, records.TrialKind.FORCED) for item in self.trial)
-        taken = {name for name in INPUT_COLUMNS if name != "force" or forced}
-        for channel in self.channel:
-            yield channel.table_column in taken, said("campaign.taken", item=channel)
-        scales = {item.unit == "K" for item in self.columns if item.quantity is records.Quantity.TEMPERATURE}
-        yield len(scales) > 1, "temperatures are given in degC and in K: give all of them in one of the two"
-        yield from self._wrong_loggers()
-        known = {item.name for item in self.channel}
-        names = ", ".join(sorted(known))
-        for item in self.trial:
-            for name in (*(item.channels or ()), *item.left_out):
-                yield name not in known, said("campaign.unknown_channel", trial=item, name=name, known=names)
+        """Yield each rule that several tables of the file may break together, and its sentence.
 
-    def _wrong_loggers(self) -> Iterator[Fault]:
-        """Yield loggers of nothing, names that none or two of them record, and inputs on two of them."""
-        inputs = {item.name for item in self.input}
-        inputs |= {"force"} if any(item.kind is records.TrialKind.FORCED for item in self.trial) else set()
-        wanted = [*(item.name for item in self.channel), *sorted(inputs)] if self.loggers else []
-        recorded = [name for names in self.loggers.values() for name in names]
-        for name in recorded:
-            yield name not in wanted, said("campaign.no_such_record", name=name, wanted=", ".join(wanted))
-        for name in wanted:
-            came = "more than one" if name in recorded else "none"
-            yield recorded.count(name) != 1, f"{name!r} must be on one of the `loggers`, and it is on {came}"
-        several = sum(bool(inputs & {*names}) for names in self.loggers.values()) > 1
-        yield several, "all inputs must be on one of the `loggers`, and they are on several"
+        The first entry of a fault is true if the rule is broken.
+        """
+        for table in ("channel", "input", "trial"):
+            repeated = _first_repeated(section.name for section in getattr(self, table))
+            yield repeated, f"there is more than one {table} called {repeated!r}: rename one"
+        yield from self._column_faults()
+        yield from self._logger_faults()
+        yield from self._unknown_channels()
+
+    def _has_trial_of(self, *kinds: records.TrialKind) -> bool:
+        """Return whether there is a trial of any of these kinds."""
+        return any(trial.kind in kinds for trial in self.trial)
+
+    def _column_faults(self) -> Iterator[Fault]:
+        """Yield unused inputs, columns with several readers, and mixed units of temperature."""
+        have_inputs = (records.TrialKind.DRIVEN, records.TrialKind.STATIC)
+        no_trial_has_inputs = bool(self.input) and not self._has_trial_of(*have_inputs)
+        yield (
+            no_trial_has_inputs,
+            '[[input]] is for trials of the kind "driven" or "static", and there is none',
+        )
+        repeated = _first_repeated(recorded.table_column for recorded in self.columns)
+        readers = "channel or input" if self.input else "channel"
+        yield (
+            repeated,
+            f"more than one {readers} reads the column {repeated!r}: give each its own `column`",
+        )
+        # only static and forced trials read the column `force`: in a driven one a load cell may
+        # have it
+        reads_force = self._has_trial_of(records.TrialKind.STATIC, records.TrialKind.FORCED)
+        reserved = {name for name in INPUT_COLUMNS if name != "force" or reads_force}
+        for channel in self.channel:
+            yield (
+                channel.table_column in reserved,
+                f"the column {channel.table_column!r} holds an input of the trial: "
+                f"give the channel {channel.name!r} another column",
+            )
+        in_kelvin: set[bool] = set()
+        for recorded in self.columns:
+            if recorded.quantity is records.Quantity.TEMPERATURE:
+                in_kelvin.add(recorded.unit == "K")
+        yield (
+            len(in_kelvin) > 1,
+            "temperatures are given in degC and in K: give all of them in one of the two",
+        )
+
+    def _unknown_channels(self) -> Iterator[Fault]:
+        """Yield the names in `channels` and `left_out` of trials that are not names of channels."""
+        known = {channel.name for channel in self.channel}
+        for trial in self.trial:
+            for name in (*(trial.channels or ()), *trial.left_out):
+                yield (
+                    name not in known,
+                    f"the trial {trial.name!r} names the channel {name!r}, "
+                    f"which is not among the channels {', '.join(sorted(known))}",
+                )
+
+    def _logger_faults(self) -> Iterator[Fault]:
+        """Yield what is wrong with the names on `loggers`."""
+        if not self.loggers:
+            return
+        inputs = {recorded.name for recorded in self.input}
+        if self._has_trial_of(records.TrialKind.FORCED):
+            inputs.add("force")
+        expected = [*(channel.name for channel in self.channel), *sorted(inputs)]
+        logged = [name for names in self.loggers.values() for name in names]
+        for name in logged:
+            yield (
+                name not in expected,
+                f"`loggers` names {name!r}, but the channels and inputs are {', '.join(expected)}",
+            )
+        for name in expected:
+            number = "more than one" if name in logged else "none"
+            yield (
+                logged.count(name) != 1,
+                f"{name!r} must be on one of the `loggers`, and it is on {number}",
+            )
+        loggers_of_inputs = [names for names in self.loggers.values() if inputs.intersection(names)]
+        yield (
+            len(loggers_of_inputs) > 1,
+            "all inputs must be on one of the `loggers`, and they are on several",
+        )
 
 
 def parse_campaign(table: Mapping[str, Any], source: str) -> CampaignSection:
     """Return the checked content of a campaign's TOML file.
 
+    Parameters
+    ----------
+    table : mapping
+        The content, as the TOML reader gives it.
+    source : str
+        Name of the file, for messages.
+
     Raises
     ------
     CampaignFileError
-        The table breaks the schema; one sentence with file and key.
+        If the content breaks the schema; the sentence names file and key.
     """
-    came = table.get("format", FORMAT)
-    if came != FORMAT or isinstance(came, bool):
-        raise CampaignFileError(said("campaign.format", source=source, came=came, wanted=FORMAT))
+    version = table.get("format", FORMAT)
+    if version != FORMAT or isinstance(version, bool):
+        raise CampaignFileError(
+            f"{source}: `format` is {version!r}; this version reads campaigns with `format = "
+            f"{FORMAT}`."
+        )
     return validate(CampaignSection, dict(table), source, CampaignFileError, what="a campaign")

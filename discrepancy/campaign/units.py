@@ -15,17 +15,26 @@ from reporting.words import listing
 
 _TABLES = Path(__file__).with_suffix(".toml")
 NEVER_CONVERTED = {"degC", "°C", "K"}
-"""Temperatures: a campaign has one of the two for all."""
+"""Units of temperature; all temperatures of a campaign are in degC, or all in K."""
 
-LOGGER_NAMES = {
-    "uE": "microstrain", "µE": "microstrain", "μE": "microstrain", "ue": "microstrain",
-    "uStrain": "microstrain", "ustrain": "microstrain", "1e-6": "microstrain", "1E-6": "microstrain",
-    "10^-6": "microstrain", "G": "g", "Gs": "g", "lb": "lbf", "lbs": "lbf", "Lbs": "lbf", "LBS": "lbf",
-    "Lbf": "lbf", "RPM": "rpm",
-    "Rpm": "rpm", "deg C": "degC", "Deg C": "degC", "DegC": "degC", "degrees C": "degC", "Celsius": "degC",
-    "Sec": "s", "sec": "s", "SEC": "s", "secs": "s", "Seconds": "s", "msec": "ms", "Volts": "V", "Deg": "deg",
-    "Newtons": "N", "KN": "kN", "inches": "inch", "Inches": "inch",
-}  # fmt: skip
+_NAMES_OF_LOGGERS = {
+    "microstrain": "uE µE μE ue uStrain ustrain 1e-6 1E-6 10^-6",
+    "g": "G Gs",
+    "lbf": "lb lbs Lbs LBS Lbf",
+    "rpm": "RPM Rpm",
+    "degC": "DegC Celsius",
+    "s": "Sec sec SEC secs Seconds",
+    "ms": "msec",
+    "V": "Volts",
+    "deg": "Deg",
+    "N": "Newtons",
+    "kN": "KN",
+    "inch": "inches Inches",
+}
+_NAMES_WITH_BLANKS = {"deg C": "degC", "Deg C": "degC", "degrees C": "degC"}
+LOGGER_NAMES = _NAMES_WITH_BLANKS | {
+    name: unit for unit, names in _NAMES_OF_LOGGERS.items() for name in names.split()
+}
 """Names of units that loggers write and pint does not know, or knows as something else."""
 
 
@@ -35,15 +44,15 @@ class Units(NamedTuple):
     Attributes
     ----------
     usual : tuple of str
-        Those of files that a user is told of; pint knows more.
+        Units that messages suggest; pint knows more.
     written : str
-        The one in which a campaign is written.
+        Unit in which a campaign is written to files.
     si : str
-        That of values in memory; of a signal it is nominal.
+        Unit of values in memory; nominal for a signal.
     drawn : tuple of float and str
         Factor from SI, and unit, in figures.
     foreign : mapping of str to float
-        Units that instruments show besides, and what one of them is in SI.
+        Further units that instruments show, and what one of each is in SI.
     """
 
     usual: Sequence[str]
@@ -53,55 +62,82 @@ class Units(NamedTuple):
     foreign: Mapping[str, float] = MappingProxyType({})
 
 
-UNITS = {Quantity(name): Units(**row) for name, row in tomllib.loads(_TABLES.read_text("utf-8")).items()}
-"""Of each quantity: a new kind of sensor is one more table in `units.toml`."""
+UNITS = {
+    Quantity(name): Units(**row) for name, row in tomllib.loads(_TABLES.read_text("utf-8")).items()
+}
+"""The units of each quantity; a new kind of sensor is a further table in `units.toml`."""
 
 
 @cache
 def conversion(unit: str, si: str) -> float:
-    """Return what one of a unit is in a unit of SI; an angle is no number here, and a hertz no rad/s.
+    """Return what one of a unit is in a unit of SI.
+
+    Units of angle and plain numbers do not convert into each other, and neither do hertz and rad/s.
+
+    Parameters
+    ----------
+    unit : str
+        The unit, as a file or a logger writes it.
+    si : str
+        The unit of SI.
 
     Raises
     ------
     ValueError
-        pint does not know the unit, or it is of another quantity.
+        If pint does not know the unit, or it belongs to another quantity.
     """
     unit = LOGGER_NAMES.get(unit, unit)
     if unit == si:
-        return 1.0  # pint takes a third of a second to load
+        return 1.0  # without pint, which takes a third of a second to load
+    # acceleration is the only quantity for which `g` is the standard gravity, and not a gram
     gravity = si == UNITS[Quantity.ACCELERATION].si
-    (dimension, one, _), (wanted, other, _) = (exact_meaning(text, gravity=gravity) for text in (unit, si))
-    if dimension != wanted:
+    dimension, factor, _ = exact_meaning(unit, gravity=gravity)
+    si_dimension, si_factor, _ = exact_meaning(si, gravity=gravity)
+    if dimension != si_dimension:
         raise ValueError(f"{unit!r} cannot become {si}")
-    return float(one / other)
+    return float(factor / si_factor)
 
 
 @cache
 def conversion_of(quantity: Quantity, unit: str) -> float:
-    """Return what one of a quantity's unit is in SI; raises ValueError with what is expected."""
+    """Return what one of a unit is in the SI unit of a quantity.
+
+    Raises
+    ------
+    ValueError
+        If the quantity is not measured in that unit; the sentence names units that it has.
+    """
     try:
-        if quantity is Quantity.TEMPERATURE and LOGGER_NAMES.get(unit, unit) in NEVER_CONVERTED:
-            return 1.0
-        if quantity is Quantity.TEMPERATURE:
-            raise ValueError
-        if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):
-            raise ValueError  # a bridge's output is no strain before its gauge factor is known
-        if quantity is Quantity.SIGNAL:
-            with suppress(ValueError):
-                return conversion(unit, "1")
-        return conversion(unit, UNITS[quantity].si)
+        return _conversion_of(quantity, unit)
     except ValueError:
         usual = listing(UNITS[quantity].usual, "or")
-        what = quantity.value.replace("_", " ")
-        raise ValueError(f"{what} must have a unit such as {usual}, and {unit!r} came") from None
+        name = quantity.value.replace("_", " ")
+        raise ValueError(f"{name} must have a unit such as {usual}, and {unit!r} came") from None
+
+
+def _conversion_of(quantity: Quantity, unit: str) -> float:
+    """Return what one of a unit is in the SI unit of a quantity.
+
+    Raise a bare ValueError otherwise.
+    """
+    if quantity is Quantity.TEMPERATURE:
+        if LOGGER_NAMES.get(unit, unit) not in NEVER_CONVERTED:
+            raise ValueError
+        return 1.0
+    if quantity is Quantity.STRAIN and re.search(r"V|[Vv]olt", unit):
+        raise ValueError  # the output of a bridge is not a strain before its gauge factor is known
+    if quantity is Quantity.SIGNAL:
+        with suppress(ValueError):
+            return conversion(unit, "1")
+    return conversion(unit, UNITS[quantity].si)
 
 
 @cache
 def quantities_of(unit: str) -> tuple[Quantity, ...]:
-    """Return the quantities that a unit can be of; none where pint does not know it."""
-    found = []
+    """Return the quantities that are measured in a unit; none if pint does not know the unit."""
+    quantities = []
     for quantity in Quantity:
         with suppress(ValueError):
             conversion_of(quantity, unit)
-            found.append(quantity)
-    return tuple(found)
+            quantities.append(quantity)
+    return tuple(quantities)

@@ -9,8 +9,15 @@ import numpy as np
 
 from discrepancy.campaign import records, schema
 from discrepancy.campaign.reading import CAMPAIGN_FILE, placed_events
-from discrepancy.campaign.units import NEVER_CONVERTED, UNITS, conversion, conversion_of, quantities_of
-from discrepancy.errors import CampaignFileError, said
+from discrepancy.campaign.trial_reading import no_reference_temperature
+from discrepancy.campaign.units import (
+    NEVER_CONVERTED,
+    UNITS,
+    conversion,
+    conversion_of,
+    quantities_of,
+)
+from discrepancy.errors import CampaignFileError
 from reporting.files import atomic_write_text
 from reporting.table_file import table_text
 from reporting.toml_file import toml_text
@@ -19,20 +26,42 @@ NOISE_FILE = "noise.csv"
 """Name of the table of samples at rest."""
 
 
-_EXACT_DIGITS, _SHOWN_DIGITS = 17, 15
-"""Digits that keep a float as it is, and that show 4.387 as such after it was in another unit."""
+_EXACT_DIGITS = 17
+"""Significant digits that keep a float as it is."""
+_SHOWN_DIGITS = 15
+"""Significant digits that show 4.387 as such after it was in another unit."""
 
 
 @dataclass(frozen=True)
-class _Layout:
-    """Units of channels, inputs and `force` in the files by name, and significant digits of their values."""
+class _FileUnits:
+    """Units and digits of the numbers in the files of a campaign.
+
+    Attributes
+    ----------
+    units : mapping of str to str
+        Units of channels, inputs and `force` by name.
+    digits : int
+        Significant digits of values in these units.
+    left_out_as_empty : bool
+        True if readings that are left out become empty cells.
+    """
 
     units: Mapping[str, str]
     digits: int
     left_out_as_empty: bool
 
     def in_unit(self, values: records.FloatArray, name: str, to_si: float) -> records.FloatArray:
-        """Return values [SI] of a channel or an input in its unit, of which one is `to_si`."""
+        """Return values (N,) of a channel or input in its unit, rounded to the digits of the files.
+
+        Parameters
+        ----------
+        values : (N,) ndarray
+            Values [SI].
+        name : str
+            Name of the channel or input.
+        to_si : float
+            Factor from its unit to SI.
+        """
         in_unit = values / to_si
         if self.digits == _EXACT_DIGITS or name not in self.units:
             return in_unit
@@ -40,7 +69,7 @@ class _Layout:
 
     @property
     def force_unit(self) -> str:
-        """Unit of the column `force`; a channel of another quantity may be called so."""
+        """Unit of the column `force`; a channel of another quantity may have that name, too."""
         unit = self.units.get("force", schema.FORCE_UNIT)
         return unit if records.Quantity.FORCE in quantities_of(unit) else schema.FORCE_UNIT
 
@@ -53,24 +82,25 @@ def write_campaign(
     units: Mapping[str, str] | None = None,
     left_out_as_empty: bool = False,
 ) -> Path:
-    """Write a campaign; `read_campaign` gives it back, equal to rounding but for its hash.
+    """Write a campaign to a folder from which `read_campaign` reads it again.
 
-    Strain is written in microstrain, displacement in mm, the rest in SI (all, if asked for). `campaign.toml`
-    comes last, so that a folder that was not finished is no campaign.
+    The campaign that is read is equal to rounding, but for its hash. Strain is written in
+    microstrain, displacement in mm, the rest in SI. `campaign.toml` is written last, so that an
+    unfinished folder is not a campaign.
 
     Parameters
     ----------
     campaign : Campaign
-        With remarks and readings left out.
+        The campaign, with its remarks and the readings that are left out.
     folder : path
-        Made if it is missing; files of the same names are replaced.
+        The folder, made if it is missing; files of the same names are replaced.
     si : bool
         Write strain and displacement in SI, too.
     units : mapping of str to str, optional
-        Unit of each channel and input in the files, by its name, in the place of these, and of the force of
-        static and forced trials by "force"; their values have 15 significant digits then.
+        Other units of channels and inputs by name, and of the force of static and forced trials by
+        "force"; their values have 15 significant digits then.
     left_out_as_empty : bool
-        Leave the cells of readings empty that are left out, in the place of `left_out` of the trial.
+        Leave the cells of readings empty that are left out, instead of listing them in `left_out`.
 
     Returns
     -------
@@ -80,121 +110,182 @@ def write_campaign(
     Raises
     ------
     CampaignFileError
-        The campaign cannot be told in the format: noise records with several intervals, or what
-        `parse_campaign` refuses, such as a channel that is called like an input.
+        If the format cannot express the campaign: noise records have several intervals, or
+        `parse_campaign` refuses it, as a channel with the name of an input.
     FileNotWrittenError, DiskFullError
-        As `reporting.files.atomic_file`.
+        For the causes of `reporting.files.atomic_file`.
     """
     folder = Path(folder)
-    usual = {name: _unit(channel, si) for name, channel in campaign.channels.items()}
-    layout = _Layout(
-        units=usual | dict(units or {}),
+    channel_units = {name: _unit(channel, si) for name, channel in campaign.channels.items()}
+    file_units = _FileUnits(
+        units=channel_units | dict(units or {}),
         digits=_EXACT_DIGITS if units is None else _SHOWN_DIGITS,
         left_out_as_empty=left_out_as_empty,
     )
-    slugs = (re.sub(r"[^a-z0-9]+", "_", trial.name.lower()).strip("_")[:40] for trial in campaign.trials)
-    files = [f"{number:02d}_{slug or 'trial'}.csv" for number, slug in enumerate(slugs, start=1)]
-    texts = {
-        file: _trial_table(campaign, trial, layout)
-        for file, trial in zip(files, campaign.trials, strict=True)
-    }
-    noise = _noise_table(campaign, layout)
-    if noise:
-        texts[NOISE_FILE] = noise[0]
-    texts[CAMPAIGN_FILE] = _campaign_text(campaign, files, noise[1] if noise else None, layout)
+    files = [_file_name(number, trial) for number, trial in enumerate(campaign.trials, start=1)]
+    texts = {}
+    for file, trial in zip(files, campaign.trials, strict=True):
+        texts[file] = _trial_table(campaign, trial, file_units)
+    noise_interval = _noise_interval(campaign)
+    if noise_interval is not None:
+        texts[NOISE_FILE] = _noise_table(campaign, noise_interval, file_units)
+    texts[CAMPAIGN_FILE] = _campaign_text(campaign, files, noise_interval, file_units)
     for name, text in texts.items():
         atomic_write_text(folder / name, text)
     return folder
 
 
+def _file_name(number: int, trial: records.Trial) -> str:
+    """Return the name of a trial's file: its number and the letters and digits of its name."""
+    slug = re.sub(r"[^a-z0-9]+", "_", trial.name.lower()).strip("_")[:40]
+    return f"{number:02d}_{slug or 'trial'}.csv"
+
+
 # ---------------------------------------------------------------- tables
 
 
-def _trial_table(campaign: records.Campaign, trial: records.Trial, layout: _Layout) -> str:
+def _trial_table(campaign: records.Campaign, trial: records.Trial, file_units: _FileUnits) -> str:
+    """Return the table of a trial as text.
+
+    Raises
+    ------
+    CampaignFileError
+        If it has temperatures and the campaign no reference temperature.
+    """
     columns: dict[str, records.FloatArray] = {}
     if trial.is_dynamic or np.any(trial.time != trial.start):
         columns["time"] = trial.time
     if trial.kind in (records.TrialKind.STATIC, records.TrialKind.FORCED):
-        columns["force"] = layout.in_unit(trial.force, "force", conversion(layout.force_unit, "N"))
+        to_newton = conversion(file_units.force_unit, "N")
+        columns["force"] = file_units.in_unit(trial.force, "force", to_newton)
     if trial.kind is records.TrialKind.FLIGHT:
         columns["load_factor"] = trial.load_factor
     if np.any(trial.temperature != 0.0):
         if campaign.reference_temperature is None:
-            raise CampaignFileError(said("campaign.no_reference", trial=trial))
+            raise CampaignFileError(no_reference_temperature(trial.name))
         columns["temperature"] = trial.temperature + campaign.reference_temperature
-    for index, region in enumerate(trial.regions):
-        name = region if region in records.USUAL_REGIONS else f"{schema.OF_REGION}{region}"
-        for key, values in ((name, trial.health), (f"{name}_deviation", trial.health_deviation)):
-            if np.any(values[:, index] != 0.0):
-                columns[key] = values[:, index]
-    for item in trial.inputs:
-        to_si = conversion_of(item.quantity, _input_unit(item, layout))
-        columns[item.name] = layout.in_unit(item.values, item.name, to_si)
+    columns |= _loss_columns(trial)
+    for recorded in trial.inputs:
+        to_si = conversion_of(recorded.quantity, _input_unit(recorded, file_units))
+        columns[recorded.name] = file_units.in_unit(recorded.values, recorded.name, to_si)
     for index, name in enumerate(trial.channels):
-        to_si = conversion_of(campaign.channels[name].quantity, layout.units[name])
+        to_si = conversion_of(campaign.channels[name].quantity, file_units.units[name])
         values = trial.values[:, index]
-        if layout.left_out_as_empty:
+        if file_units.left_out_as_empty:
             values = np.where(trial.used[:, index], values, np.nan)
-        columns[name] = layout.in_unit(values, name, to_si)
+        columns[name] = file_units.in_unit(values, name, to_si)
     return table_text(columns)
 
 
-def _unit(item: records.InTables, si: bool) -> str:
-    if item.unit in NEVER_CONVERTED:
-        return item.unit
-    return UNITS[item.quantity].si if si else UNITS[item.quantity].written
+def _loss_columns(trial: records.Trial) -> dict[str, records.FloatArray]:
+    """Return the columns of stiffness losses and their standard deviations that are not zero."""
+    columns = {}
+    for index, region in enumerate(trial.regions):
+        name = region if region in records.USUAL_REGIONS else f"{schema.OF_REGION}{region}"
+        if np.any(trial.health[:, index] != 0.0):
+            columns[name] = trial.health[:, index]
+        if np.any(trial.health_deviation[:, index] != 0.0):
+            columns[f"{name}_deviation"] = trial.health_deviation[:, index]
+    return columns
 
 
-def _input_unit(item: records.RecordedInput, layout: _Layout) -> str:
-    return layout.units.get(item.name) or _unit(item, True)
+def _unit(recorded: records.InTables, si: bool) -> str:
+    """Return the unit in which a channel or input is written, where the user states none."""
+    if recorded.unit in NEVER_CONVERTED:
+        return recorded.unit
+    units = UNITS[recorded.quantity]
+    return units.si if si else units.written
 
 
-def _noise_table(campaign: records.Campaign, layout: _Layout) -> tuple[str, float] | None:
-    """Return the table of samples at rest and their interval, None without any."""
-    recorded = {
-        name: (channel.noise.samples, channel.noise.interval)
+def _input_unit(recorded: records.RecordedInput, file_units: _FileUnits) -> str:
+    """Return the unit in which an input is written."""
+    return file_units.units.get(recorded.name) or _unit(recorded, si=True)
+
+
+def _noise_interval(campaign: records.Campaign) -> float | None:
+    """Return the sampling interval of the samples at rest [s]; None if there are none.
+
+    Raises
+    ------
+    CampaignFileError
+        If they have several intervals, or uneven ones.
+    """
+    intervals = set()
+    for channel in campaign.channels.values():
+        if channel.noise is not None and channel.noise.samples is not None:
+            intervals.add(channel.noise.interval)
+    if not intervals:
+        return None
+    if len(intervals) > 1 or None in intervals:
+        raise CampaignFileError(
+            "Noise records can be written only if all have one sampling interval: resample them, "
+            "or keep their standard deviations."
+        )
+    return intervals.pop()
+
+
+def _noise_table(campaign: records.Campaign, interval: float, file_units: _FileUnits) -> str:
+    """Return the table of samples at rest as text; shorter records end with empty cells."""
+    samples_of_channels = {
+        name: channel.noise.samples
         for name, channel in campaign.channels.items()
         if channel.noise is not None and channel.noise.samples is not None
     }
-    intervals = {interval for _, interval in recorded.values()}
-    if not recorded:
-        return None
-    interval = intervals.pop()
-    if intervals or interval is None:
-        raise CampaignFileError(said("campaign.several_intervals"))
-    longest = max(len(samples) for samples, _ in recorded.values())
+    longest = max(len(samples) for samples in samples_of_channels.values())
     columns: dict[str, records.FloatArray] = {"time": interval * np.arange(float(longest))}
-    for name, (samples, _) in recorded.items():
+    for name, samples in samples_of_channels.items():
+        to_si = conversion_of(campaign.channels[name].quantity, file_units.units[name])
         columns[name] = np.full(longest, np.nan)
-        to_si = conversion_of(campaign.channels[name].quantity, layout.units[name])
-        columns[name][: len(samples)] = layout.in_unit(samples, name, to_si)
-    return table_text(columns), interval
+        columns[name][: len(samples)] = file_units.in_unit(samples, name, to_si)
+    return table_text(columns)
 
 
 # ---------------------------------------------------------------- TOML
 
 
 def _campaign_text(
-    campaign: records.Campaign, files: list[str], noise_interval: float | None, layout: _Layout
+    campaign: records.Campaign,
+    files: list[str],
+    noise_interval: float | None,
+    file_units: _FileUnits,
 ) -> str:
+    """Return the text of `campaign.toml`.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    files : list of str
+        Names of the tables, one for each trial.
+    noise_interval : float or None
+        Sampling interval of the samples at rest [s]; None if there are none.
+    file_units : _FileUnits
+        Units of the files.
+    """
     source = f"The campaign {campaign.name!r}"
-    inputs = {item.name: item for trial in campaign.trials for item in trial.inputs}
+    inputs = {recorded.name: recorded for trial in campaign.trials for recorded in trial.inputs}
+    priors = {}
+    for name, (mean, deviation) in campaign.parameters.items():
+        priors[name] = schema.StatedPriorSection.model_construct(mean=mean, deviation=deviation)
+    noise = None
+    if noise_interval is not None:
+        noise = schema.NoiseFileSection(file=NOISE_FILE, interval=noise_interval)
+    trials = []
+    for trial, file in zip(campaign.trials, files, strict=True):
+        trials.append(_trial_section(campaign, trial, file, file_units))
     section = schema.CampaignSection.model_construct(
         format=schema.FORMAT,
         name=campaign.name,
-        force_unit=layout.force_unit,
+        force_unit=file_units.force_unit,
         reference_temperature=campaign.reference_temperature,
         remarks=campaign.remarks,
-        parameters={
-            name: schema.ParameterSection.model_construct(mean=mean, deviation=deviation)
-            for name, (mean, deviation) in campaign.parameters.items()
-        },
-        noise=noise_interval and schema.NoiseFileSection(file=NOISE_FILE, interval=noise_interval),
+        parameters=priors,
+        noise=noise,
         loggers=dict(campaign.loggers),
         accept=campaign.accept,
-        channel=tuple(_channel(channel, layout) for channel in campaign.channels.values()),
-        input=tuple(_input(item, layout) for item in inputs.values()),
-        trial=tuple(_trial(campaign, *pair, layout) for pair in zip(campaign.trials, files, strict=True)),
+        channel=tuple(_channel(channel, file_units) for channel in campaign.channels.values()),
+        input=tuple(_input(recorded, file_units) for recorded in inputs.values()),
+        trial=tuple(trials),
         event=tuple(placed_events(campaign.events, campaign.trials, source)),
     )
     content = section.model_dump(mode="json", exclude_defaults=True)
@@ -202,38 +293,44 @@ def _campaign_text(
     return toml_text(content)
 
 
-def _channel(channel: records.Channel, layout: _Layout) -> records.Channel:
-    """Return a channel as a file has it; samples at rest are in a table of their own."""
+def _channel(channel: records.Channel, file_units: _FileUnits) -> records.Channel:
+    """Return a channel as the file has it; its samples at rest stand in a table of their own."""
     noise = channel.noise
+    if noise is not None and noise.samples is not None:
+        noise = None
     if noise is not None:
-        noise = None if noise.samples is not None else replace(noise, interval=None, file="")
-    return replace(channel, unit=layout.units[channel.name], column="", noise=noise)
+        noise = replace(noise, interval=None, file="")
+    return replace(channel, unit=file_units.units[channel.name], column="", noise=noise)
 
 
-def _input(item: records.RecordedInput, layout: _Layout) -> records.RecordedInput:
-    reference = bool(item.quantity.moving) and item.hold is not records.Hold.SMOOTH
-    unit = _input_unit(item, layout)
-    deviation = item.offset_deviation / conversion_of(item.quantity, unit)
-    return replace(item, unit=unit, offset_deviation=deviation, column="", reference=reference)
-
-
-def _trial(
-    campaign: records.Campaign, trial: records.Trial, file: str, layout: _Layout
-) -> schema.TrialSection:
-    left_out = (
-        {}
-        if layout.left_out_as_empty
-        else {
-            name: tuple((np.flatnonzero(~trial.used[:, index]) + 1).tolist())
-            for index, name in enumerate(trial.channels)
-            if not trial.used[:, index].all()
-        }
+def _input(recorded: records.RecordedInput, file_units: _FileUnits) -> records.RecordedInput:
+    """Return an input as the file has it, without its values and in its unit."""
+    is_reference = bool(recorded.quantity.moving) and recorded.hold is not records.Hold.SMOOTH
+    unit = _input_unit(recorded, file_units)
+    deviation = recorded.offset_deviation / conversion_of(recorded.quantity, unit)
+    return replace(
+        recorded, unit=unit, offset_deviation=deviation, column="", reference=is_reference
     )
-    driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed
-    said = driven or trial.begins is not records.Start.SETTLED
-    in_order = list(trial.channels) == [name for name in campaign.channels if name in trial.channels]
+
+
+def _trial_section(
+    campaign: records.Campaign, trial: records.Trial, file: str, file_units: _FileUnits
+) -> schema.TrialSection:
+    """Return a trial as `campaign.toml` has it; keys with their default are left out."""
+    left_out: dict[str, tuple[int, ...]] = {}
+    if not file_units.left_out_as_empty:
+        for index, name in enumerate(trial.channels):
+            rows = np.flatnonzero(~trial.used[:, index]) + 1
+            if rows.size:
+                left_out[name] = tuple(rows.tolist())
+    is_driven = trial.kind is records.TrialKind.DRIVEN and not trial.begin_assumed
+    states_begin = is_driven or trial.begins is not records.Start.SETTLED
+    names_in_order = [name for name in campaign.channels if name in trial.channels]
+    keys = {**trial.keys_in_file, "file": file}
     return schema.TrialSection(
-        **{**trial.said, "file": file}, left_out=left_out,
+        **keys,
+        left_out=left_out,
         start=trial.start if trial.start or not trial.is_dynamic else None,
-        begins=trial.begins if said else None, channels=None if in_order else trial.channels,
-    )  # fmt: skip
+        begins=trial.begins if states_begin else None,
+        channels=None if list(trial.channels) == names_in_order else trial.channels,
+    )

@@ -1,4 +1,4 @@
-"""A catalogue entry: a named effect, its parameters with priors, and the patch that it stands for."""
+"""An entry of the catalogue: a named effect, its parameters with priors, and its patch."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -17,22 +17,22 @@ NINETY = 1.6448536269514722
 """Standard normal quantile of 0.95."""
 Number = Annotated[float, Strict()]
 ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
-"""How a table of an entry is read as one of these records."""
+"""How a table of a file of effects is checked as one of these records."""
 LEAST_SHRINKAGE = 0.3
-"""A step takes no positive value below this share of itself."""
+"""Least factor by which a step of an iteration changes a positive value."""
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior of one number, as a map of a standard normal variable u.
+    """Prior of one number, as a map from a standard normal variable u.
 
     Attributes
     ----------
     shape : {"log_normal", "normal", "uniform"}
-        "log_normal": 90 % of the mass between `low` and `high`, both positive; "normal": the same; "uniform":
-        between them.
+        Distribution: "log_normal" and "normal" have 90 % of their mass between `low` and `high`,
+        "uniform" has all of it there.
     low, high : float
-        See there.
+        Bounds, in the unit of the number; both positive for "log_normal".
     """
 
     __pydantic_config__ = ROW
@@ -41,8 +41,8 @@ class Prior:
     low: Number
     high: Number
 
-    def _line(self) -> tuple[float, float]:
-        """Return mean and deviation of the value, or of its logarithm."""
+    def _mean_and_deviation(self) -> tuple[float, float]:
+        """Return mean and standard deviation of the value, or of its logarithm if log-normal."""
         low, high = self.low, self.high
         if self.shape == "log_normal":
             low, high = log(low), log(high)
@@ -52,25 +52,32 @@ class Prior:
         """Return the value at the standard normal variable `u`."""
         if self.shape == "uniform":
             return self.low + (self.high - self.low) * float(ndtr(u))
-        mean, deviation = self._line()
-        return exp(mean + deviation * u) if self.shape == "log_normal" else mean + deviation * u
+        mean, deviation = self._mean_and_deviation()
+        if self.shape == "log_normal":
+            return exp(mean + deviation * u)
+        return mean + deviation * u
 
     def normal(self, value: float) -> float:
         """Return the standard normal variable of a value; the inverse of `value`."""
         if self.shape == "uniform":
-            return float(ndtri(min(max((value - self.low) / (self.high - self.low), 1e-12), 1.0 - 1e-12)))
-        mean, deviation = self._line()
-        return ((log(value) if self.shape == "log_normal" else value) - mean) / deviation
+            probability = (value - self.low) / (self.high - self.low)
+            return float(ndtri(min(max(probability, 1e-12), 1.0 - 1e-12)))
+        mean, deviation = self._mean_and_deviation()
+        if self.shape == "log_normal":
+            value = log(value)
+        return (value - mean) / deviation
 
     def stepped(self, u: float, step: float) -> float:
-        """Return the standard normal variable after a step, taken along the value's tangent.
+        """Return the standard normal variable after a step along the value's tangent.
 
-        What follows a value in proportion is far from following its logarithm.
+        A prediction that is proportional to a log-normal value is far from linear in its logarithm,
+        so the step is made in the value. It leaves at least `LEAST_SHRINKAGE` of a positive value.
         """
         if self.shape != "log_normal":
             return u + step
-        slope = self._line()[1]
-        return u + log(max(1.0 + slope * step, LEAST_SHRINKAGE)) / slope
+        _, deviation = self._mean_and_deviation()
+        growth = max(1.0 + deviation * step, LEAST_SHRINKAGE)
+        return u + log(growth) / deviation
 
 
 @dataclass(frozen=True)
@@ -79,14 +86,21 @@ class EffectParameter:
 
     Attributes
     ----------
-    name, symbol, unit, description : str
-        Full name in snake case, the symbol of the equation, SI unit ("1" without), one line.
+    name : str
+        Full name in snake case.
+    symbol : str
+        Symbol in the equation of the effect.
+    unit : str
+        Unit in SI; "1" if it has none.
+    description : str
+        One line.
     prior : Prior
-        In the unit.
+        Prior, in the unit.
     magnitude : bool
-        Whether the effect vanishes with this parameter.
+        True if the effect vanishes with this parameter.
     levels : int
-        Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the search.
+        Number of values, evenly over the prior, at which fits may begin; 0 leaves the choice to the
+        search.
     """
 
     __pydantic_config__ = ROW
@@ -102,16 +116,18 @@ class EffectParameter:
 
 @dataclass(frozen=True)
 class ShapeParameter:
-    """A number that is fixed in the named effect and free in its family (the shape gate frees it).
+    """An exponent or the like that is fixed in the named effect and free in its family.
+
+    The shape gate frees it, to test whether the data determine the name.
 
     Attributes
     ----------
     name, symbol, description : str
-        As of `EffectParameter`.
+        Those of an `EffectParameter`.
     canonical : float
         Value in the named effect.
     prior : Prior
-        Within the family.
+        Prior within the family.
     """
 
     __pydantic_config__ = ROW
@@ -128,15 +144,26 @@ class ShapeParameter:
 
 @dataclass(frozen=True)
 class Setting:
-    """Where an effect is to be built: campaign, model, natural scales.
+    """A campaign and a model in which effects are built.
 
-    `largest` keeps the largest readings that were found, as patches are built at every step of a fit.
+    Attributes
+    ----------
+    campaign : Campaign
+        The campaign.
+    model : Model
+        The model that effects are added to.
+    scales : Scales
+        Natural scales of the model in the campaign, which make parameters dimensionless.
+    largest : dict
+        Largest readings that were computed; kept, because a fit builds patches at every step.
     """
 
     campaign: Campaign
     model: Model
     scales: Scales
-    largest: dict[object, float] = field(default_factory=dict, init=False, compare=False, repr=False)
+    largest: dict[object, float] = field(
+        default_factory=dict, init=False, compare=False, repr=False
+    )
 
 
 Build = Callable[[Setting, Mapping[str, float], str], ModelPatch]
@@ -144,29 +171,29 @@ Build = Callable[[Setting, Mapping[str, float], str], ModelPatch]
 
 @dataclass(frozen=True, kw_only=True)
 class EffectKeys:
-    """What an effect has as its file says it.
+    """The entries of an effect that its file states.
 
     Attributes
     ----------
     identifier : str
-        Lower case with underscores, such as "coulomb_friction"; stable. `id` in files.
+        Stable identifier in lower case with underscores, such as "coulomb_friction"; `id` in files.
     name : str
         The field's standard term.
     family : str
-        Name of the free-shape family that it belongs to, such as "damping |v|^p |x|^a".
+        Family of laws that it belongs to, such as "damping |v|^p |x|^a".
     equation, signature, reference : str
-        One line each.
+        Equation, what it changes in the data, and source; one line each.
     acts_on : frozenset of TrialKind
-        Trials that it changes.
+        Kinds of trials that it changes.
     parameters : tuple of EffectParameter
-        With priors, dimensionless wherever a scale of the setting can make them so.
+        Parameters with priors, dimensionless wherever a scale of the setting can make them so.
     shape : tuple of ShapeParameter
-        Freed by the shape gate.
+        Numbers that the shape gate frees.
     confusable : tuple of str
         Identifiers of effects that some campaigns cannot tell from it.
     spectral : str
-        Name of a parameter that is a frequency over the first natural frequency; fits of it begin at peaks of
-        the residuals' spectrum at the place, a channel. Empty if there is none.
+        Name of a parameter that is a frequency over the first natural frequency; fits of it begin
+        at peaks of the residuals' spectrum at the place, a channel. Empty if there is none.
     """
 
     identifier: Annotated[str, Field(alias="id")]
@@ -184,17 +211,18 @@ class EffectKeys:
 
 @dataclass(frozen=True, kw_only=True)
 class Effect(EffectKeys):
-    """A named effect.
+    """A named effect: the patch that adds it to a model, and where it may act.
 
     Attributes
     ----------
     build : callable
-        (setting, values by name of parameters and shape, place) -> patch. A missing shape value is canonical.
+        Returns the patch by setting, values of parameters and shape by name, and place. A shape
+        value that is missing is the canonical one.
     places : callable
-        setting -> the discrete places where it may act (channel names, ports, runs, mains frequencies); ("",)
-        if there is no choice.
+        Returns the places where it may act in a setting (names of channels, ports, runs or mains
+        lines); ("",) if there is no choice.
     unavailable : callable
-        setting -> why it cannot be tested here, or None.
+        Returns why it cannot be tested in a setting, or None.
     """
 
     build: Build
@@ -203,8 +231,11 @@ class Effect(EffectKeys):
 
     def canonical_shape(self) -> dict[str, float]:
         """Return the shape values of the named effect."""
-        return {item.name: item.canonical for item in self.shape}
+        return {parameter.name: parameter.canonical for parameter in self.shape}
 
     def patch(self, setting: Setting, values: Mapping[str, float], place: str = "") -> ModelPatch:
-        """Return the patch at given values; shape values that are not given are canonical."""
+        """Return the patch at values of parameters and shape.
+
+        A missing shape value is canonical.
+        """
         return self.build(setting, {**self.canonical_shape(), **values}, place)

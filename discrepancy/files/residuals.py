@@ -1,7 +1,7 @@
 """`residuals.nc`: measured, predicted and residual values of every trial, with units (NetCDF-4).
 
-One group for each trial (`trial_001` ..) with its name as an attribute, and a group `noise` for what was
-recorded of the noise.
+One group for each trial (`trial_001` ..) with its name as an attribute, and a group `noise` for
+what was recorded of the noise.
 """
 
 import json
@@ -15,9 +15,17 @@ import numpy as np
 import xarray as xr
 
 from discrepancy.campaign.protocol import Release
-from discrepancy.campaign.records import USUAL_REGIONS, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import (
+    USUAL_REGIONS,
+    Channel,
+    FloatArray,
+    NoiseRecord,
+    Quantity,
+    Trial,
+    TrialKind,
+)
 from discrepancy.campaign.units import UNITS
-from discrepancy.errors import DiscrepancyError, VerdictFileError, said
+from discrepancy.errors import DiscrepancyError, VerdictFileError
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes
@@ -30,18 +38,26 @@ SCHEMA = "uav-twin residuals 1"
 """Value of the attribute `schema` of the root."""
 
 _DAMAGED = (
-    DamagedFileError, KeyError, TypeError, ValueError, AttributeError, RecursionError, DiscrepancyError,
-)  # fmt: skip
+    DamagedFileError,
+    KeyError,
+    TypeError,
+    ValueError,
+    AttributeError,
+    RecursionError,
+    DiscrepancyError,
+)
 _PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
-"""What the file has of a channel as it is."""
+"""Fields of a channel that the file has as they are."""
 _NOTE = "unit of each channel: see the coordinate `unit`"
 _ARRAYS: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text("utf-8")
 )
-"""Dimensions, unit and words of the arrays of a trial and of its fit, by name."""
+"""Dimensions and attributes of the arrays of a trial and of its fit, by name."""
 
 
-def write_residuals(path: Path, residuals: ResidualSet, attributes: Mapping[str, str] | None = None) -> Path:
+def write_residuals(
+    path: Path, residuals: ResidualSet, attributes: Mapping[str, str] | None = None
+) -> Path:
     """Write a set of residuals, whole or not at all.
 
     Parameters
@@ -53,30 +69,34 @@ def write_residuals(path: Path, residuals: ResidualSet, attributes: Mapping[str,
     attributes : mapping of str to str, optional
         Further attributes of the root, such as the hypothesis, the data hash and the command.
 
+    Returns
+    -------
+    Path
+        The destination.
+
     Raises
     ------
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
-    root = {
-        **(attributes or {}),
-        "schema": SCHEMA,
-        "channels": json.dumps([_channel_row(channel) for channel in residuals.channels.values()]),
-    }
+    channel_rows = [_channel_row(channel) for channel in residuals.channels.values()]
+    root = {**(attributes or {}), "schema": SCHEMA, "channels": json.dumps(channel_rows)}
     groups: dict[str, xr.Dataset] = {"/": xr.Dataset(attrs=root)}
-    for number, item in enumerate(residuals.trials, start=1):
-        groups[f"trial_{number:03d}"] = _dataset(item, residuals.channels)
+    for number, fitted_trial in enumerate(residuals.trials, start=1):
+        groups[f"trial_{number:03d}"] = _dataset(fitted_trial, residuals.channels)
     for number, (name, channel) in enumerate(residuals.channels.items(), start=1):
         if channel.noise is not None and channel.noise.samples is not None:
+            unit = UNITS[channel.quantity].si
             groups[f"noise/channel_{number:03d}"] = xr.Dataset(
-                {"noise": ("sample", channel.noise.samples, {"units": UNITS[channel.quantity].si})},
+                {"noise": ("sample", channel.noise.samples, {"units": unit})},
                 attrs={"channel": name, "interval": channel.noise.interval or float("nan")},
             )
-    return atomic_write_bytes(path, bytes(xr.DataTree.from_dict(groups).to_netcdf(engine="h5netcdf")))
+    content = xr.DataTree.from_dict(groups).to_netcdf(engine="h5netcdf")
+    return atomic_write_bytes(path, bytes(content))
 
 
 def read_residuals(path: Path) -> ResidualSet:
-    """Read what `write_residuals` wrote; values are equal to the last bit, sensitivities are not there.
+    """Read the residuals that `write_residuals` wrote; they are equal to the last bit.
 
     Raises
     ------
@@ -85,87 +105,156 @@ def read_residuals(path: Path) -> ResidualSet:
     """
     path = Path(path)
     if not path.is_file():
-        raise VerdictFileError(f"There is no file {path}; give the one that the discrepancy workflow left.")
+        raise VerdictFileError(
+            f"There is no file {path}; give the one that the discrepancy workflow left."
+        )
     try:
         tree = read_groups(path)
         schema = tree.attrs.get("schema")
         if schema == SCHEMA:
-            groups = {name: group.to_dataset() for name, group in tree.children.items()}
-            noise = {
-                str(group.attrs["channel"]): group.to_dataset()
-                for group in (
-                    tree["noise"].children.values() if groups.pop("noise", None) is not None else ()
-                )
-            }
-            channels = {row["name"]: _channel(row, noise) for row in json.loads(tree.attrs["channels"])}
-            return ResidualSet(channels, tuple(_trial(groups[name]) for name in sorted(groups)))
+            return _residual_set(tree)
     except _DAMAGED as error:
-        reason = f"{type(error).__name__}: {one_line(error)}"
-        raise VerdictFileError(said("models.residuals_file", path=path, reason=reason)) from error
+        raise VerdictFileError(
+            f"{path} is damaged or no file of residuals ({type(error).__name__}: "
+            f"{one_line(error)}); write it again."
+        ) from error
     raise VerdictFileError(f"{path} has the schema {schema!r}, but {SCHEMA!r} is needed.")
 
 
+def _residual_set(tree: xr.DataTree) -> ResidualSet:
+    """Return the residuals in the groups of a file."""
+    samples_at_rest: dict[str, FloatArray] = {}
+    if "noise" in tree.children:
+        for group in tree["noise"].children.values():
+            samples_at_rest[str(group.attrs["channel"])] = group.to_dataset()["noise"].values
+    channels = {}
+    for row in json.loads(tree.attrs["channels"]):
+        channels[row["name"]] = _channel(row, samples_at_rest.get(row["name"]))
+    names = sorted(name for name in tree.children if name != "noise")
+    return ResidualSet(channels, tuple(_fitted_trial(tree[name].to_dataset()) for name in names))
+
+
 def _channel_row(channel: Channel) -> dict[str, Any]:
-    noise = channel.noise
-    recorded = noise and [noise.standard_deviation, noise.degrees_of_freedom, noise.interval, noise.source]
-    # JSON as Python writes it knows Infinity; this text is read by Python only.
-    return {"quantity": channel.quantity, **{key: getattr(channel, key) for key in _PLAIN}, "noise": recorded}
+    """Return a channel as a row of the attribute `channels`, without its samples at rest.
+
+    The row may hold infinities, which Python's JSON writes and reads.
+    """
+    noise_row = None
+    if channel.noise is not None:
+        noise = channel.noise
+        noise_row = [
+            noise.standard_deviation,
+            noise.degrees_of_freedom,
+            noise.interval,
+            noise.source,
+        ]
+    plain_keys = {key: getattr(channel, key) for key in _PLAIN}
+    return {"quantity": channel.quantity, **plain_keys, "noise": noise_row}
 
 
-def _channel(row: Mapping[str, Any], samples: Mapping[str, xr.Dataset]) -> Channel:
+def _channel(row: Mapping[str, Any], samples: FloatArray | None) -> Channel:
+    """Return the channel of a row of the attribute `channels`.
+
+    Parameters
+    ----------
+    row : mapping
+        The row.
+    samples : (n,) ndarray or None
+        Its samples at rest.
+    """
     noise = None
     if row["noise"] is not None:
         deviation, freedom, interval, source = row["noise"]
-        recorded = samples[row["name"]]["noise"].values if row["name"] in samples else None
-        noise = NoiseRecord(deviation, freedom, recorded, interval, source)
-    return Channel(quantity=Quantity(row["quantity"]), noise=noise, **{key: row[key] for key in _PLAIN})
+        noise = NoiseRecord(
+            standard_deviation=deviation,
+            degrees_of_freedom=freedom,
+            samples=samples,
+            interval=interval,
+            source=source,
+        )
+    plain_keys = {key: row[key] for key in _PLAIN}
+    return Channel(quantity=Quantity(row["quantity"]), noise=noise, **plain_keys)
 
 
-def _dataset(item: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
-    trial = item.trial
+def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
+    """Return the group of a trial: its readings, its fit, and its attributes."""
+    trial = fitted_trial.trial
+    by_row_and_channel = ("row", "channel")
     variables: dict[str, Any] = {
-        "measured": (("row", "channel"), trial.values, {"long_name": "measured value", "comment": _NOTE}),
-        "used": (("row", "channel"), item.used.astype(np.int8), {"long_name": "1 where the sample counts"}),
+        "measured": (
+            by_row_and_channel,
+            trial.values,
+            {"long_name": "measured value", "comment": _NOTE},
+        ),
+        "used": (
+            by_row_and_channel,
+            fitted_trial.used.astype(np.int8),
+            {"long_name": "1 where the sample counts"},
+        ),
     }
-    for record, part in ((trial, "trial"), (item, "fit")):
-        for name, known in _ARRAYS[part].items():
-            if (values := getattr(record, name)) is not None:
-                words = {key: text for key, text in known.items() if key != "dimensions"}
-                variables[name] = (known["dimensions"], values, words)
-    said: dict[str, Any] = {
-        "name": trial.name, "kind": trial.kind.value, "run": trial.run, "start": trial.start,
-        "held_out": int(trial.held_out), "load_place": json.dumps(trial.load_place),
+    records: dict[str, Trial | FittedTrial] = {"trial": trial, "fit": fitted_trial}
+    for table, record in records.items():
+        for name, description in _ARRAYS[table].items():
+            values = getattr(record, name)
+            if values is not None:
+                attributes = {key: text for key, text in description.items() if key != "dimensions"}
+                variables[name] = (description["dimensions"], values, attributes)
+    attributes_of_trial: dict[str, Any] = {
+        "name": trial.name,
+        "kind": trial.kind.value,
+        "run": trial.run,
+        "start": trial.start,
+        "held_out": int(trial.held_out),
+        "load_place": json.dumps(trial.load_place),
         "regions": json.dumps(trial.regions),
-    }  # fmt: skip
-    if trial.release is not None:
-        said["release"] = json.dumps(astuple(trial.release))
-    coordinates = {
-        "channel": ("channel", list(trial.channels)),
-        "unit": ("channel", [UNITS[channels[name].quantity].si for name in trial.channels]),
     }
-    return xr.Dataset(variables, coords=coordinates, attrs=said).set_coords("time")
+    if trial.release is not None:
+        attributes_of_trial["release"] = json.dumps(astuple(trial.release))
+    units = [UNITS[channels[name].quantity].si for name in trial.channels]
+    coordinates = {"channel": ("channel", list(trial.channels)), "unit": ("channel", units)}
+    dataset = xr.Dataset(variables, coords=coordinates, attrs=attributes_of_trial)
+    return dataset.set_coords("time")
 
 
-def _trial(group: xr.Dataset) -> FittedTrial:
+def _fitted_trial(group: xr.Dataset) -> FittedTrial:
+    """Return the trial of a group with its fit.
+
+    Raises
+    ------
+    ValueError
+        If an array of the trial is not finite.
+    """
     attributes = group.attrs
-    rows: dict[str, Any] = {name: group[name].values for name in _ARRAYS["trial"]}
-    for name, values in rows.items():
+    arrays: dict[str, Any] = {name: group[name].values for name in _ARRAYS["trial"]}
+    for name, values in arrays.items():
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{name} is not finite")
-    place = json.loads(attributes["load_place"])
+    load_place = json.loads(attributes["load_place"])
+    if not isinstance(load_place, str):
+        load_place = (float(load_place[0]), float(load_place[1]))
+    release = None
+    if "release" in attributes:
+        release = Release(*json.loads(attributes["release"]))
+    regions = USUAL_REGIONS
+    if "regions" in attributes:
+        regions = tuple(json.loads(attributes["regions"]))
     trial = Trial(
         name=str(attributes["name"]),
         kind=TrialKind(attributes["kind"]),
         channels=tuple(str(name) for name in group["channel"].values),
         values=group["measured"].values,
         used=group["used"].values.astype(bool),
-        load_place=place if isinstance(place, str) else (float(place[0]), float(place[1])),
+        load_place=load_place,
         start=float(attributes["start"]),
         run=str(attributes["run"]),
-        release=Release(*json.loads(attributes["release"])) if "release" in attributes else None,
+        release=release,
         held_out=bool(attributes["held_out"]),
-        regions=tuple(json.loads(attributes["regions"])) if "regions" in attributes else USUAL_REGIONS,
-        **rows,
+        regions=regions,
+        **arrays,
     )
-    found = {name: group[name].values for name in _ARRAYS["fit"].keys() - {"standardised"} if name in group}
-    return FittedTrial(trial, **found)
+    arrays_of_fit = {
+        name: group[name].values
+        for name in _ARRAYS["fit"]
+        if name != "standardised" and name in group
+    }
+    return FittedTrial(trial, **arrays_of_fit)

@@ -27,38 +27,51 @@ VERDICT_SCHEMA = "uav-twin verdict 5"
 """Value of the key `schema`; files of earlier numbers are read too."""
 VERDICT_NAME = "verdict.json"
 OLDER_SCHEMAS = tuple(f"uav-twin verdict {number}" for number in (1, 2, 3, 4))
-"""They lack keys of this one, which have defaults, and shares of another definition, which are left
-out."""
+"""Earlier schemas, which are read, too.
+
+They lack keys of this one, which have defaults. Their fractions have another definition and are
+left out."""
 OLD_SHARE = (
-    "The file is of an earlier version, whose share divided the error after by the doubt of the posterior "
-    "too; run its command again."
+    "The file is of an earlier version, whose share divided the error after by the doubt of the "
+    "posterior too; run its command again."
 )
 """Why the proof of an older file has no share."""
 
 
 @dataclass(frozen=True)
 class StoredVerdict:
-    """Content of verdict.json."""
+    """Content of `verdict.json`.
+
+    Attributes
+    ----------
+    verdict : Verdict
+        What was concluded.
+    proof : Proof or None
+        Its proof on trials that were held out, if there are any.
+    origin : Origin
+        Model, campaign and program that it comes from.
+    """
 
     verdict: Verdict
     proof: Proof | None
     origin: Origin
 
     def __repr__(self) -> str:
-        return brief(self, verdict=self.verdict, model=self.origin.model, campaign=self.origin.campaign)
+        return brief(
+            self, verdict=self.verdict, model=self.origin.model, campaign=self.origin.campaign
+        )
 
 
 @dataclass(frozen=True, repr=False)
 class VerdictFolder(StoredVerdict):
-    """What `uav-twin discrepancy run` left: the content of `verdict.json`, and more.
+    """The folder that `uav-twin discrepancy run` leaves: the content of `verdict.json`, and more.
 
     Attributes
     ----------
     patch : ModelPatch or None
-        The effects that were found, identical to what was found; None without `patch.json`.
+        The effects that were found, to the last bit; None without `patch.json`.
     residuals : ResidualSet or None
-        Data minus model with the effects, in standard deviations of the noise; None where faults of the data
-        stopped the work.
+        Data minus model with the effects; None if faults of the data stopped the work.
     """
 
     patch: ModelPatch | None
@@ -79,19 +92,20 @@ def write_verdict(path: Path, verdict: Verdict, proof: Proof | None, origin: Ori
 
 
 def read_verdict_file(path: Path) -> StoredVerdict:
-    """Read the verdict.json that `write_verdict` wrote; the records are equal, nan included.
+    """Read the `verdict.json` that `write_verdict` wrote; the records are equal, nan included.
 
     Raises
     ------
     VerdictFileError
         If the file is missing, damaged, of another schema, or holds something else than it should.
     """
-    return read_document(path, VERDICT_SCHEMA, StoredVerdict, OLDER_SCHEMAS, _without_old_shares)
+    return read_document(path, VERDICT_SCHEMA, StoredVerdict, OLDER_SCHEMAS, _drop_old_definitions)
 
 
-def _without_old_shares(content: dict[str, Any]) -> None:
-    """Leave out of an older file what was told as a share or as chi-square by other definitions."""
-    verdict, proof = content["verdict"], content["proof"]
+def _drop_old_definitions(content: dict[str, Any]) -> None:
+    """Remove from an older file what has another definition now: fractions and chi-squared."""
+    verdict = content["verdict"]
+    proof = content["proof"]
     verdict.pop("explained", None)
     force = verdict.get("force") or {}
     for role in ("fitted", "held_out"):
@@ -105,8 +119,10 @@ def _without_old_shares(content: dict[str, Any]) -> None:
         scores = proof[name]
         if scores is not None:
             scores.pop("chi_square_per_dof", None)
-            scores |= {"chi_square_per_sample": None, "chi_square_deviation": None}
-    proof |= {"closed": None, "closed_reason": OLD_SHARE}
+            scores["chi_square_per_sample"] = None
+            scores["chi_square_deviation"] = None
+    proof["closed"] = None
+    proof["closed_reason"] = OLD_SHARE
 
 
 def read_verdict(folder: Path | str) -> VerdictFolder:
@@ -115,28 +131,31 @@ def read_verdict(folder: Path | str) -> VerdictFolder:
     Parameters
     ----------
     folder : path
-        As `uav-twin discrepancy run --out` leaves it.
+        The folder that `uav-twin discrepancy run --out` leaves.
 
     Raises
     ------
     VerdictFileError
         If a file is missing, damaged, of another schema, or holds something else than it should.
     """
-    place = Path(folder)
-    restore_folder(place)
-    stored = read_verdict_file(place / VERDICT_NAME)
-    patch, residuals = place / PATCH_NAME, place / RESIDUALS_NAME
+    folder = Path(folder)
+    restore_folder(folder)
+    stored = read_verdict_file(folder / VERDICT_NAME)
+    patch_file = folder / PATCH_NAME
+    residuals_file = folder / RESIDUALS_NAME
     return VerdictFolder(
-        **vars(stored),
-        patch=read_patch(patch).patch if patch.is_file() else None,
-        residuals=read_residuals(residuals) if residuals.is_file() else None,
+        verdict=stored.verdict,
+        proof=stored.proof,
+        origin=stored.origin,
+        patch=read_patch(patch_file).patch if patch_file.is_file() else None,
+        residuals=read_residuals(residuals_file) if residuals_file.is_file() else None,
     )
 
 
 PATCHED = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART, VerdictKind.FAMILY, VerdictKind.GROUP)
 """Verdicts that leave a patch."""
 APPLIED = (*PATCHED, VerdictKind.UNEXPLAINED)
-"""What a patch may rest on; on an unexplained gap where its best hypothesis is applied."""
+"""Verdicts on which a patch may rest: on an unexplained one if its best hypothesis is applied."""
 PATCH_NAME = "patch.json"
 
 _INTERVAL = (0.05, 0.95)
@@ -148,9 +167,20 @@ _OUTPUTS = {
 
 @dataclass(frozen=True)
 class PrimitiveInterval:
-    """90 % posterior interval of a parameter of the primitive `primitive` (index in the effect's patch).
+    """90 % posterior interval of one parameter of a primitive.
 
-    `low`, `high` are nan where the posterior was not drawn from; `unit` is that of the parameter.
+    Attributes
+    ----------
+    primitive : int
+        Index of the primitive in the effect's patch.
+    parameter : str
+        Name of the parameter.
+    value : float
+        Value in the patch.
+    low, high : float
+        Ends of the interval; nan if no draws of the posterior were taken.
+    unit : str
+        Unit of the parameter.
     """
 
     primitive: Annotated[int, Field(ge=0, description="Index in the effect's list `patch`.")]
@@ -168,9 +198,12 @@ class PatchEffect(NamedEffect):
     intervals: tuple[PrimitiveInterval, ...]
 
 
-def _patched(kind: VerdictKind) -> VerdictKind:
+def _checked_basis(kind: VerdictKind) -> VerdictKind:
+    """Return a kind of verdict on which a patch may rest; raise ValueError for any other."""
     if kind not in APPLIED:
-        raise ValueError(f"a patch rests on a name, a family, a group or a hypothesis, not on {kind.value!r}")
+        raise ValueError(
+            f"a patch rests on a name, a family, a group or a hypothesis, not on {kind.value!r}"
+        )
     return kind
 
 
@@ -181,22 +214,24 @@ class StoredPatch:
     Attributes
     ----------
     verdict : VerdictKind
-        What the patch rests on; of a group it is one member, mostly the most probable, and of an unexplained
-        gap the best hypothesis: these are no names.
+        Verdict on which the patch rests. For a group the patch is one member, mostly the most
+        probable, and for an unexplained gap the best hypothesis: these are not names.
     sentence : str
         The verdict in words.
     effects : tuple of PatchEffect
-        In order.
+        The effects in order.
     channels : mapping of str to str
         Outputs of the wing FMU by the names of channels.
     parameters : tuple of CalibratedParameter
-        Of the model, beside these effects.
+        Parameters of the model, fitted beside these effects.
     origin : Origin
-        What it was reached from.
+        Model, campaign and program that it comes from.
     """
 
     verdict: Annotated[
-        VerdictKind, AfterValidator(_patched), WithJsonSchema({"enum": [kind.value for kind in APPLIED]})
+        VerdictKind,
+        AfterValidator(_checked_basis),
+        WithJsonSchema({"enum": [kind.value for kind in APPLIED]}),
     ]
     sentence: str
     effects: tuple[PatchEffect, ...]
@@ -206,46 +241,74 @@ class StoredPatch:
 
     @property
     def patch(self) -> ModelPatch:
-        """The whole patch: that of all effects, in order."""
+        """The patches of all effects, in order, as one."""
         return sum((effect.patch for effect in self.effects), ModelPatch())
 
     def upon(self, earlier: "StoredPatch | None") -> "StoredPatch":
-        """Return this patch and the one that was built into its model, for the model that had neither."""
+        """Return this patch after an earlier one that is in its model, for the bare model."""
         if earlier is None:
             return self
-        beneath = earlier.origin
-        origin = replace(self.origin, model_file=beneath.model_file, model_hash=beneath.model_hash)
-        effects, channels = earlier.effects + self.effects, {**earlier.channels, **self.channels}
-        return replace(self, effects=effects, origin=origin, channels=channels)
+        origin = replace(
+            self.origin,
+            model_file=earlier.origin.model_file,
+            model_hash=earlier.origin.model_hash,
+        )
+        return replace(
+            self,
+            effects=earlier.effects + self.effects,
+            origin=origin,
+            channels={**earlier.channels, **self.channels},
+        )
 
 
-def primitive_intervals(patch: ModelPatch, draws: Sequence[ModelPatch] = ()) -> tuple[PrimitiveInterval, ...]:
-    """Return the interval of each real parameter of a patch.
+def primitive_intervals(
+    patch: ModelPatch, draws: Sequence[ModelPatch] = ()
+) -> tuple[PrimitiveInterval, ...]:
+    """Return the 90 % interval of each parameter of a patch's primitives.
 
     Parameters
     ----------
     patch : ModelPatch
-        At the posterior's centre.
+        Patch at the centre of the posterior.
     draws : sequence of ModelPatch
-        Patches of the same effect at draws of its posterior; their quantiles 0.05 and 0.95 are taken.
+        Patches of the same effect at draws of its posterior, whose quantiles 0.05 and 0.95 are
+        taken.
 
     Raises
     ------
     VerdictFileError
         If a draw has other primitives than the patch.
     """
-    kinds, *others = (", ".join(item.kind for item in each) or "none" for each in (patch, *draws))
-    for count, came in enumerate(others, start=1):
-        if came != kinds:
-            odd = f"Draw {count} of the posterior has the primitives {came}"
-            raise VerdictFileError(f"{odd}, but the patch has {kinds}.")
-    found = []
-    for place, primitive in enumerate(patch):
+    kinds = _kinds(patch)
+    for number, draw in enumerate(draws, start=1):
+        if _kinds(draw) != kinds:
+            raise VerdictFileError(
+                f"Draw {number} of the posterior has the primitives {_kinds(draw)}, but the patch "
+                f"has {kinds}."
+            )
+    intervals = []
+    for index, primitive in enumerate(patch):
         for name, unit in PRIMITIVE_UNITS[primitive.kind].items():
-            values = [float(getattr(draw.primitives[place], name)) for draw in draws]
-            low, high = np.quantile(values, _INTERVAL).tolist() if values else (nan, nan)
-            found.append(PrimitiveInterval(place, name, float(getattr(primitive, name)), low, high, unit))
-    return tuple(found)
+            values = [float(getattr(draw.primitives[index], name)) for draw in draws]
+            low = high = nan
+            if values:
+                low, high = np.quantile(values, _INTERVAL).tolist()
+            intervals.append(
+                PrimitiveInterval(
+                    primitive=index,
+                    parameter=name,
+                    value=float(getattr(primitive, name)),
+                    low=low,
+                    high=high,
+                    unit=unit,
+                )
+            )
+    return tuple(intervals)
+
+
+def _kinds(patch: ModelPatch) -> str:
+    """Return the kinds of a patch's primitives, for a message."""
+    return ", ".join(primitive.kind for primitive in patch) or "none"
 
 
 def patch_effects(
@@ -256,62 +319,67 @@ def patch_effects(
     Parameters
     ----------
     effects : sequence of NamedEffect
-        In order.
+        The effects in order.
     draws : sequence of sequence of ModelPatch, optional
-        For each effect, in order: its patch at draws of the posterior. Without, intervals are null.
+        Patches of each effect at draws of the posterior; without them intervals are null.
 
     Raises
     ------
     VerdictFileError
-        As `primitive_intervals`.
+        If a draw has other primitives than the effect's patch.
     """
-    rows = zip(effects, draws or [()] * len(effects), strict=True)
-    return tuple(
-        PatchEffect(**vars(effect), intervals=primitive_intervals(effect.patch, own)) for effect, own in rows
-    )
+    draws_of_effects = draws or [()] * len(effects)
+    with_intervals = []
+    for effect, draws_of_effect in zip(effects, draws_of_effects, strict=True):
+        intervals = primitive_intervals(effect.patch, draws_of_effect)
+        with_intervals.append(PatchEffect(**vars(effect), intervals=intervals))
+    return tuple(with_intervals)
 
 
 def write_patch(path: Path, stored: StoredPatch) -> Path:
-    """Write patch.json, whole or not at all.
+    """Write `patch.json`, whole or not at all.
 
     Raises
     ------
-    VerdictFileError, reporting.errors.FileNotWrittenError
-        As `write_verdict`.
+    VerdictFileError
+        If a record does not fit the schema.
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
     """
     return write_document(path, PATCH_SCHEMA, stored)
 
 
 def fmu_outputs(channels: Mapping[str, Channel]) -> dict[str, str]:
-    """Return the outputs of the wing FMU by the names of the channels that measure them.
+    """Return the outputs of the wing FMU that channels measure.
 
-    Gauges count from 1 in campaigns, in patches and in the FMU alike, so that `strain[k]` of a channel is
-    `strain[k]` of the FMU, whatever the channel is called. Channels that the FMU has no output for
-    (velocities, displacements of other places) are not in the table.
+    Gauges count from 1 in campaigns, in patches and in the FMU, so that `strain[k]` of a channel is
+    `strain[k]` of the FMU, whatever the name of the channel. Channels for which the FMU has no
+    output (velocities, displacements of other points) are left out.
 
     Parameters
     ----------
     channels : mapping of str to Channel
-        By name.
+        Channels by name.
 
     Returns
     -------
     dict of str to str
         Output by channel, such as "strain[17]" for "g17".
     """
-    return {
-        name: channel.output
-        for name, channel in channels.items()
-        if (known := _OUTPUTS.get(channel.quantity)) and known.fullmatch(channel.output)
-    }
+    outputs = {}
+    for name, channel in channels.items():
+        pattern = _OUTPUTS.get(channel.quantity)
+        if pattern is not None and pattern.fullmatch(channel.output):
+            outputs[name] = channel.output
+    return outputs
 
 
 def read_patch(path: Path) -> StoredPatch:
-    """Read the patch.json that `write_patch` wrote; the patch is identical to the last bit.
+    """Read the `patch.json` that `write_patch` wrote; the patch is identical to the last bit.
 
     Raises
     ------
     VerdictFileError
-        As `read_verdict_file`.
+        If the file is missing, damaged, of another schema, or holds something else than it should.
     """
     return read_document(path, PATCH_SCHEMA, StoredPatch, (FIRST_SCHEMA,), parameters=[])

@@ -1,10 +1,8 @@
 """The map of residuals: cells of sensor, trial and bin, with the statistics of each.
 
-Whole records are correlated with what they could depend on (columns); bins of time, amplitude, frequency and
-load are tested for their mean and size.
-
-A column b has z = b . r / sqrt(b . b - |S^T b|^2): every p-value allows for what the fit has absorbed, and a
-column that the fit absorbs is not tested.
+Whole records are correlated with what they may depend on; bins of time, amplitude, frequency and
+load are tested for mean and size. Every p-value allows for what the fit has absorbed: a function b
+has the statistic z = b . r / sqrt(b . b - |S^T b|^2), and one that the fit absorbs is not tested.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,140 +15,219 @@ from scipy.linalg import block_diag
 
 from discrepancy.campaign.noise_tests import benjamini_yekutieli, periodogram, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray
+from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
 
-from .residuals import FittedTrial, ResidualSet, quadratic_moments
+_LEAST_SURVIVING = 0.02
+"""Fraction of a direction's square that must survive the fit, otherwise it says nothing."""
 
-_FREE_SHARE = 0.02  # of a direction's square must survive the fit, else it says nothing
 
+class NormalEquations(NamedTuple):
+    """Normal equations of functions B of unit norm, fitted to the residuals r of one channel.
 
-class Part(NamedTuple):
-    """One channel of a dependence: B'B, B'r and S'B, where B has unit columns."""
+    Attributes
+    ----------
+    gram : (k, k) ndarray
+        B'B.
+    projection : (k,) ndarray
+        B'r.
+    absorbed : (P, k) ndarray
+        S'B, with the sensitivities S of the residuals; no rows without them.
+    """
 
     gram: FloatArray
-    along: FloatArray
+    projection: FloatArray
     absorbed: FloatArray
 
 
-def part_of(basis: FloatArray, items: Sequence[tuple[FittedTrial, BoolArray]], column: int) -> Part | None:
-    """Return columns (n, k) over rows (N,) of trials beside residuals; None if they explain anything."""
-    size = np.linalg.norm(basis, axis=0)
-    basis = basis[:, size > 0.0] / size[size > 0.0]
-    residual = np.concatenate([item.standardised[rows, column] for item, rows in items])
-    if not 0 < basis.shape[1] < max(residual.size, 2):
-        return None  # as many coefficients as samples explain anything
-    sensitive = [item.sensitivity[rows, column] for item, rows in items if item.sensitivity is not None]
-    if len(sensitive) == len(items):
-        return Part(basis.T @ basis, basis.T @ residual, np.vstack(sensitive).T @ basis)
-    expected = np.concatenate([item.expected_variance[rows, column] for item, rows in items])
-    return Part((basis.T * expected) @ basis, basis.T @ residual, np.zeros((0, basis.shape[1])))
+def normal_equations_of(
+    basis: FloatArray, rows: Sequence[tuple[FittedTrial, BoolArray]], column: int
+) -> NormalEquations | None:
+    """Return the normal equations of functions fitted to a channel's residuals.
 
+    Parameters
+    ----------
+    basis : (n, k) ndarray
+        Values of the functions.
+    rows : sequence of (FittedTrial, (N,) ndarray of bool)
+        Trials, and which of their samples are the n rows of `basis`.
+    column : int
+        Column of the channel.
 
-def explained(parts: Sequence[Part]) -> tuple[float, int]:
-    """Return the sum of squares that a dependence explains, and the number of its coefficients.
-
-    B'r has the covariance G = B'(I - S S')B under the null, so that (B'r)' G^-1 (B'r) is chi^2; with a gap it
-    is what B explains of it after the fit has absorbed its share. Directions that it absorbs are left out.
+    Returns
+    -------
+    NormalEquations or None
+        None if there are no functions, or as many as samples, which explain anything.
     """
-    gram = block_diag(*(part.gram for part in parts))
-    if all(part.absorbed.shape[0] for part in parts):
-        absorbed = np.hstack([part.absorbed for part in parts])
-        gram = gram - absorbed.T @ absorbed
-    along = np.concatenate([part.along for part in parts])
-    values, vectors = np.linalg.eigh(gram)
-    kept = values > _FREE_SHARE
-    return float(np.sum((vectors[:, kept].T @ along) ** 2 / values[kept])), int(kept.sum())
+    norms = np.linalg.norm(basis, axis=0)
+    basis = basis[:, norms > 0.0] / norms[norms > 0.0]
+    function_count = basis.shape[1]
+    residual = np.concatenate([fitted.standardised[used, column] for fitted, used in rows])
+    if not 0 < function_count < max(residual.size, 2):
+        return None
+    sensitivities = [
+        fitted.sensitivity[used, column] for fitted, used in rows if fitted.sensitivity is not None
+    ]
+    if len(sensitivities) == len(rows):
+        absorbed = np.vstack(sensitivities).T @ basis
+        return NormalEquations(basis.T @ basis, basis.T @ residual, absorbed)
+    # without sensitivities: the expected variance of each sample
+    variance = np.concatenate([fitted.expected_variance[used, column] for fitted, used in rows])
+    gram = (basis.T * variance) @ basis
+    return NormalEquations(gram, basis.T @ residual, np.zeros((0, function_count)))
 
 
-def envelope(item: FittedTrial, column: int) -> FloatArray:
-    """Return the amplitude of a channel's predicted motion, (N,): sqrt(x^2 + (v / w)^2) over one period.
+def explained(equations: Sequence[NormalEquations]) -> tuple[float, int]:
+    """Return the sum of squares that functions explain, and the number of their coefficients.
 
-    w is the ratio of the root mean squares of rate and value; the mean is taken out first.
+    B'r has the covariance G = B'(I - S S')B if the model is right, so that (B'r)' G^-1 (B'r) is
+    chi-squared. Directions that the fit has absorbed are left out.
+
+    Parameters
+    ----------
+    equations : sequence of NormalEquations
+        Normal equations of each channel, whose coefficients are its own.
     """
-    assert item.rates is not None
-    x = item.prediction[:, column] - _resting(item, column)
-    v = item.rates[:, column]
-    size, speed = float(np.sqrt(np.mean(x**2))), float(np.sqrt(np.mean(v**2)))
-    if size == 0.0 or speed == 0.0:
+    covariance = block_diag(*(of_channel.gram for of_channel in equations))
+    if all(of_channel.absorbed.shape[0] for of_channel in equations):
+        absorbed = np.hstack([of_channel.absorbed for of_channel in equations])
+        covariance = covariance - absorbed.T @ absorbed
+    projection = np.concatenate([of_channel.projection for of_channel in equations])
+    values, vectors = np.linalg.eigh(covariance)
+    survives = values > _LEAST_SURVIVING
+    squares = (vectors[:, survives].T @ projection) ** 2 / values[survives]
+    return float(np.sum(squares)), int(survives.sum())
+
+
+def envelope(fitted: FittedTrial, column: int) -> FloatArray:
+    """Return the amplitude (N,) of a channel's predicted motion: sqrt(x^2 + (v / w)^2).
+
+    w is the ratio of the root mean squares of rate and value; the value at rest is subtracted
+    first.
+    """
+    assert fitted.rates is not None
+    x = fitted.prediction[:, column] - _value_at_rest(fitted, column)
+    v = fitted.rates[:, column]
+    rms_value = float(np.sqrt(np.mean(x**2)))
+    rms_rate = float(np.sqrt(np.mean(v**2)))
+    if rms_value == 0.0 or rms_rate == 0.0:
         return np.abs(x)
-    amplitude = np.hypot(x, v * size / speed)
-    width = min(max(1, round(2.0 * np.pi * size / (speed * item.trial.interval))), len(x))
+    amplitude = np.hypot(x, v * rms_value / rms_rate)
+    # moving average over one period
+    period = 2.0 * np.pi * rms_value / (rms_rate * fitted.trial.interval)
+    width = min(max(1, round(period)), len(x))
     kernel = np.ones(width)
-    return np.asarray(np.convolve(amplitude, kernel, "same") / np.convolve(np.ones_like(x), kernel, "same"))
+    sums = np.convolve(amplitude, kernel, "same")
+    counts = np.convolve(np.ones_like(x), kernel, "same")
+    return np.asarray(sums / counts)
 
 
-def _resting(item: FittedTrial, column: int) -> float:
-    """Return the value about which a dynamic prediction oscillates: that of its last quarter."""
-    values = item.prediction[:, column]
+def _value_at_rest(fitted: FittedTrial, column: int) -> float:
+    """Return the value about which a prediction oscillates: the mean of its last quarter."""
+    values = fitted.prediction[:, column]
     return float(np.mean(values[-max(len(values) // 4, 1) :]))
 
 
-def features(item: FittedTrial, column: int) -> dict[str, FloatArray]:
-    """Return what residuals of a channel may go with, (n, k) each at the used samples.
+def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
+    """Return the functions (n, k) that residuals of a channel may depend on, at its n used samples.
 
-    Shapes beyond the linear ones (x^3, |v|v and so on) are made orthogonal to mean, x and v, so that an
-    error of amplitude or phase does not show in all of them.
+    Functions that are not linear (x^3, |v|v and so on) are made orthogonal to mean, x and v, so
+    that an error of amplitude or phase does not show in all of them.
+
+    Parameters
+    ----------
+    fitted : FittedTrial
+        The trial.
+    column : int
+        Column of the channel.
     """
-    used, trial = item.used[:, column], item.trial
-    ones = np.ones(int(used.sum()))
-    x = item.prediction[used, column] - (_resting(item, column) if trial.is_dynamic else 0.0)
-    linear = {"mean": ones, "x": x}
-    bent = {"x^3": [x**3], "|x|": [np.abs(x)], "sgn x": [np.sign(x)]}
-    # loads, time and temperature are themselves what a reader looks for: only their mean goes out
+    used = fitted.used[:, column]
+    trial = fitted.trial
+    rest = _value_at_rest(fitted, column) if trial.is_dynamic else 0.0
+    x = fitted.prediction[used, column] - rest
+    linear = {"mean": np.ones(int(used.sum())), "x": x}
+    nonlinear = {"x^3": [x**3], "|x|": [np.abs(x)], "sgn x": [np.sign(x)]}
+    # loads, time and temperature are what a reader looks for: only their mean is projected out
     inputs = {"time": trial.time[used], "temperature": trial.temperature[used]}
     if not trial.is_dynamic:
-        inputs |= {"load": trial.force[used], "load factor": trial.load_factor[used]}
-    elif item.rates is not None:
-        v = linear["v"] = item.rates[used, column]
-        bent |= {"sgn v": [np.sign(v)], "|v|v": [np.abs(v) * v]}
-        wave = x / _scale(x) - 1j * v / _scale(v)
-        amplitude, phase = envelope(item, column)[used], np.angle(wave)
+        inputs["load"] = trial.force[used]
+        inputs["load factor"] = trial.load_factor[used]
+    elif fitted.rates is not None:
+        v = fitted.rates[used, column]
+        linear["v"] = v
+        nonlinear["sgn v"] = [np.sign(v)]
+        nonlinear["|v|v"] = [np.abs(v) * v]
+        amplitude = envelope(fitted, column)[used]
+        phase = np.angle(x / _rms_or_one(x) - 1j * v / _rms_or_one(v))
         for order, name in ((2, "2nd harmonic"), (3, "3rd harmonic")):
-            bent[name] = [amplitude * np.cos(order * phase), amplitude * np.sin(order * phase)]
-    base = np.linalg.qr(np.column_stack([values / _scale(values) for values in linear.values()]))[0]
-    found = {name: values[:, np.newaxis] for name, values in linear.items() if np.any(values)}
-    for name, rows in {**bent, **{name: [values] for name, values in inputs.items()}}.items():
-        table = np.column_stack(rows)
-        against = base[:, :1] if name in inputs else base
-        rest = table - against @ (against.T @ table)
-        size = np.linalg.norm(table, axis=0)
-        if np.all((size > 0.0) & (np.linalg.norm(rest, axis=0) > 1e-6 * size)):
-            found[name] = rest
-    return found
+            nonlinear[name] = [
+                amplitude * np.cos(order * phase),
+                amplitude * np.sin(order * phase),
+            ]
+    scaled = [values / _rms_or_one(values) for values in linear.values()]
+    linear_basis, _ = np.linalg.qr(np.column_stack(scaled))
+    mean_basis = linear_basis[:, :1]
+    functions = {}
+    for name, values in linear.items():
+        if np.any(values):
+            functions[name] = values[:, np.newaxis]
+    for name, columns in nonlinear.items():
+        _add_projected(functions, name, np.column_stack(columns), linear_basis)
+    for name, values in inputs.items():
+        _add_projected(functions, name, values[:, np.newaxis], mean_basis)
+    return functions
 
 
-def _scale(values: FloatArray) -> float:
+def _add_projected(
+    functions: dict[str, FloatArray], name: str, columns: FloatArray, basis: FloatArray
+) -> None:
+    """Add columns (n, k) made orthogonal to a basis (n, b).
+
+    Not if little remains of any of them.
+    """
+    remaining = columns - basis @ (basis.T @ columns)
+    norms = np.linalg.norm(columns, axis=0)
+    remains = np.linalg.norm(remaining, axis=0) > 1e-6 * norms
+    if np.all((norms > 0.0) & remains):
+        functions[name] = remaining
+
+
+def _rms_or_one(values: FloatArray) -> float:
+    """Return the root mean square of values (n,); 1 if all are zero."""
     return float(np.sqrt(np.mean(values**2))) or 1.0
 
 
 BINS = 6
 """Bins of time, amplitude and frequency of a dynamic record."""
 
-_FEWEST = 4  # samples of a cell whose size is tested
+_FEWEST = 4
+"""Fewest samples of a cell whose size is tested."""
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One entry of the map.
+    """One entry of the map: a statistic of the residuals of a channel in a bin of a trial.
 
     Attributes
     ----------
     trial, channel : str
-        Names.
+        Names of the trial and the channel.
     axis : str
         "whole", "time", "amplitude", "frequency" or "load".
     low, high : float
-        Bin on that axis: [s], [channel's unit], [Hz], [N] or load factor; nan for the whole record.
+        Ends of the bin on that axis: [s], [channel's unit], [Hz], [N] or load factor; nan for the
+        whole record.
     count : int
-        Samples.
+        Number of samples.
     statistic : str
-        "mean", "variance", or the feature that residuals go with: "x", "v", "sgn v", "|v|v", "x^3", "sgn x"
-        (odd), "|x|" (even), "2nd harmonic", "3rd harmonic", "time", "load", "load factor", "temperature".
+        "mean", "variance", or the function that residuals depend on: "x", "v", "sgn v", "|v|v",
+        "x^3", "sgn x" (odd), "|x|" (even), "2nd harmonic", "3rd harmonic", "time", "load", "load
+        factor", "temperature".
     value : float
-        Mean [noise deviation]; mean square over its expectation; correlation coefficient.
+        Mean [noise deviation], mean square over its expectation, or correlation coefficient.
     p_value : float
-        Two-sided, for a variance one-sided.
+        p-value: two-sided, for a variance one-sided.
     significant : bool
-        Discovery at the map's false discovery rate.
+        True for a discovery at the map's false discovery rate.
     """
 
     trial: str
@@ -168,97 +245,199 @@ class Cell:
 def residual_map(
     residuals: ResidualSet, white: tuple[FloatArray, ...], rate: float = 0.05
 ) -> tuple[Cell, ...]:
-    """Return all cells, significant where the false discovery rate (Benjamini-Yekutieli) allows.
+    """Return all cells; significant ones by the false discovery rate of Benjamini and Yekutieli.
 
     Parameters
     ----------
     residuals : ResidualSet
         Fitted trials.
     white : tuple of (N, C) ndarray
-        What its `white` returned, for the bins of frequency.
+        White residuals of each trial, from its method `white`, for the bins of frequency.
     rate : float
         False discovery rate.
     """
-    cells = [cell for item, values in zip(residuals.trials, white, strict=True)
-             for cell in _cells(residuals, item, values)]  # fmt: skip
-    found = benjamini_yekutieli(np.array([cell.p_value for cell in cells]), rate)
-    return tuple(replace(cell, significant=bool(flag)) for cell, flag in zip(cells, found, strict=True))
+    cells: list[Cell] = []
+    for fitted, values in zip(residuals.trials, white, strict=True):
+        cells += _cells_of_trial(residuals, fitted, values)
+    p_values = np.array([cell.p_value for cell in cells])
+    are_discoveries = benjamini_yekutieli(p_values, rate)
+    return tuple(
+        replace(cell, significant=bool(is_discovery))
+        for cell, is_discovery in zip(cells, are_discoveries, strict=True)
+    )
 
 
-def _cells(residuals: ResidualSet, item: FittedTrial, white: FloatArray) -> Iterator[Cell]:
-    trial = item.trial
+def _cells_of_trial(
+    residuals: ResidualSet, fitted: FittedTrial, white: FloatArray
+) -> Iterator[Cell]:
+    """Yield the cells of a trial with white residuals (N, C)."""
+    trial = fitted.trial
     for column, channel in enumerate(trial.channels):
-        freedom, used = residuals.degrees_of_freedom(channel), item.used[:, column]
+        noise_freedom = residuals.degrees_of_freedom(channel)
+        used = fitted.used[:, column]
         if not used.any():
             continue
-        base = Cell(trial.name, channel, "whole", np.nan, np.nan, 0, "", np.nan, 1.0)
-        for axis, low, high, where in _stretches(item, column):
-            cell = replace(base, axis=axis, low=low, high=high, count=int(where.sum()))
-            tables = features(item, column) if axis == "whole" else {"mean": np.ones((cell.count, 1))}
-            for name, table in tables.items():
-                yield from _along(item, column, where, table, replace(cell, statistic=name), freedom)
-            yield from _size(item, column, where, cell, freedom)
+        empty = Cell(
+            trial=trial.name,
+            channel=channel,
+            axis="whole",
+            low=np.nan,
+            high=np.nan,
+            count=0,
+            statistic="",
+            value=np.nan,
+            p_value=1.0,
+        )
+        for span in _spans(fitted, column):
+            count = int(span.used.sum())
+            cell = replace(empty, axis=span.axis, low=span.low, high=span.high, count=count)
+            functions = {"mean": np.ones((count, 1))}
+            if span.axis == "whole":
+                functions = features(fitted, column)
+            for name, columns in functions.items():
+                cell_of_function = replace(cell, statistic=name)
+                yield from _dependence_cells(
+                    fitted, column, span.used, columns, cell_of_function, noise_freedom
+                )
+            yield from _variance_cells(fitted, column, span.used, cell, noise_freedom)
         if trial.is_dynamic and used.all():
-            yield from _bands(white[:, column], trial.interval, base, freedom)
+            yield from _frequency_cells(white[:, column], trial.interval, empty, noise_freedom)
 
 
-def _stretches(item: FittedTrial, column: int) -> Iterator[tuple[str, float, float, BoolArray]]:
-    """Yield axis, ends, and which used samples (N,) lie between: of the whole record, then of the bins."""
-    trial, used = item.trial, item.used[:, column]
-    yield "whole", np.nan, np.nan, used
-    axes: list[tuple[str, FloatArray, FloatArray]] = []
+class _Span(NamedTuple):
+    """Samples of a channel between two values on an axis.
+
+    Attributes
+    ----------
+    axis : str
+        "whole", "time", "amplitude" or "load".
+    low, high : float
+        Ends; nan for the whole record.
+    used : (N,) ndarray of bool
+        Used samples between the ends.
+    """
+
+    axis: str
+    low: float
+    high: float
+    used: BoolArray
+
+
+def _spans(fitted: FittedTrial, column: int) -> Iterator[_Span]:
+    """Yield the whole record of a channel, and then its bins of time and amplitude, or of load."""
+    trial = fitted.trial
+    used = fitted.used[:, column]
+    yield _Span("whole", np.nan, np.nan, used)
     if trial.is_dynamic:
-        axes.append(("time", trial.time, np.linspace(trial.time[0], trial.time[-1], BINS + 1)))
+        edges = np.linspace(trial.time[0], trial.time[-1], BINS + 1)
+        yield from _bins("time", trial.time, edges, used)
+        if fitted.rates is not None:
+            amplitude = envelope(fitted, column)
+            if amplitude.any():
+                least = max(amplitude.min(), 1e-4 * amplitude.max())
+                edges = np.geomspace(least, amplitude.max(), BINS + 1)
+                yield from _bins("amplitude", amplitude, edges, used)
     else:
-        axes.append(("load", trial.load, np.linspace(trial.load.min(), trial.load.max(), 4)))
-    if trial.is_dynamic and item.rates is not None and (amplitude := envelope(item, column)).any():
-        least = max(amplitude.min(), 1e-4 * amplitude.max())
-        axes.append(("amplitude", amplitude, np.geomspace(least, amplitude.max(), BINS + 1)))
-    for axis, values, edges in axes:
-        place = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
-        for number, (low, high) in enumerate(pairwise(edges.tolist())):
-            if low < high:
-                yield axis, low, high, used & (place == number)
+        edges = np.linspace(trial.load.min(), trial.load.max(), 4)
+        yield from _bins("load", trial.load, edges, used)
 
 
-def _along(
-    item: FittedTrial, column: int, where: BoolArray, table: FloatArray, cell: Cell, freedom: float
+def _bins(axis: str, values: FloatArray, edges: FloatArray, used: BoolArray) -> Iterator[_Span]:
+    """Yield the used samples between each pair of edges on an axis with values (N,)."""
+    numbers = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
+    for number, (low, high) in enumerate(pairwise(edges.tolist())):
+        if low < high:
+            yield _Span(axis, low, high, used & (numbers == number))
+
+
+def _dependence_cells(
+    fitted: FittedTrial,
+    column: int,
+    used: BoolArray,
+    columns: FloatArray,
+    cell: Cell,
+    noise_freedom: float,
 ) -> Iterator[Cell]:
-    """Yield a cell on whether residuals go with columns (n, k) at some samples, if the fit leaves these."""
-    part = part_of(table, ((item, where),), column)
-    statistic, count = (0.0, 0) if part is None else explained((part,))
-    if part is None or count < table.shape[1]:
+    """Yield the cell of a function that residuals may depend on, unless the fit has absorbed it.
+
+    Parameters
+    ----------
+    fitted : FittedTrial
+        The trial.
+    column : int
+        Column of the channel.
+    used : (N,) ndarray of bool
+        The n samples.
+    columns : (n, k) ndarray
+        Values of the function.
+    cell : Cell
+        The cell without value and p-value.
+    noise_freedom : float
+        Degrees of freedom of the channel's noise record; 0 without one.
+    """
+    equations = normal_equations_of(columns, ((fitted, used),), column)
+    if equations is None:
         return
-    residual = item.standardised[where, column]
+    statistic, count = explained((equations,))
+    if count < columns.shape[1]:
+        return
+    residual = fitted.standardised[used, column]
     value = float(np.mean(residual))
     if cell.statistic != "mean":
-        along = part.along / (float(np.linalg.norm(residual)) or 1.0)
-        value = float(along[0] if count == 1 else np.linalg.norm(along))
-    yield replace(cell, value=value, p_value=variance_p_value(statistic / count, count, freedom or np.inf))
+        correlations = equations.projection / (float(np.linalg.norm(residual)) or 1.0)
+        value = float(correlations[0] if count == 1 else np.linalg.norm(correlations))
+    p_value = variance_p_value(statistic / count, count, noise_freedom or np.inf)
+    yield replace(cell, value=value, p_value=p_value)
 
 
-def _size(item: FittedTrial, column: int, where: BoolArray, cell: Cell, freedom: float) -> Iterator[Cell]:
-    """Yield a cell on the size of the residuals at some samples, where the noise is recorded."""
-    if freedom <= 0.0 or cell.count < (1 if cell.axis == "whole" else _FEWEST):
+def _variance_cells(
+    fitted: FittedTrial, column: int, used: BoolArray, cell: Cell, noise_freedom: float
+) -> Iterator[Cell]:
+    """Yield the cell of the residuals' mean square at some samples, if the noise is recorded.
+
+    Parameters
+    ----------
+    fitted : FittedTrial
+        The trial.
+    column : int
+        Column of the channel.
+    used : (N,) ndarray of bool
+        The samples.
+    cell : Cell
+        The cell without value and p-value.
+    noise_freedom : float
+        Degrees of freedom of the channel's noise record; 0 without one.
+    """
+    fewest = 1 if cell.axis == "whole" else _FEWEST
+    if noise_freedom <= 0.0 or cell.count < fewest:
         return
-    sensitive = None if item.sensitivity is None else item.sensitivity[where, column]
-    mean, own = quadratic_moments([(item.expected_variance[where, column], sensitive)])
-    if own >= 0.5:
-        value = float(np.sum(item.standardised[where, column] ** 2)) / mean
-        p = variance_p_value(value, own, freedom)
-        yield replace(cell, statistic="variance", value=value, p_value=p)
+    sensitivity = None if fitted.sensitivity is None else fitted.sensitivity[used, column]
+    mean, freedom = quadratic_moments([(fitted.expected_variance[used, column], sensitivity)])
+    if freedom >= 0.5:
+        value = float(np.sum(fitted.standardised[used, column] ** 2)) / mean
+        p_value = variance_p_value(value, freedom, noise_freedom)
+        yield replace(cell, statistic="variance", value=value, p_value=p_value)
 
 
-def _bands(series: FloatArray, interval: float, base: Cell, freedom: float) -> Iterator[Cell]:
-    """Yield the size of the residual in bands of frequency that widen upwards."""
+def _frequency_cells(
+    series: FloatArray, interval: float, empty: Cell, noise_freedom: float
+) -> Iterator[Cell]:
+    """Yield the mean square of white residuals (N,) in bands of frequency that widen upwards."""
     ordinates = periodogram(series)
-    if ordinates.size < 4 * BINS or freedom <= 0.0:
+    if ordinates.size < 4 * BINS or noise_freedom <= 0.0:
         return
     edges = np.unique(np.round(np.geomspace(4, ordinates.size, BINS)).astype(int)).tolist()
-    step = 1.0 / (series.size * interval)
-    cell = replace(base, axis="frequency", statistic="variance")
+    resolution = 1.0 / (series.size * interval)
     for first, last in pairwise([0, *edges]):
-        count, value = 2 * (last - first), float(ordinates[first:last].mean())
-        ends = {"low": (first + 0.5) * step, "high": (last + 0.5) * step}
-        p = variance_p_value(value, count, freedom)
-        yield replace(cell, **ends, count=count, value=value, p_value=p)
+        count = 2 * (last - first)  # a cosine and a sine for each ordinate
+        value = float(ordinates[first:last].mean())
+        yield replace(
+            empty,
+            axis="frequency",
+            statistic="variance",
+            low=(first + 0.5) * resolution,
+            high=(last + 0.5) * resolution,
+            count=count,
+            value=value,
+            p_value=variance_p_value(value, count, noise_freedom),
+        )

@@ -1,1 +1,1 @@
-"""The hypothesis that nothing is missing: the posterior of a model's parameters under a campaign."""
+"""The posterior of a model's parameters given a campaign, if the model lacks nothing."""

@@ -1,6 +1,6 @@
 """The whole way from a campaign to the calibration of a model's parameters."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import combinations
 from typing import Literal
@@ -9,11 +9,17 @@ import numpy as np
 from scipy.special import ndtr
 from scipy.stats import truncnorm
 
-from calibration.result.record import Calibration, ChannelFit, ParameterPrior, correlation, prior_samples
+from calibration.result.record import (
+    Calibration,
+    ChannelFit,
+    ParameterPrior,
+    correlation,
+    prior_samples,
+)
 from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.model_check import LEFT
-from discrepancy.errors import CampaignDataError, ModelError, said
+from discrepancy.checks.model_check import MOST_OF_PRIOR
+from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice
@@ -26,6 +32,7 @@ from reporting.provenance import collect_provenance
 from reporting.words import counted, small
 
 SAMPLES = 1000
+"""Samples of a calibration, if nobody asks for another number."""
 
 
 def calibrate_parameters(
@@ -37,24 +44,24 @@ def calibrate_parameters(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Return the posterior of a model's parameters under a campaign, nothing being missing of the model.
+    """Return the posterior of a model's parameters given a campaign, if the model lacks nothing.
 
-    Trials that the campaign marks as held out are not fitted; their residuals are told.
+    Trials that are held out are not fitted; the calibration contains their residuals.
 
     Parameters
     ----------
     campaign : Campaign
-        Its `parameters` replace priors of the model.
+        The campaign; its `parameters` replace priors of the model.
     choice : ModelChoice
         The model and where it comes from.
     asset : str, optional
-        Name of what was measured; that of the campaign if left out.
+        Name of what was measured; that of the campaign by default.
     samples : int
-        Of the posterior, and of the prior.
+        Number of samples of the posterior, and of the prior.
     seed : int
-        Of the samples.
+        Seed of the samples.
     progress : Progress, optional
-        Where to report.
+        Where progress is reported.
 
     Raises
     ------
@@ -67,18 +74,21 @@ def calibrate_parameters(
     """
     progress = reporter(progress)
     model = choice.model
-    priors = stated_priors(campaign, choice)  # before the model is asked, which may refuse what is outside
+    # before the model is evaluated, which may refuse values outside its range
+    priors = stated_priors(campaign, choice)
     with progress.stage("Checking the data"):
         campaign, faults = checked(campaign, model, hold_out=False)
-    fatal = [fault for fault in faults if fault.fatal]
-    if fatal:
-        raise CampaignDataError(fatal[0].sentence)
+    for fault in faults:
+        if fault.fatal:
+            raise CampaignDataError(fault.sentence)
     problem = without_wrong_ends(campaign, model)
     campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
-    best = posterior.optima[0]  # what noise is coloured like, beyond what its record tells, is no gap
-    gate = check_absolute_fit(problem, replace(best, residual_process=residual_process_of(problem, best)))
+    # noise that is coloured beyond what its record shows is not a discrepancy
+    best = posterior.optima[0]
+    best = replace(best, residual_process=residual_process_of(problem, best))
+    gate = check_absolute_fit(problem, best)
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
     return Calibration(
         asset=campaign.name if asset is None else asset,
@@ -90,7 +100,7 @@ def calibrate_parameters(
         prior_samples=prior_samples(priors, samples, seed),
         explained=gate.passed,
         findings=findings(priors, posterior, gate, faults, campaign.remarks),
-        channels=_channels(problem, posterior),
+        channels=_channel_fits(problem, posterior),
         source=campaign.name,
         seed=seed,
         provenance=collect_provenance(seed, input_hashes=hashes).as_dict(),
@@ -99,66 +109,78 @@ def calibrate_parameters(
 
 
 def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPrior, ...]:
-    """Return the parameters that have a prior deviation, as the campaign or the model's file states them.
+    """Return the uncertain parameters, with the priors of the campaign or the model's file.
 
     Raises
     ------
     ModelError
-        If there is none.
+        If no parameter is uncertain.
     CampaignDataError
         If the campaign states a mean outside the range of the model.
     """
-    label = choice.label or choice.model.name
-    found = []
+    model = choice.label or choice.model.name
+    priors = []
     moments = choice.model.stated(campaign)
-    for item, (mean, deviation) in zip(choice.model.parameters, moments, strict=True):
-        if not item.low <= mean <= item.high:
-            raise CampaignDataError(said("parameters.outside", item=item, mean=mean, model=label))
+    for parameter, (mean, deviation) in zip(choice.model.parameters, moments, strict=True):
+        name = parameter.name
+        if not parameter.low <= mean <= parameter.high:
+            raise CampaignDataError(
+                f"The campaign states {name} = {mean:g}, outside the range {parameter.low:g} to "
+                f"{parameter.high:g} in which {model} holds: correct [parameters.{name}], or widen "
+                "the range in the model's file."
+            )
         if deviation > 0.0:
-            stated = "the campaign" if item.name in campaign.parameters else label
-            found.append(replace(item, mean=mean, deviation=deviation, stated_by=stated, title=""))
-    if not found:
-        names = [item.name for item in choice.model.parameters]
+            stated_by = "the campaign" if name in campaign.parameters else model
+            priors.append(
+                replace(parameter, mean=mean, deviation=deviation, stated_by=stated_by, title="")
+            )
+    if not priors:
+        names = [parameter.name for parameter in choice.model.parameters]
         known = f"all of {', '.join(names)} have the deviation 0" if names else "it lists none"
-        raise ModelError(said("parameters.none", model=label, known=known))
-    return tuple(found)
+        raise ModelError(
+            f"The model {model} has no parameter to calibrate: {known}; give a [[parameter]] with "
+            "name, mean, deviation, low and high in its file."
+        )
+    return tuple(priors)
 
 
-def _channels(problem: Problem, posterior: ParameterPosterior) -> tuple[ChannelFit, ...]:
-    """Return the residuals of each channel at the prior means and at the optimum."""
+def _channel_fits(problem: Problem, posterior: ParameterPosterior) -> tuple[ChannelFit, ...]:
+    """Return the rms residuals of each channel at the prior means and at the optimum."""
     marginal = posterior.marginal
-    found: list[ChannelFit] = []
-    best = posterior.optima[0].point.shared[marginal.free]
-    parts: dict[Literal["fitted", "held out"], Problem] = {"fitted": problem}
+    optimum = posterior.optima[0].point.shared[marginal.free]
+    prior_mean = np.zeros_like(optimum)
+    problems: dict[Literal["fitted", "held out"], Problem] = {"fitted": problem}
     if problem.campaign.held_out:
-        parts["held out"] = problem.with_trials(problem.campaign.held_out)
-    for trials, part in parts.items():
-        fits = [marginal.fitted(u, part) for u in (np.zeros_like(best), best)]
-        for number, name in enumerate(part.channel_names):
-            count = int(part.counts[number])
+        problems["held out"] = problem.with_trials(problem.campaign.held_out)
+    channel_fits: list[ChannelFit] = []
+    for role, problem_of_role in problems.items():
+        at_prior_mean = marginal.fitted(prior_mean, problem_of_role)
+        at_optimum = marginal.fitted(optimum, problem_of_role)
+        for index, name in enumerate(problem_of_role.channel_names):
+            count = int(problem_of_role.counts[index])
             if not count:
                 continue
-            before, after = (
-                float(np.sqrt(item.sums[number] / count)) if part.freedom[number] > 0.0 else np.nan
-                for item in fits
-            )
-            found.append(ChannelFit(name, trials, count, before, after))
-    return tuple(found)
+            before = after = np.nan
+            if problem_of_role.freedom[index] > 0.0:
+                before = float(np.sqrt(at_prior_mean.sums[index] / count))
+                after = float(np.sqrt(at_optimum.sums[index] / count))
+            channel_fits.append(ChannelFit(name, role, count, before, after))
+    return tuple(channel_fits)
 
 
-# ---------------------------------------------------------------- what it says
+# ---------------------------------------------------------------- findings
 
 
 FAR = 3.0
-"""Prior deviations from which on a posterior mean is remarked on."""
+"""Distance of a posterior mean from the prior mean, in prior deviations, that is a finding."""
 TIED = 0.95
-"""Correlation from which on two parameters are told together rather than one by one."""
+"""Correlation above which two parameters are determined together and not one by one."""
 EDGE = 0.02
-"""Share of a posterior beyond the model's range from which on it is remarked on, where the parameter is told:
-one that is not is cut off as its prior is."""
+"""Fraction of a posterior beyond the model's range that is a finding.
 
+It is one only for a parameter that the data determine: any other is cut off as its prior is."""
 REFUSED = 4.0
-"""Standard deviations from the optimum within which a place that the model refuses is remarked on."""
+"""Standard deviations from the optimum within which values that the model refuses are a finding."""
 
 
 def findings(
@@ -168,68 +190,163 @@ def findings(
     faults: tuple[DataFault, ...],
     remarks: tuple[str, ...],
 ) -> tuple[str, ...]:
-    """Return all sentences: what disagrees first, then what the campaign does not tell, then remarks."""
-    found: list[str] = []
+    """Return all findings in sentences: disagreement, limits of the posterior, then remarks.
+
+    Parameters
+    ----------
+    priors : tuple of ParameterPrior
+        Priors of the parameters.
+    posterior : ParameterPosterior
+        Their posterior.
+    gate : Gate
+        The gate of absolute fit at the optimum.
+    faults : tuple of DataFault
+        Faults of the data.
+    remarks : tuple of str
+        Remarks of the campaign.
+    """
+    sentences: list[str] = []
     if gate.passed is False:
-        found.append(said("parameters.not_explained", reason=small(gate.reason)))
+        sentences.append(
+            f"The campaign is not explained by these parameters: {small(gate.reason)} The "
+            "posterior is too narrow, and may be of the wrong thing; `uav-twin discrepancy run` on "
+            "the same campaign and model looks for what is missing."
+        )
     elif gate.passed is None:
-        found.append(gate.reason)
-    found += _of_posterior(priors, posterior)
-    found += [fault.sentence for fault in faults if fault.kind is not FaultKind.UNOBSERVABLE]
-    return (*found, *(text for text in remarks if text not in found))
+        sentences.append(gate.reason)
+    sentences += _prior_findings(priors, posterior)
+    sentences += _range_findings(priors, posterior)
+    sentences += _optimum_findings(priors, posterior)
+    sentences += _undetermined_findings(priors, posterior)
+    for fault in faults:
+        if fault.kind is not FaultKind.UNOBSERVABLE:  # the posterior says so itself
+            sentences.append(fault.sentence)
+    return (*sentences, *(remark for remark in remarks if remark not in sentences))
 
 
-def _of_posterior(priors: tuple[ParameterPrior, ...], posterior: ParameterPosterior) -> Iterator[str]:
-    marginal, optima = posterior.marginal, posterior.optima
+def _parameter_values(priors: Sequence[ParameterPrior], values: FloatArray) -> str:
+    """Return values of the parameters (P,) as text; nan is left out."""
+    phrases = []
+    for prior, value in zip(priors, values.tolist(), strict=True):
+        if np.isfinite(value):
+            phrases.append(f"{prior.name} = {value:.4g}")
+    return ", ".join(phrases)
 
-    def listed(values: FloatArray) -> str:
-        pairs = zip(priors, values.tolist(), strict=True)
-        return ", ".join(f"{prior.name} = {value:.4g}" for prior, value in pairs if np.isfinite(value))
 
+def _prior_findings(
+    priors: Sequence[ParameterPrior], posterior: ParameterPosterior
+) -> Iterator[str]:
+    """Yield a finding on each parameter whose posterior mean is far from its prior mean."""
     for prior, mean in zip(priors, posterior.draws.mean(axis=0).tolist(), strict=True):
         if abs(mean) > FAR:
             side = "above" if mean > 0.0 else "below"
-            yield said("parameters.off_prior", prior=prior, off=abs(mean), side=side)
-    best = optima[0].point.shared[marginal.free]
-    deviation = np.maximum(np.sqrt(np.diag(optima[0].covariance)[marginal.free]), 1e-12)
-    beyond = ndtr((marginal.low - best) / deviation) + ndtr((best - marginal.high) / deviation)
-    told = kept_shares(posterior) <= LEFT
-    for prior, share, known in zip(priors, beyond.tolist(), told.tolist(), strict=True):
-        if known and share > EDGE:
-            yield said("parameters.cut_off", prior=prior)
-    missing = [item for item in marginal.refused if _told_apart(posterior, item[0]) < REFUSED]
-    if missing:
-        place, reason = missing[0]
-        where = {"count": counted(len(missing), "place"), "places": listed(marginal.values(place))}
-        yield said("parameters.refused", reason=reason.rstrip("."), **where)
-    if len(optima) > 1:
-        evidence = np.array([item.log_evidence for item in optima])
-        weight = np.exp(evidence - evidence.max())
-        values = [listed(marginal.values(item.point.shared[marginal.free])) for item in optima]
-        shares = zip(values, (weight / weight.sum()).tolist(), strict=True)
-        places = " and ".join(f"{there} ({share:.0%})" for there, share in shares)
-        yield said("parameters.maxima", count=len(optima), places=places)
-    if not optima[0].converged:
-        yield said("parameters.not_settled")
-    for prior, share in zip(priors, kept_shares(posterior).tolist(), strict=True):
-        if share > LEFT:
-            left = "all" if share > 0.995 else f"{100.0 * share:.0f} %"
-            yield said("parameters.not_told", prior=prior, left=left)
-    matrix = correlation(posterior.draws)
-    for (at, first), (beside, second) in combinations(enumerate(priors), 2):
-        if abs(matrix[at, beside]) > TIED:
-            yield said("parameters.tied", first=first, second=second, value=matrix[at, beside])
+            yield (
+                f"{prior.name} comes out {abs(mean):.1f} prior deviations {side} what "
+                f"{prior.stated_by} states: the prior is wrong, or the parameter stands for "
+                "something that the model lacks."
+            )
 
 
-def _told_apart(posterior: ParameterPosterior, u: FloatArray) -> float:
-    """Return how far from the best optimum scaled parameters (P,) are [standard deviations]; NaN: any."""
-    known = np.flatnonzero(np.isfinite(u))
-    index, best = posterior.marginal.free[known], posterior.optima[0]
-    shift = u[known] - best.point.shared[index]
-    return float(np.sqrt(shift @ np.linalg.solve(best.covariance[np.ix_(index, index)], shift)))
-
-
-def kept_shares(posterior: ParameterPosterior) -> FloatArray:
-    """Return the deviation of each parameter (P,) over that of its prior, cut off at its range [1]."""
+def _range_findings(
+    priors: Sequence[ParameterPrior], posterior: ParameterPosterior
+) -> Iterator[str]:
+    """Yield findings on posteriors at the ends of the range, and on refused values within it."""
     marginal = posterior.marginal
-    return np.asarray(posterior.draws.std(axis=0, ddof=1) / truncnorm.std(marginal.low, marginal.high))
+    optimum = posterior.optima[0]
+    best = optimum.point.shared[marginal.free]
+    deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.free]), 1e-12)
+    below = ndtr((marginal.low - best) / deviation)
+    above = ndtr((best - marginal.high) / deviation)
+    is_determined = remaining_deviations(posterior) <= MOST_OF_PRIOR
+    is_cut_off = is_determined & (below + above > EDGE)
+    for prior, cut_off in zip(priors, is_cut_off.tolist(), strict=True):
+        if cut_off:
+            yield (
+                f"The posterior of {prior.name} reaches the end of its range, {prior.low:g} to "
+                f"{prior.high:g}, and is cut off there: widen the range if the model holds beyond "
+                "it."
+            )
+    refusals = [
+        refusal
+        for refusal in marginal.refused
+        if _distance_from_optimum(posterior, refusal.parameters) < REFUSED
+    ]
+    if refusals:
+        first = refusals[0]
+        values = _parameter_values(priors, marginal.values(first.parameters))
+        yield (
+            f"At {counted(len(refusals), 'place')} near the optimum, and within its range, the "
+            f"model cannot be had, first at {values} ({first.reason.rstrip('.')}): the posterior "
+            "has nothing there; correct the range in the model's file."
+        )
+
+
+def _optimum_findings(
+    priors: Sequence[ParameterPrior], posterior: ParameterPosterior
+) -> Iterator[str]:
+    """Yield findings on several optima, and on an iteration that did not converge."""
+    marginal = posterior.marginal
+    optima = posterior.optima
+    if len(optima) > 1:
+        evidence = np.array([optimum.log_evidence for optimum in optima])
+        weight = np.exp(evidence - evidence.max())
+        probabilities = (weight / weight.sum()).tolist()
+        phrases = []
+        for optimum, probability in zip(optima, probabilities, strict=True):
+            values = marginal.values(optimum.point.shared[marginal.free])
+            phrases.append(f"{_parameter_values(priors, values)} ({probability:.0%})")
+        yield (
+            f"The posterior has {len(optima)} maxima: {' and '.join(phrases)}; the campaign does "
+            "not tell which, and the mean lies between them."
+        )
+    if not optima[0].converged:
+        yield (
+            "The fit had not settled when it ended: the samples may be off; state the priors "
+            "narrower."
+        )
+
+
+def _undetermined_findings(
+    priors: Sequence[ParameterPrior], posterior: ParameterPosterior
+) -> Iterator[str]:
+    """Yield findings on parameters that the campaign does not determine, or not apart."""
+    for prior, ratio in zip(priors, remaining_deviations(posterior).tolist(), strict=True):
+        if ratio > MOST_OF_PRIOR:
+            remaining = "all" if ratio > 0.995 else f"{100.0 * ratio:.0f} %"
+            yield (
+                f"The campaign does not tell {prior.name}: {remaining} of its prior deviation is "
+                "left, and what is believed of it is the prior."
+            )
+    correlations = correlation(posterior.draws)
+    for i, j in combinations(range(len(priors)), 2):
+        if abs(correlations[i, j]) > TIED:
+            yield (
+                f"{priors[i].name} and {priors[j].name} are told together and hardly apart "
+                f"(correlation {correlations[i, j]:+.3f}): fly with samples of both, or measure "
+                "where they act differently."
+            )
+
+
+def _distance_from_optimum(posterior: ParameterPosterior, u: FloatArray) -> float:
+    """Return the distance of scaled parameters from the best optimum [standard deviations].
+
+    Parameters
+    ----------
+    posterior : ParameterPosterior
+        The posterior.
+    u : (P,) ndarray
+        Scaled parameters; nan for those that may have any value.
+    """
+    optimum = posterior.optima[0]
+    is_given = np.isfinite(u)
+    indices = posterior.marginal.free[is_given]
+    shift = u[is_given] - optimum.point.shared[indices]
+    covariance = optimum.covariance[np.ix_(indices, indices)]
+    return float(np.sqrt(shift @ np.linalg.solve(covariance, shift)))
+
+
+def remaining_deviations(posterior: ParameterPosterior) -> FloatArray:
+    """Return the standard deviation of each parameter (P,) over that of its cut-off prior."""
+    marginal = posterior.marginal
+    prior_deviations = truncnorm.std(marginal.low, marginal.high)
+    return np.asarray(posterior.draws.std(axis=0, ddof=1) / prior_deviations)

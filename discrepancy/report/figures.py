@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,15 @@ from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce
 from discrepancy.proof_record import Scores
+from discrepancy.report import residual_figures
+from discrepancy.report.load_and_time_figures import load_figure, time_line_figure
+from discrepancy.report.motion_figures import (
+    backbone_figure,
+    history_figure,
+    spectrum_figure,
+    worst_record,
+)
+from discrepancy.report.text import WORDS, added_label, force_sentence, motion_of, scored
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation
 from fe.wing.design import WingDesign
@@ -26,137 +36,231 @@ from reporting import figures as style
 from reporting.page import ReportFigure
 from reporting.words import listing
 
-from . import residual_figures
-from .motion_figures import backbone_figure, history_figure, spectrum_figure, worst_record
-from .text import WORDS, added_label, force_sentence, motion_of, scored
-
 _LARGEST_DISTANCE = 1e4
 
 
 def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
-    """Draw histograms of probability integral transforms; keys are titles, in order before and after."""
+    """Draw histograms of probability integral transforms; None without scores.
+
+    Parameters
+    ----------
+    scores : mapping of str to Scores
+        Scores before and after by the title of their panel.
+    """
     if not scores:
         return None
     figure, grid = residual_figures.panels(1, 2, 1.9)
-    cells = zip(style.keep_first_panels(grid, len(scores)), scores.items(), strict=True)
-    top = max(max(item.pit) for item in scores.values())
-    for number, (axes, (title, item)) in enumerate(cells):
-        count = len(item.pit)
+    all_axes = style.keep_first_panels(grid, len(scores))
+    highest = max(max(score.pit) for score in scores.values())
+    has_two_panels = len(scores) > 1
+    for number, (axes, (title, score)) in enumerate(zip(all_axes, scores.items(), strict=True)):
+        bin_count = len(score.pit)
+        is_before = number == 0 and has_two_panels
         axes.bar(
-            (np.arange(count) + 0.5) / count, item.pit, 0.94 / count,
-            color=style.PREDICTION if number == 0 and len(scores) > 1 else style.PAST, alpha=0.75,
-        )  # fmt: skip
-        axes.axhline(1.0 / count, color=style.OBSERVED, lw=0.9, ls="--")
+            (np.arange(bin_count) + 0.5) / bin_count,
+            score.pit,
+            0.94 / bin_count,
+            color=style.PREDICTION if is_before else style.PAST,
+            alpha=0.75,
+        )
+        axes.axhline(1.0 / bin_count, color=style.OBSERVED, lw=0.9, ls="--")
         axes.yaxis.set_major_locator(MaxNLocator(4))
-        axes.set(xlim=(0.0, 1.0), ylim=(0.0, 1.1 * max(top, 0.16)), xlabel="probability integral transform")
+        axes.set(
+            xlim=(0.0, 1.0),
+            ylim=(0.0, 1.1 * max(highest, 0.16)),
+            xlabel="probability integral transform",
+        )
         axes.set_ylabel("share of samples" if number == 0 else "")
-        axes.set_title(f"{'ab'[number]}  {title}" if len(scores) > 1 else title)
+        axes.set_title(f"{'ab'[number]}  {title}" if has_two_panels else title)
     return figure
 
 
 def _map_of_names(
-    values: FloatArray, rows: Sequence[str], columns: Sequence[str], norm: Normalize,
+    values: FloatArray,
+    rows: Sequence[str],
+    columns: Sequence[str],
+    norm: Normalize,
     texts: NDArray[np.str_] | None = None,
-) -> tuple[Figure, Axes, AxesImage]:  # fmt: skip
-    """Return a figure with a map of square cells between names of effects."""
+) -> tuple[Figure, Axes, AxesImage]:
+    """Return a figure with a map of square cells, whose rows and columns are effects.
+
+    Parameters
+    ----------
+    values : (R, C) ndarray
+        Values; nan for an empty cell.
+    rows, columns : sequence of str
+        Identifiers of the effects.
+    norm : Normalize
+        Colour scale.
+    texts : (R, C) ndarray of str, optional
+        Texts of the cells.
+    """
     figure, ((axes,),) = residual_figures.panels(1, 1, 0.175 * len(rows) + 1.6)
-    words = ([name.replace("_", " ") for name in names] for names in (rows, columns))
-    image = residual_figures.heat_map(axes, values, (next(words), next(words)), norm, 55, texts)
+    row_names = [name.replace("_", " ") for name in rows]
+    column_names = [name.replace("_", " ") for name in columns]
+    image = residual_figures.heat_map(axes, values, (row_names, column_names), norm, 55, texts)
     axes.set_aspect("equal", anchor="W")
     axes.tick_params(labelsize=6.5)
     return figure, axes, image
 
 
-def separability_figure(found: Separability) -> Figure | None:
-    """Draw how well each effect can be told from each other one; None with fewer than two effects."""
-    names = found.identifiers
+def separability_figure(separability: Separability) -> Figure | None:
+    """Draw how well each effect can be distinguished from each other; None with fewer than two."""
+    names = separability.identifiers
     if len(names) < 2:
         return None
-    # Members of a confusion group stand side by side.
-    number = {name: at for at, group in reversed([*enumerate(found.groups)]) for name in group}
-    order = sorted(range(len(names)), key=lambda n: (number.get(names[n], len(found.groups)), n))
-    distance = found.distance[np.ix_(order, order)]
-    table = np.clip(distance, 0.3, _LARGEST_DISTANCE)
-    np.fill_diagonal(table, np.nan)
-    labels = [names[n] for n in order]
-    figure, axes, image = _map_of_names(table, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
+    # members of a confusion group stand side by side
+    group_numbers: dict[str, int] = {}
+    for group_number, group in enumerate(separability.groups):
+        for name in group:
+            group_numbers.setdefault(name, group_number)
+    no_group = len(separability.groups)
+    order = sorted(
+        range(len(names)), key=lambda index: (group_numbers.get(names[index], no_group), index)
+    )
+    distance = separability.distance[np.ix_(order, order)]
+    cells = np.clip(distance, 0.3, _LARGEST_DISTANCE)
+    np.fill_diagonal(cells, np.nan)
+    labels = [names[index] for index in order]
+    figure, axes, image = _map_of_names(cells, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
     for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
         if row != column:
             axes.plot(column, row, "x", color=style.PREDICTION, ms=4.0, mew=1.1)
-    cell = 1.0 / len(names)
-    beside = axes.inset_axes((1.0 + 0.4 * cell, 0.0, 0.4 * cell, 1.0))
-    bar = style.color_bar(figure, image, "squared distance d²", cax=beside)
+    cell_width = 1.0 / len(names)
+    bar_axes = axes.inset_axes((1.0 + 0.4 * cell_width, 0.0, 0.4 * cell_width, 1.0))
+    bar = style.color_bar(figure, image, "squared distance d²", cax=bar_axes)
     style.plain_powers(bar.yaxis, (1.0,))
     bar.axhline(CONFUSED, color=style.PREDICTION, lw=1.2)
     bar.axhline(DETECTED, color="white", lw=1.2)
     return figure
 
 
-def confusion_figure(found: SelfCalibration) -> Figure:
+def confusion_figure(self_calibration: SelfCalibration) -> Figure:
     """Draw the confusion matrix of the workflow on simulated campaigns of this geometry."""
-    rows, columns, counts = found.confusion()
-    share = np.where(counts > 0, counts / np.maximum(counts.sum(axis=1, keepdims=True), 1), np.nan)
+    rows, columns, counts = self_calibration.confusion()
+    row_sums = np.maximum(counts.sum(axis=1, keepdims=True), 1)
+    fractions = np.where(counts > 0, counts / row_sums, np.nan)
     texts = np.where(counts > 0, counts.astype(str), "")
-    figure, axes, _ = _map_of_names(share, rows, columns, Normalize(0.0, 1.0), texts)
+    figure, axes, _ = _map_of_names(fractions, rows, columns, Normalize(0.0, 1.0), texts)
     axes.set(xlabel="verdict", ylabel="what was hidden")
     return figure
 
 
 MOST_DOTS = 3000
-"""Dots of a panel; of longer records some are left out evenly."""
+"""Most dots of a panel; of longer records samples are left out evenly."""
 MOST_TURNS = 400
-"""Samples of the course in time: the stretch where the force is largest."""
+"""Most samples of the force over time; they surround its largest value."""
 
 
 def missing_force_figure(missing: MissingForce) -> Figure:
-    """Draw a missing force and what is told of it, with its law and what is left where there is one."""
-    parts = [("missing force", "force"), ("what is left", "left")][: 2 if missing.law else 1]
-    what, place, rate = motion_of(missing.at_port)
-    integral, state = ("displacement", "speed") if place else ("integral of the state", "state")
-    along = (("position", ", ".join(filter(None, (integral, place)))), ("speed", f"{state}, {rate}"))
-    every = slice(None, None, -(-sum(len(item.time) for item in missing.courses) // MOST_DOTS))
-    strongest = max(missing.courses, key=lambda one: float(np.max(np.abs(one.force))))
-    first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
-    first = max(min(first, len(strongest.time) - MOST_TURNS), 0)
-    stretch = slice(first, first + MOST_TURNS)
-    figure, rows = residual_figures.panels(len(parts), 3, 2.4 * len(parts) + 0.5, sharey=True)
-    for number, (row, (title, name)) in enumerate(zip(rows, parts, strict=True)):
-        law = "law" if missing.law and name == "force" else ""
-        for axes, (motion, label) in zip(row[:2], along, strict=True):
-            _draw_over(axes, missing, motion, name, law, every)
+    """Draw a missing force over displacement, speed and time, and what its law leaves."""
+    row_titles = {"force": "missing force"}
+    if missing.law:
+        row_titles["left"] = "what is left"
+    name_of_force, displacement_unit, speed_unit = motion_of(missing.at_port)
+    if displacement_unit:
+        motions = {
+            "position": f"displacement, {displacement_unit}",
+            "speed": f"speed, {speed_unit}",
+        }
+    else:
+        motions = {"position": "integral of the state", "speed": f"state, {speed_unit}"}
+    sample_count = sum(len(course.time) for course in missing.courses)
+    drawn_samples = slice(None, None, ceil(sample_count / MOST_DOTS))
+    figure, rows = residual_figures.panels(
+        len(row_titles), 3, 2.4 * len(row_titles) + 0.5, sharey=True
+    )
+    letters = iter("abcdef")
+    for row, (series, title) in zip(rows, row_titles.items(), strict=True):
+        law = "law" if missing.law and series == "force" else ""
+        for axes, (motion, label) in zip(row[:2], motions.items(), strict=True):
+            _draw_over_motion(axes, missing, motion, series, law, drawn_samples)
             axes.set_xlabel(label)
-        time, values = strongest.time[stretch], getattr(strongest, name)[stretch]
-        reach = 2.0 * strongest.deviation[stretch]
-        style.band(row[2], time, values - reach, values + reach, style.OBSERVED)
-        row[2].plot(time, values, color=style.OBSERVED, lw=0.9)
-        if law and strongest.law is not None:
-            row[2].plot(time, strongest.law[stretch], "--", color=style.PREDICTION, lw=0.9)
-        row[2].set_xlabel(f"time in {strongest.trial}, s")
-        row[0].set_ylabel(f"{what}, {missing.at_port.unit}")
-        for column, axes in enumerate(row):
+        _draw_over_time(row[2], missing, series, has_law=bool(law))
+        row[0].set_ylabel(f"{name_of_force}, {missing.at_port.unit}")
+        for axes in row:
             axes.axhline(0.0, color=style.REFERENCE, lw=0.6, zorder=0)
             axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
             axes.tick_params(labelleft=True)
-            style.panel_label(axes, "abcdef"[3 * number + column], title)
-    drawn = rows[0][0].get_legend_handles_labels()
-    figure.legend(*drawn, loc="outside upper right", ncols=2, markerscale=3.0)
+            style.panel_label(axes, next(letters), title)
+    handles, labels = rows[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=2, markerscale=3.0)
     return figure
 
 
-def _draw_over(axes: Axes, missing: MissingForce, motion: str, name: str, law: str, every: slice) -> None:
-    """Draw a force over a motion of its port, and its law where it has one."""
+def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: bool) -> None:
+    """Draw a series of the trial with the largest force, around the time at which it is largest.
 
-    def joined(key: str) -> FloatArray:
-        parts = (getattr(item, key) for item in missing.courses)
-        return np.concatenate([values[every] for values in parts if values is not None])
+    Parameters
+    ----------
+    axes : Axes
+        Where it is drawn.
+    missing : MissingForce
+        The missing force.
+    series : str
+        "force", or "left" for what its law leaves.
+    has_law : bool
+        True to draw the law, too.
+    """
+    strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
+    first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
+    first = max(min(first, len(strongest.time) - MOST_TURNS), 0)
+    drawn = slice(first, first + MOST_TURNS)
+    time = strongest.time[drawn]
+    values = getattr(strongest, series)[drawn]
+    two_deviations = 2.0 * strongest.deviation[drawn]
+    style.band(axes, time, values - two_deviations, values + two_deviations, style.OBSERVED)
+    axes.plot(time, values, color=style.OBSERVED, lw=0.9)
+    if has_law and strongest.law is not None:
+        axes.plot(time, strongest.law[drawn], "--", color=style.PREDICTION, lw=0.9)
+    axes.set_xlabel(f"time in {strongest.trial}, s")
 
-    along, values, deviation = map(joined, (motion, name, "deviation"))
+
+def _draw_over_motion(
+    axes: Axes, missing: MissingForce, motion: str, series: str, law: str, samples: slice
+) -> None:
+    """Draw a force over a motion of its port, with its law if there is one.
+
+    Parameters
+    ----------
+    axes : Axes
+        Where it is drawn.
+    missing : MissingForce
+        The missing force.
+    motion, series, law : str
+        Names of the arrays of a trial: the motion, the force, and its law (empty for none).
+    samples : slice
+        Samples that are drawn.
+    """
+
+    def joined(name: str) -> FloatArray:
+        """Return an array of all trials that have it."""
+        arrays = [getattr(course, name) for course in missing.courses]
+        return np.concatenate([array[samples] for array in arrays if array is not None])
+
+    positions = joined(motion)
+    values = joined(series)
+    deviation = joined("deviation")
     axes.vlines(
-        along, values - deviation, values + deviation, color=style.OBSERVED, lw=0.4, alpha=style.BAND_OPACITY
+        positions,
+        values - deviation,
+        values + deviation,
+        color=style.OBSERVED,
+        lw=0.4,
+        alpha=style.BAND_OPACITY,
     )
-    axes.plot(along, values, ".", color=style.OBSERVED, ms=2.6, alpha=0.6, label="seen, ± 1 deviation")
+    label = "seen, ± 1 deviation"
+    axes.plot(positions, values, ".", color=style.OBSERVED, ms=2.6, alpha=0.6, label=label)
     if law:
-        axes.plot(along, joined(law), ".", color=style.PREDICTION, ms=1.2, alpha=0.7, label=missing.law)
+        axes.plot(
+            positions,
+            joined(law),
+            ".",
+            color=style.PREDICTION,
+            ms=1.2,
+            alpha=0.7,
+            label=missing.law,
+        )
 
 
 Pack = Callable[[Path, Path], str]
@@ -170,22 +274,21 @@ class ReportInput:
     Attributes
     ----------
     investigation : Investigation
-        What came out.
+        The investigation with its verdict.
     origin : Origin
-        What it came from.
+        Model, campaign and program that it comes from.
     separability : Separability or None
-        What the campaign can decide.
+        Which effects the campaign can distinguish.
     self_calibration : SelfCalibration or None
-        Where it was asked for.
+        The workflow on simulated campaigns, if it was asked for.
     design : WingDesign or None
-        Of a wing, for the map.
+        Design of a wing, for the map of residuals.
     intervals : sequence of sequence of PrimitiveInterval
-        Of the patch, by effect; empty without a patch.
+        Intervals of the patch's numbers, by effect; empty without a patch.
     fmu : str
-        Name of the patched FMU, or why there is none; empty if none is due.
+        Name of the patched FMU, or why there is none; empty if none is needed.
     pack : callable, optional
-        Makes the patched FMU, of patch.json and its own file, and says what of it; called where an effect is
-        named.
+        Makes the patched FMU, and returns a sentence about it; called if an effect is named.
     """
 
     investigation: Investigation
@@ -199,65 +302,84 @@ class ReportInput:
 
 
 def _unit_of_noise(before: ResidualSet) -> str:
-    """Return what the unit of sizes of residuals is."""
+    """Return the sentence on the unit of sizes of residuals."""
     unknown = [name for name in before.measured if name not in before.recorded]
     if not unknown:
         return "1 is noise."
     return (
-        f"1 is noise; of {listing(unknown)}, whose noise is not recorded, what the model as it was leaves in "
-        "fitted trials."
+        f"1 is noise; of {listing(unknown)}, whose noise is not recorded, what the model as it was "
+        "leaves in fitted trials."
     )
 
 
 @style.publication_style()
 def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
-    """Draw every figure that these data allow, by name; their words are in `words.toml`.
+    """Draw every figure that these data allow, by name; their captions are in `words.toml`.
 
     Parameters
     ----------
     content : ReportInput
         What is shown.
     """
-    found: dict[str, ReportFigure] = {}
-
-    def add(name: str, figure: Figure | None, **words: object) -> None:
-        if figure is not None:
-            found[name] = WORDS.figure(name, figure, **words)
-
+    figures: dict[str, ReportFigure] = {}
     investigation = content.investigation
-    verdict, proof, missing = investigation.verdict, investigation.proof, investigation.missing
-    before, after = investigation.before, investigation.after if added_label(investigation) else None
+    missing = investigation.missing
     if missing is not None:
-        add("missing_force", missing_force_figure(missing), sentence=force_sentence(missing.at_port))
-    if before is not None:
-        names = [item.trial.name for item in before.trials if item.trial.held_out]
-        scale = {
-            "beside": WORDS.say("beside", names=names, both=after is not None),
-            "unit": _unit_of_noise(before),
-        }
-        if content.design is not None:
-            add("residual_map", residual_figures.planform_figure(before, after, content.design), **scale)
-        add("residual_table", residual_figures.heat_figure(before, after), **scale)
-        add("load", residual_figures.load_figure(before, after))
-        with_effect = any(item.with_effect for item in verdict.windows)
-        left = " The thin bars below are what the hypothesis leaves." if with_effect else ""
-        add("time_line", residual_figures.time_line_figure(verdict.windows), left=left)
-        if (worst := worst_record(before.trials)) is not None:
-            trial = before.trials[worst.trial].trial
-            role = "held out" if trial.held_out else "fitted"
-            figure = history_figure(before, after, worst)
-            add("history", figure, channel=worst.channel, trial=trial.name, role=role)
-            add("spectrum", spectrum_figure(before, after, worst))
-        if (backbone := backbone_figure(before, after)) is not None:
-            add("backbone", backbone[0], channel=backbone[1])
-    if proof is not None:
-        *pair, trials = scored(proof)
-        shown = zip(("model as it was", "with the effect"), pair, strict=True)
-        scores = {title: item for title, item in shown if item.pit}
+        sentence = force_sentence(missing.at_port)
+        _add(figures, "missing_force", missing_force_figure(missing), sentence=sentence)
+    if investigation.before is not None:
+        _add_residual_figures(figures, content, investigation.before)
+    if investigation.proof is not None:
+        before, after, trials = scored(investigation.proof)
+        scores = {"model as it was": before, "with the effect": after}
+        with_pit = {title: score for title, score in scores.items() if score.pit}
         where = "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
-        add("pit", pit_figure(scores), where=where)
+        _add(figures, "pit", pit_figure(with_pit), where=where)
     if content.separability is not None:
-        add("separability", separability_figure(content.separability), confused=CONFUSED)
+        figure = separability_figure(content.separability)
+        _add(figures, "separability", figure, confused=CONFUSED)
     if content.self_calibration is not None:
-        add("self_calibration", confusion_figure(content.self_calibration))
-    return found
+        _add(figures, "self_calibration", confusion_figure(content.self_calibration))
+    return figures
+
+
+def _add(
+    figures: dict[str, ReportFigure], name: str, figure: Figure | None, **fields: object
+) -> None:
+    """Add a figure, if there is one, with the caption that these fields fill in."""
+    if figure is not None:
+        figures[name] = WORDS.figure(name, figure, **fields)
+
+
+def _add_residual_figures(
+    figures: dict[str, ReportFigure], content: ReportInput, before: ResidualSet
+) -> None:
+    """Add the figures of residuals, before and after."""
+    investigation = content.investigation
+    after = investigation.after if added_label(investigation) else None
+    held_out = [fitted.trial.name for fitted in before.trials if fitted.trial.held_out]
+    scale = {
+        "beside": WORDS.say("beside", names=held_out, both=after is not None),
+        "unit": _unit_of_noise(before),
+    }
+    if content.design is not None:
+        figure = residual_figures.planform_figure(before, after, content.design)
+        _add(figures, "residual_map", figure, **scale)
+    _add(figures, "residual_table", residual_figures.heat_figure(before, after), **scale)
+    _add(figures, "load", load_figure(before, after))
+    windows = investigation.verdict.windows
+    remark = ""
+    if any(window.with_effect for window in windows):
+        remark = " The thin bars below are what the hypothesis leaves."
+    _add(figures, "time_line", time_line_figure(windows), left=remark)
+    worst = worst_record(before.trials)
+    if worst is not None:
+        trial = before.trials[worst.trial].trial
+        role = "held out" if trial.held_out else "fitted"
+        figure = history_figure(before, after, worst)
+        _add(figures, "history", figure, channel=worst.channel, trial=trial.name, role=role)
+        _add(figures, "spectrum", spectrum_figure(before, after, worst))
+    backbone = backbone_figure(before, after)
+    if backbone is not None:
+        figure, channel = backbone
+        _add(figures, "backbone", figure, channel=channel)

@@ -5,19 +5,21 @@ from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.signal import welch
 
-from discrepancy.campaign.records import FloatArray, TrialKind
+from discrepancy.campaign.records import FloatArray, NoiseRecord, TrialKind
 from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
-from discrepancy.location.dependence import Backbone, backbones, predicted_frequencies
+from discrepancy.location.backbones import Backbone, backbones
+from discrepancy.location.dependence import predicted_frequencies
 from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
+from discrepancy.report.residual_figures import DrawnModel, draw_noise, models, panels, size
 from reporting import figures as style
 
-from .residual_figures import draw_noise, models, panels, size
-
-_ROWS = [item.name for item in fields(Backbone)[1:]]
+_ARRAYS = [entry.name for entry in fields(Backbone) if entry.name != "mode"]
+"""Names of the arrays of a backbone."""
 
 LEAST_POINTS = 4
 """Fewest measured points of a mode whose backbone is drawn."""
@@ -30,178 +32,329 @@ ABOVE: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "bo
 
 
 class Worst(NamedTuple):
-    """The record with the largest gap: index of the trial in its set, name of the channel."""
+    """The record with the largest gap: index of the trial in its set, and name of the channel."""
 
     trial: int
     channel: str
 
 
-def worst_record(items: Sequence[FittedTrial]) -> Worst | None:
+def worst_record(trials: Sequence[FittedTrial]) -> Worst | None:
     """Return the dynamic record whose residuals exceed the noise most; None without one."""
-    found = [
-        (found, number, name)
-        for number, item in enumerate(items)
-        if item.trial.is_dynamic
-        for column, name in enumerate(item.trial.channels)
-        if item.used[:, column].any() and np.isfinite(found := size([item], name))
-    ]
-    return Worst(*max(found)[1:]) if found else None
+    candidates: list[tuple[float, int, str]] = []
+    for index, fitted in enumerate(trials):
+        if not fitted.trial.is_dynamic:
+            continue
+        for name in fitted.trial.channels:
+            size_of_record = size([fitted], name)
+            if np.isfinite(size_of_record):
+                candidates.append((size_of_record, index, name))
+    if not candidates:
+        return None
+    _, index, name = max(candidates)
+    return Worst(index, name)
 
 
 def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure:
-    """Draw the worst record: measured and predicted values, and the residuals against the noise."""
-    item = before.trials[worst.trial]
-    column = item.column(worst.channel)
+    """Draw the worst record: readings and predictions, and the residuals with the noise.
+
+    Parameters
+    ----------
+    before, after : ResidualSet or None
+        Residuals of the model as it was, and with the effect.
+    worst : Worst
+        The record.
+    """
+    fitted = before.trials[worst.trial]
+    column = fitted.column(worst.channel)
+    used = fitted.used[:, column]
+    time = fitted.trial.time
     factor, unit = UNITS[before.channels[worst.channel].quantity].drawn
-    time, used = item.trial.time, item.used[:, column]
-    shown = models(before, after)
-    count = 1 + len(shown)
-    shape = {"height_ratios": [1.25, *[1.0] * len(shown)], "sharex": True}
-    figure, ((axes,), *below) = panels(count, 1, 1.45 * count + 0.35, **shape)
+    drawn_models = models(before, after)
+    panel_count = 1 + len(drawn_models)
+    height_ratios = [1.25, *[1.0] * len(drawn_models)]
+    figure, ((axes,), *rows_below) = panels(
+        panel_count, 1, 1.45 * panel_count + 0.35, height_ratios=height_ratios, sharex=True
+    )
     axes.margins(x=0.01)
-    values = factor * item.trial.values[used, column]
-    axes.plot(time[used], values, ".", ms=1.8, color=style.OBSERVED, label="measured")
-    for one in shown:
-        predicted = factor * one.residuals.trials[worst.trial].prediction[:, column]
-        axes.plot(time, predicted, one.dashes, lw=0.9, color=one.colour, label=one.label)
-    axes.set(ylabel=f"{worst.channel}, {unit}", title=f"a  {worst.channel} in {item.trial.name}")
+    readings = factor * fitted.trial.values[used, column]
+    axes.plot(time[used], readings, ".", ms=1.8, color=style.OBSERVED, label="measured")
+    for drawn in drawn_models:
+        prediction = factor * drawn.residuals.trials[worst.trial].prediction[:, column]
+        axes.plot(time, prediction, drawn.dashes, lw=0.9, color=drawn.colour, label=drawn.label)
+    axes.set(ylabel=f"{worst.channel}, {unit}", title=f"a  {worst.channel} in {fitted.trial.name}")
     axes.legend(**ABOVE, ncol=3)
-    for number, ((panel,), one) in enumerate(zip(below, shown, strict=True)):
-        each = one.residuals.trials[worst.trial]
-        draw_noise(panel, factor * float(each.noise_deviation[column]), 0.3)
-        panel.plot(time[used], factor * each.residual[used, column], lw=0.6, color=one.colour)
-        panel.set(ylabel=f"residual, {unit}", title=f"{'bc'[number]}  residual, {one.label}")
-    below[0][0].legend(**ABOVE)
+    panels_below = [panel for (panel,) in rows_below]
+    for letter, panel, drawn in zip("bc", panels_below, drawn_models, strict=False):
+        fitted_by_model = drawn.residuals.trials[worst.trial]
+        draw_noise(panel, factor * float(fitted_by_model.noise_deviation[column]), 0.3)
+        residual = factor * fitted_by_model.residual[used, column]
+        panel.plot(time[used], residual, lw=0.6, color=drawn.colour)
+        panel.set(ylabel=f"residual, {unit}", title=f"{letter}  residual, {drawn.label}")
+    panels_below[0].legend(**ABOVE)
     figure.axes[-1].set_xlabel("time, s")
     return figure
 
 
 def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
-    """Draw spectra of the residuals of the worst channel over all dynamic trials, with that of the noise."""
-    drawn = [
-        (*spectrum, item)
-        for item in models(before, after)
-        if (spectrum := _spectrum(item.residuals, worst.channel)) is not None
-    ]
-    if not drawn:
+    """Draw spectra of the residuals of the worst channel over all dynamic trials.
+
+    None if no trial is long enough.
+    """
+    spectra = []
+    for drawn in models(before, after):
+        spectrum = _spectrum(drawn.residuals, worst.channel)
+        if spectrum is not None:
+            spectra.append((spectrum, drawn))
+    if not spectra:
         return None
-    noise = before.channels[worst.channel].noise
     figure, ((axes,),) = panels(1, 1, 2.7)
-    if noise is not None and noise.samples is not None and noise.interval and len(noise.samples) >= 32:
-        count = min(len(noise.samples), 128)
-        at, power = welch(noise.samples / noise.standard_deviation, 1.0 / noise.interval, nperseg=count)
-        power = power[1:] * 0.5 / noise.interval
-        axes.plot(at[1:], power, color=style.OBSERVED, lw=0.8, alpha=0.6, label="noise record")
+    _draw_noise_spectrum(axes, before.channels[worst.channel].noise)
     axes.axhline(1.0, color=style.TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
-    for at, power, item in drawn:
-        axes.plot(at, power, item.dashes, color=item.colour, lw=1.1, label=item.label)
+    for spectrum, drawn in spectra:
+        axes.plot(
+            spectrum.frequency,
+            spectrum.power,
+            drawn.dashes,
+            color=drawn.colour,
+            lw=1.1,
+            label=drawn.label,
+        )
     for number, frequency in enumerate(mode_frequencies(before)[:4], start=1):
         axes.axvline(frequency, color=style.REFERENCE, lw=0.6, ls=":")
         axes.annotate(
-            f"mode {number}", (frequency, 1.0), (2.0, -2.0), xycoords=("data", "axes fraction"),
-            textcoords="offset points", rotation=90, va="top", fontsize=6.5, color=style.OBSERVED,
-        )  # fmt: skip
-    axes.set(yscale="log", xlim=(0.0, float(drawn[0][0][-1])), xlabel="frequency, Hz")
-    axes.set(ylabel="power / white noise", title=f"residuals of {worst.channel}, all dynamic trials")
+            f"mode {number}",
+            (frequency, 1.0),
+            (2.0, -2.0),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            rotation=90,
+            va="top",
+            fontsize=6.5,
+            color=style.OBSERVED,
+        )
+    highest_frequency = float(spectra[0][0].frequency[-1])
+    axes.set(yscale="log", xlim=(0.0, highest_frequency), xlabel="frequency, Hz")
+    title = f"residuals of {worst.channel}, all dynamic trials"
+    axes.set(ylabel="power / white noise", title=title)
     low, high = axes.get_ylim()
     axes.set_ylim(min(low, 0.1), max(high, 10.0))
     axes.legend(**ABOVE, ncol=2)
     return figure
 
 
-def _spectrum(residuals: ResidualSet, channel: str) -> tuple[FloatArray, FloatArray] | None:
-    """Return frequency [Hz] and power over that of the stated white noise, mean of the trials."""
-    found: dict[float, list[tuple[FloatArray, FloatArray]]] = {}
-    for item, column, _ in of_channel(residuals.trials, channel):
-        if not item.trial.is_dynamic or len(item.trial.time) < 32:
+def _draw_noise_spectrum(axes: Axes, noise: NoiseRecord | None) -> None:
+    """Draw the spectrum of samples at rest, over that of white noise.
+
+    Nothing without 32 samples.
+    """
+    if noise is None or noise.samples is None or not noise.interval or len(noise.samples) < 32:
+        return
+    standardised = noise.samples / noise.standard_deviation
+    segment = min(len(noise.samples), 128)
+    frequency, power = welch(standardised, 1.0 / noise.interval, nperseg=segment)
+    power = power[1:] * 0.5 / noise.interval
+    axes.plot(frequency[1:], power, color=style.OBSERVED, lw=0.8, alpha=0.6, label="noise record")
+
+
+class _Spectrum(NamedTuple):
+    """A spectrum of residuals: frequencies (F,) [Hz], and power (F,) over that of white noise."""
+
+    frequency: FloatArray
+    power: FloatArray
+
+
+def _spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
+    """Return the mean spectrum of a channel's residuals over the trials; None without a long one.
+
+    Trials of several lengths have several frequencies; those of the most frequent kind are
+    averaged.
+    """
+    groups: dict[float, list[_Spectrum]] = {}
+    for fitted, column, _ in of_channel(residuals.trials, channel):
+        if not fitted.trial.is_dynamic or len(fitted.trial.time) < 32:
             continue
-        series = np.nan_to_num(item.standardised[:, column])
-        count = min(len(series), 512)
-        at, power = welch(series, 1.0 / item.trial.interval, nperseg=count, detrend="constant")
-        found.setdefault(round(item.trial.interval * len(at), 9), []).append(
-            (at[1:], power[1:] * 0.5 / item.trial.interval)
-        )
-    if not found:
+        interval = fitted.trial.interval
+        series = np.nan_to_num(fitted.standardised[:, column])
+        segment = min(len(series), 512)
+        frequency, power = welch(series, 1.0 / interval, nperseg=segment, detrend="constant")
+        resolution = round(interval * len(frequency), 9)
+        spectrum = _Spectrum(frequency[1:], power[1:] * 0.5 / interval)
+        groups.setdefault(resolution, []).append(spectrum)
+    if not groups:
         return None
-    most = max(found.values(), key=len)
-    return most[0][0], np.mean([power for _, power in most], axis=0)
+    largest_group = max(groups.values(), key=len)
+    mean_power = np.mean([spectrum.power for spectrum in largest_group], axis=0)
+    return _Spectrum(largest_group[0].frequency, mean_power)
 
 
 def mode_frequencies(residuals: ResidualSet) -> tuple[float, ...]:
     """Return the frequencies [Hz] at which predictions ring, lowest first."""
-    items = [item for item in residuals.trials if item.trial.is_dynamic]
-    return predicted_frequencies(items) if items else ()
+    dynamic_trials = [fitted for fitted in residuals.trials if fitted.trial.is_dynamic]
+    return predicted_frequencies(dynamic_trials) if dynamic_trials else ()
 
 
 # ---------------------------------------------------------------- backbones
 
 
 def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Figure, str] | None:
-    """Draw frequency and damping ratio of the ring-downs over the amplitude, and name the channel.
+    """Draw frequency and damping ratio of the ring-downs over the amplitude.
 
-    None where no record is long enough or no mode rings long enough.
+    Parameters
+    ----------
+    before, after : ResidualSet or None
+        Residuals of the model as it was, and with the effect.
+
+    Returns
+    -------
+    (Figure, str) or None
+        The figure and its channel; None if no record is long enough, or no mode rings long enough.
     """
     frequencies = mode_frequencies(before if after is None else after)[:MOST_MODES]
-    worst = worst_record([item for item in before.trials if item.trial.kind is TrialKind.RINGDOWN])
+    ringdowns = [fitted for fitted in before.trials if fitted.trial.kind is TrialKind.RINGDOWN]
+    worst = worst_record(ringdowns)
     if worst is None or not frequencies:
         return None
     channel = worst.channel
     measured = _backbones(before, channel, frequencies, measured=True)
-    curves = [(_backbones(one.residuals, channel, frequencies), one) for one in models(before, after)]
-    modes = [n for n in sorted(measured) if np.isfinite(measured[n].time).sum() >= LEAST_POINTS][:2]
+    curves = []
+    for drawn in models(before, after):
+        curves.append((drawn, _backbones(drawn.residuals, channel, frequencies)))
+    modes = [
+        mode for mode in sorted(measured) if np.isfinite(measured[mode].time).sum() >= LEAST_POINTS
+    ][:2]
     if not modes:
         return None
     factor, unit = UNITS[before.channels[channel].quantity].drawn
-    drawn = (("frequency", "frequency, Hz", 1.0), ("damping_ratio", "damping ratio, %", 100.0))
-    figure, cells = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
-    for row, mode in enumerate(modes):
-        points = measured[mode]
-        for place, (axes, (name, label, scale)) in enumerate(zip(cells[row], drawn, strict=True)):
-            for found, shown in curves:
-                if (curve := found.get(mode)) is not None:
-                    (line,) = axes.plot(factor * curve.amplitude, scale * getattr(curve, name))
-                    line.set(color=shown.colour, ls=shown.dashes, lw=1.1, alpha=0.8, label=shown.label)
-            values, error = scale * getattr(points, name), scale * getattr(points, f"{name}_error")
-            axes.errorbar(
-                factor * points.amplitude, values, error, fmt="o", ms=2.6, color=style.OBSERVED, lw=0.0,
-                elinewidth=0.6, alpha=0.85, label="measured, ± 1 standard error", zorder=3,
-            )  # fmt: skip
-            title, across = f"{'abcd'[2 * row + place]}  mode {mode}", f"amplitude of {channel}, {unit}"
-            axes.set(xscale="log", title=title, xlabel=across, ylabel=label)
+    figure, grid = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
+    letters = iter("abcd")
+    for row, mode in zip(grid, modes, strict=True):
+        curves_of_mode = [(drawn, curve[mode]) for drawn, curve in curves if mode in curve]
+        for axes, (name, label, scale) in zip(row, _BACKBONE_VALUES, strict=True):
+            _draw_backbone(axes, measured[mode], curves_of_mode, name, factor, scale)
+            axes.set(
+                xscale="log",
+                title=f"{next(letters)}  mode {mode}",
+                xlabel=f"amplitude of {channel}, {unit}",
+                ylabel=label,
+            )
             style.plain_powers(axes.xaxis, (1.0, 2.0, 5.0))
-            # what was measured and its surroundings, whatever a wrong model does
-            low, high = np.nanquantile(values, (0.02, 0.98))
-            wide = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))
-            bottom, top = axes.get_ylim()
-            axes.set_ylim(max(bottom, low - wide), min(top, high + wide))
-    cells[0][1].legend(loc="best")
+            _limit_to_measured(axes, scale * getattr(measured[mode], name))
+    grid[0][1].legend(loc="best")
     return figure, channel
+
+
+_BACKBONE_VALUES = (
+    ("frequency", "frequency, Hz", 1.0),
+    ("damping_ratio", "damping ratio, %", 100.0),
+)
+"""Entries of a backbone that are drawn: their name, label, and factor to the unit of the label."""
+
+
+def _draw_backbone(
+    axes: Axes,
+    measured: Backbone,
+    curves: Sequence[tuple[DrawnModel, Backbone]],
+    name: str,
+    factor: float,
+    scale: float,
+) -> None:
+    """Draw an entry of the backbones of a mode over the amplitude: predicted, and measured.
+
+    Parameters
+    ----------
+    axes : Axes
+        Where it is drawn.
+    measured : Backbone
+        The measured backbone.
+    curves : sequence of (DrawnModel, Backbone)
+        Models and their predicted backbones.
+    name : str
+        Name of the entry.
+    factor, scale : float
+        Factors from amplitude and entry to the units of the figure.
+    """
+    for drawn, curve in curves:
+        axes.plot(
+            factor * curve.amplitude,
+            scale * getattr(curve, name),
+            color=drawn.colour,
+            ls=drawn.dashes,
+            lw=1.1,
+            alpha=0.8,
+            label=drawn.label,
+        )
+    axes.errorbar(
+        factor * measured.amplitude,
+        scale * getattr(measured, name),
+        scale * getattr(measured, f"{name}_error"),
+        fmt="o",
+        ms=2.6,
+        color=style.OBSERVED,
+        lw=0.0,
+        elinewidth=0.6,
+        alpha=0.85,
+        label="measured, ± 1 standard error",
+        zorder=3,
+    )
+
+
+def _limit_to_measured(axes: Axes, values: FloatArray) -> None:
+    """Limit the ordinate to measured values and their surroundings."""
+    low, high = np.nanquantile(values, (0.02, 0.98))
+    margin = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))
+    bottom, top = axes.get_ylim()
+    axes.set_ylim(max(bottom, low - margin), min(top, high + margin))
 
 
 def _backbones(
     residuals: ResidualSet, channel: str, frequencies: Sequence[float], *, measured: bool = False
 ) -> dict[int, Backbone]:
-    """Return the backbones of the ring-downs by mode, of what was predicted or of what was measured.
+    """Return the backbones of the ring-downs by mode, of the predictions or of the readings.
 
-    Points whose errors leave nothing to be seen are left out; NaN stands between ring-downs.
+    Points with large errors are left out, and nan stands between ring-downs.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The ring-downs.
+    channel : str
+        Name of the channel.
+    frequencies : sequence of float
+        Start values of the frequencies [Hz].
+    measured : bool
+        True for the readings.
     """
-    found: dict[int, list[list[FloatArray]]] = {}
-    for item, column, used in of_channel(residuals.trials, channel):
-        if item.trial.kind is not TrialKind.RINGDOWN:
+    backbones_of_modes: dict[int, list[Backbone]] = {}
+    for fitted, column, used in of_channel(residuals.trials, channel):
+        if fitted.trial.kind is not TrialKind.RINGDOWN:
             continue
-        noise, values = float(item.noise_deviation[column]), item.prediction[:, column]
+        noise = float(fitted.noise_deviation[column])
+        values = fitted.prediction[:, column]
         if measured:
-            values = np.where(used, item.trial.values[:, column], values)
+            values = np.where(used, fitted.trial.values[:, column], values)
         try:
-            curves = backbones(item.trial.time, values, list(frequencies), noise_deviation=noise)
-        except FitError:
+            curves = backbones(fitted.trial.time, values, list(frequencies), noise_deviation=noise)
+        except FitError:  # the record is too short
             continue
-        for curve in (curve for curve in curves if curve.time.size):
-            limit = LARGEST_ERROR * max(float(np.median(np.abs(curve.damping_ratio))), 1e-4)
-            clear = curve.damping_ratio_error < limit
-            if clear.any():
-                rows = [np.r_[getattr(curve, name)[clear], np.nan] for name in _ROWS]
-                found.setdefault(curve.mode, []).append(rows)
-    return {
-        mode: Backbone(mode, *map(np.concatenate, zip(*each, strict=True))) for mode, each in found.items()
-    }
+        for curve in curves:
+            if curve.time.size:
+                clear_points = _clear_points(curve)
+                if clear_points is not None:
+                    backbones_of_modes.setdefault(curve.mode, []).append(clear_points)
+    return {mode: _joined(mode, parts) for mode, parts in backbones_of_modes.items()}
+
+
+def _clear_points(curve: Backbone) -> Backbone | None:
+    """Return the points of a backbone with small errors, and nan after them; None without any."""
+    median_ratio = float(np.median(np.abs(curve.damping_ratio)))
+    is_clear = curve.damping_ratio_error < LARGEST_ERROR * max(median_ratio, 1e-4)
+    if not is_clear.any():
+        return None
+    arrays = {name: np.r_[getattr(curve, name)[is_clear], np.nan] for name in _ARRAYS}
+    return Backbone(mode=curve.mode, **arrays)
+
+
+def _joined(mode: int, parts: Sequence[Backbone]) -> Backbone:
+    """Return the backbones of several ring-downs as one."""
+    arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
+    return Backbone(mode=mode, **arrays)

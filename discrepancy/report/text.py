@@ -1,23 +1,16 @@
-"""Numbers, sizes in SI units and sentences of the report and of the summary on the terminal.
-
-Also what a campaign can decide, in rows for both.
-"""
+"""Numbers, sizes in SI units and sentences of the report and of the summary on the terminal."""
 
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from math import isfinite, isnan
 from typing import Any
 
-import numpy as np
-
-from discrepancy.campaign.records import Campaign, Quantity, TrialKind
+from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
-from discrepancy.catalogue.entry import Effect
 from discrepancy.document import PRIMITIVE_UNITS
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.closed_share import closed_text, share_text
 from discrepancy.judgement.conclusion import effects_text, probability_text
-from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
 from discrepancy.proof_record import Proof, Scores
 from discrepancy.system.interface import Model
 from discrepancy.system.response import EITHER, MOVES, TURNS
@@ -33,25 +26,26 @@ from discrepancy.verdict import (
 from discrepancy.workflow import Investigation
 from fe.runtime.patch import CHANNEL_UNIT, ModelPatch, Primitive
 from reporting.page import Words
-from reporting.words import between, listing, rounded
+from reporting.words import between, rounded
 
 BEYOND_DOUBT = 1e6
-"""Evidence [nat] of which no more is told."""
+"""Evidence [nat] above which no digits are shown."""
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
-"""Verdicts that say what is missing, if not all of it."""
+"""Verdicts that name what is missing, or part of it."""
 
 LARGEST_PLAIN = 1e6
-"""Numbers from here on have a power of ten."""
+"""Least number that is written with a power of ten."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
 
 
 def estimate_text(estimate: Estimate) -> tuple[str, str]:
-    """Return a value, and its 90 % interval, with two digits of the half-width."""
+    """Return a value and its 90 % interval as texts, to two digits of the half-width."""
     if not (isfinite(estimate.low) and isfinite(estimate.high)):
         return f"{estimate.value:.4g}", "not known"
-    half = 0.5 * (estimate.high - estimate.low)
-    return rounded(estimate.value, half), between(estimate.low, estimate.high, half)
+    half_width = 0.5 * (estimate.high - estimate.low)
+    interval = between(estimate.low, estimate.high, half_width)
+    return rounded(estimate.value, half_width), interval
 
 
 def p_value_text(p: float) -> str:
@@ -77,113 +71,141 @@ def unit_text(unit: str) -> str:
 
 
 def headline(verdict: Verdict) -> str:
-    """Return the verdict in one sentence that holds its probability."""
-    text = verdict.sentence.rstrip(".")
-    known = [*verdict.effects, *(effect for item in verdict.hypotheses for effect in item.effects)]
-    for identifier, name in {effect.identifier: effect.name for effect in known}.items():
-        whole = rf"{re.escape(name)}|\b{identifier}\b"  # a name may hold the identifier
-        text = re.sub(whole, lambda _, name=name: name, text)  # type: ignore[misc]
-    about = WORDS.content["probability"].get(verdict.kind)
-    if isnan(verdict.probability) or "probability" in text or about is None:
-        return f"{text}."
-    return f"{text} ({about} {probability_text(verdict.probability)})."
+    """Return the verdict in one sentence with its probability, and names of effects."""
+    sentence = verdict.sentence.rstrip(".")
+    effects = [*verdict.effects]
+    for hypothesis in verdict.hypotheses:
+        effects += hypothesis.effects
+    for identifier, name in {effect.identifier: effect.name for effect in effects}.items():
+        # names first, because a name may contain the identifier
+        name_or_identifier = rf"{re.escape(name)}|\b{identifier}\b"
+        sentence = re.sub(name_or_identifier, name.replace("\\", r"\\"), sentence)
+    role = WORDS.content["probability"].get(verdict.kind)
+    if isnan(verdict.probability) or "probability" in sentence or role is None:
+        return f"{sentence}."
+    return f"{sentence} ({role} {probability_text(verdict.probability)})."
 
 
 def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
-    """Return the members of a group by name, each with its effects; empty for any other verdict."""
-    found = {}
-    for group in verdict.group if verdict.kind is VerdictKind.GROUP else ():
-        one = next((item for item in verdict.hypotheses if " + ".join(item.identifiers) == group), None)
-        effects = tuple(item for item in verdict.effects if item.identifier == group)
-        effects = effects if one is None else one.effects
-        found[effects_text(effects) or group] = effects
-    return found
+    """Return the effects of each member of a group by its name; empty for any other verdict."""
+    if verdict.kind is not VerdictKind.GROUP:
+        return {}
+    effects_of_hypotheses = {}
+    for hypothesis in reversed(verdict.hypotheses):  # the first of several counts
+        effects_of_hypotheses[" + ".join(hypothesis.identifiers)] = hypothesis.effects
+    members = {}
+    for member in verdict.group:
+        if member in effects_of_hypotheses:
+            effects = effects_of_hypotheses[member]
+        else:
+            effects = tuple(effect for effect in verdict.effects if effect.identifier == member)
+        members[effects_text(effects) or member] = effects
+    return members
 
 
 def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
-    """Return what is missing, and the units of displacement and speed of its port."""
-    flow = "flow", "", force.unit.partition("/s times")[0]
-    what, place, rate = WORDS.content["motions"].get(force.unit, flow)
-    return what, place, rate
+    """Return what is missing at a port (a force, a moment, a flow), and the units of its motion.
+
+    The units are those of displacement and speed of the port.
+    """
+    of_state = ("flow", "", force.unit.partition("/s times")[0])
+    name, displacement_unit, speed_unit = WORDS.content["motions"].get(force.unit, of_state)
+    return name, displacement_unit, speed_unit
 
 
 def force_sentence(force: ForceAtPort) -> str:
-    """Return where a force is missing, how large, what orders it, and what its law leaves of it."""
-    what, place, rate = motion_of(force)
-    own = force.evidence[force.port]
-    others = {name: value for name, value in force.evidence.items() if name != force.port}
-    nearest = max(others, key=lambda name: others[name], default="")
-    evidence = {"own": own, "nearest": nearest, "ahead": own - others.get(nearest, own)}
-    port = {"what": what, "place": place, "rate": rate}
-    return WORDS.say("force", force=force, tested=tested_trials(force), **evidence, **port)
+    """Return the sentence on a missing force: where, how large, and what its law leaves."""
+    name, displacement_unit, speed_unit = motion_of(force)
+    evidence = force.evidence[force.port]
+    other_ports = {port: value for port, value in force.evidence.items() if port != force.port}
+    nearest = max(other_ports, key=lambda port: other_ports[port], default="")
+    return WORDS.say(
+        "force",
+        force=force,
+        tested=tested_trials(force),
+        own=evidence,
+        nearest=nearest,
+        ahead=evidence - other_ports.get(nearest, evidence),
+        what=name,
+        place=displacement_unit,
+        rate=speed_unit,
+    )
 
 
 def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
-    """Return which trials, and what a law leaves of a missing force in them; only where it has a force."""
-    found = {} if force is None else {"fitted": force.fitted, "held-out": force.held_out}
-    return [(kind, left) for kind, left in found.items() if left is not None and left.tested]
+    """Return what a law leaves of a missing force in fitted and held-out trials."""
+    if force is None:
+        return []
+    tested = []
+    for role, remainder in (("fitted", force.fitted), ("held-out", force.held_out)):
+        if remainder is not None and remainder.tested:
+            tested.append((role, remainder))
+    return tested
 
 
 def scored(proof: Proof) -> tuple[Scores, Scores, str]:
-    """Return the scores before and after, and on which trials: those held out, where there are any."""
+    """Return the scores before and after, and their trials: held-out ones if there are any."""
     if proof.held_out_before is not None and proof.held_out_after is not None:
         return proof.held_out_before, proof.held_out_after, "held-out"
     return proof.fitted_before, proof.fitted_after, "fitted"
 
 
 def error_sentence(investigation: Investigation) -> str:
-    """Return what share of the error the effects take away, in which channels from what to what; or why none.
+    """Return the sentence on which fraction of the error the effects remove.
 
-    Empty where nothing was added.
+    Empty if nothing was added to the model.
     """
-    proof, before, after = investigation.proof, investigation.before, investigation.after
+    proof = investigation.proof
+    before = investigation.before
+    after = investigation.after
     if proof is None or before is None or after is None:
         return ""
     if proof.closed is None:
         return proof.closed_reason
-    named = investigation.verdict.kind in NAMING
-    what = "With it" if named else "With the best hypothesis, which is no name,"
-    text = closed_text(before, after, proof.closed)
-    return f"{what} {text.removeprefix('it ')}." if proof.closed.grew else f"{_subject(named)}{text[2:]}."
-
-
-def _subject(named: bool) -> str:
-    """Return what explains a share of the error."""
-    return "It" if named else "The best hypothesis, which is no name,"
+    is_named = investigation.verdict.kind in NAMING
+    predicate = closed_text(before, after, proof.closed).removeprefix("it ")
+    if proof.closed.grew:
+        subject = "With it" if is_named else "With the best hypothesis, which is no name,"
+    else:
+        subject = "It" if is_named else "The best hypothesis, which is no name,"
+    return f"{subject} {predicate}."
 
 
 def noise_levels(proof: Proof) -> tuple[str, str]:
-    """Return the rms of the residuals before and after over the noise, for people."""
+    """Return the rms of the residuals over the noise, before and after, as texts."""
     before, after, _ = scored(proof)
-    levels = (score.chi_square_per_sample**0.5 for score in (before, after))
-    first, second = (number(level, 2) for level in levels)
-    return first, second
+    rms_before = number(before.chi_square_per_sample**0.5, 2)
+    rms_after = number(after.chi_square_per_sample**0.5, 2)
+    return rms_before, rms_after
 
 
 def remainders_sentence(verdict: Verdict) -> str:
-    """Return what is left in which channel, over what time; empty without a remainder."""
+    """Return the sentence on what remains unexplained in which channel; empty if nothing does."""
     return WORDS.say("left", remainders=verdict.remainders)
 
 
 def _labels(effects: Iterable[tuple[str, str, bool]]) -> str:
-    """Return effects joined, each of a name and a place, and whether its shape is free."""
-    found = []
-    for name, place, free_shape in effects:
-        marks = ", ".join(filter(None, (place, "free shape" if free_shape else "")))
-        found.append(f"{name} ({marks})" if marks else name)
-    return " + ".join(found)
+    """Return effects joined by plus signs: their names, places and whether a shape is free."""
+    labels = []
+    for name, place, has_free_shape in effects:
+        marks = [place] if place else []
+        if has_free_shape:
+            marks.append("free shape")
+        labels.append(f"{name} ({', '.join(marks)})" if marks else name)
+    return " + ".join(labels)
 
 
 def hypothesis_name(hypothesis: Hypothesis) -> str:
     """Return the effects of a hypothesis in words."""
-    return (
-        _labels((item.name, item.place, bool(item.shape)) for item in hypothesis.effects) or "nothing missing"
-    )
+    effects = [(effect.name, effect.place, bool(effect.shape)) for effect in hypothesis.effects]
+    return _labels(effects) or "nothing missing"
 
 
 def added_label(investigation: Investigation) -> str:
-    """Return what the model "after" has more than the model "before"; empty if nothing."""
-    terms = () if investigation.fit is None else investigation.fit.candidate.terms
+    """Return the effects that were added to the model, in words; empty if none was."""
+    if investigation.fit is None:
+        return ""
+    terms = investigation.fit.candidate.terms
     return _labels((term.effect.name, term.place, term.free_shape) for term in terms)
 
 
@@ -192,62 +214,80 @@ _POWERS = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def formula(text: str) -> str:
-    """Return an equation of the catalogue with Greek letters, powers and arrows as they are printed."""
+    """Return an equation of the catalogue with Greek letters, powers and arrows."""
     greek = WORDS.content["greek"]
     text = _WORD.sub(lambda match: greek.get(match[1], match[1]), text).replace("->", "→")
     return re.sub(r"\^(\d)(?!\w)", lambda match: match[1].translate(_POWERS), text)
 
 
 def nats(evidence: float) -> str:
-    """Return an evidence; beyond all doubt its digits tell nothing."""
+    """Return an evidence [nat] as text; no digits beyond `BEYOND_DOUBT`."""
     return f"{evidence:,.0f}" if abs(evidence) < BEYOND_DOUBT else f"more than {BEYOND_DOUBT:,.0f}"
 
 
-def parameter_text(item: Estimate) -> str:
-    """Return what a parameter is."""
-    return formula(item.description or item.name.replace("_", " "))
+def parameter_text(estimate: Estimate) -> str:
+    """Return the description of a parameter, with its formula as it is printed."""
+    return formula(estimate.description or estimate.name.replace("_", " "))
 
 
 _NUMBERS: tuple[Any, ...] = (
-    number, nats, share_text, formula, p_value_text, estimate_text, unit_text, parameter_text,
-    probability_text, isfinite,
-)  # fmt: skip
-WORDS = Words("discrepancy.report", "words.toml", **{function.__name__: function for function in _NUMBERS})
+    number,
+    nats,
+    share_text,
+    formula,
+    p_value_text,
+    estimate_text,
+    unit_text,
+    parameter_text,
+    probability_text,
+    isfinite,
+)
+WORDS = Words(
+    "discrepancy.report", "words.toml", **{function.__name__: function for function in _NUMBERS}
+)
 """Words of the report, of figures and of the summary on the terminal."""
 
 
 BESIDE = ("reference_velocity", "reference_displacement", "time", "start", "length", "station")
-"""Where or at what a size holds; no sizes themselves."""
+"""Parameters of primitives that say where or when an effect acts, and not how large it is."""
 
 
 def si_sizes(
     patch: ModelPatch, intervals: Sequence[PrimitiveInterval], model: Model, campaign: Campaign
 ) -> str:
-    """Return the sizes of a patch that have a unit, "slip force 0.53 N (0.52 to 0.54)"; empty without.
+    """Return the sizes of a patch that have a unit, such as "slip force 0.53 N (0.52 to 0.54)".
 
     Parameters
     ----------
     patch : ModelPatch
-        Of one effect.
+        Patch of one effect.
     intervals : sequence of PrimitiveInterval
-        Of its numbers.
+        Intervals of its numbers.
     model : Model
-        Says whether a port moves or turns.
+        The model, which knows whether a port moves or turns.
     campaign : Campaign
-        Says what a channel measures.
+        The campaign, which knows what a channel measures.
+
+    Returns
+    -------
+    str
+        Sizes with 90 % intervals; empty if none has a unit.
     """
-    found: dict[str, None] = {}
-    for item in intervals:
-        primitive = patch.primitives[item.primitive]
-        unit = definite_unit(item.unit, primitive, model, campaign)
-        if not unit or item.parameter in BESIDE or item.value == 0.0:
+    sizes: dict[str, None] = {}  # each once, in order
+    for size in intervals:
+        primitive = patch.primitives[size.primitive]
+        unit = definite_unit(size.unit, primitive, model, campaign)
+        if not unit or size.parameter in BESIDE or size.value == 0.0:
             continue
-        known = isfinite(item.low) and isfinite(item.high) and item.low < item.high
-        half = 0.5 * (item.high - item.low) if known else 0.0
-        interval = f" ({between(item.low, item.high, half)})" if known else ""
-        words, where = _words(item.parameter, primitive, unit), _where(primitive, item, model, campaign)
-        found[f"{words} {rounded(item.value, half)} {unit}{interval}{where}"] = None
-    return ", ".join(found)
+        half_width = 0.0
+        interval = ""
+        if isfinite(size.low) and isfinite(size.high) and size.low < size.high:
+            half_width = 0.5 * (size.high - size.low)
+            interval = f" ({between(size.low, size.high, half_width)})"
+        name = _size_name(size.parameter, primitive, unit)
+        where = _where(primitive, size, model, campaign)
+        sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{where}"] = None
+    return ", ".join(sizes)
 
 
 def size_sentence(
@@ -255,129 +295,110 @@ def size_sentence(
     effects: Sequence[NamedEffect],
     intervals: Sequence[Sequence[PrimitiveInterval]],
 ) -> str:
-    """Return the sizes of the effects of a patch in one sentence; empty where none has a unit."""
-    model, campaign = investigation.model, investigation.campaign
-    sizes = [si_sizes(e.patch, row, model, campaign) for e, row in zip(effects, intervals, strict=True)]
-    named = investigation.verdict.kind in (*NAMING, VerdictKind.FAMILY)
-    alone = named and len(effects) == 1
-    parts = []
-    for effect, size in zip(effects, sizes, strict=True):
+    """Return the sizes of the effects of a patch in one sentence; empty if none has a unit.
+
+    Parameters
+    ----------
+    investigation : Investigation
+        The investigation.
+    effects : sequence of NamedEffect
+        Effects of the patch.
+    intervals : sequence of sequence of PrimitiveInterval
+        Intervals of the numbers of each effect.
+    """
+    is_named = investigation.verdict.kind in (*NAMING, VerdictKind.FAMILY)
+    is_only_effect = is_named and len(effects) == 1
+    phrases = []
+    for effect, intervals_of_effect in zip(effects, intervals, strict=True):
+        sizes = si_sizes(
+            effect.patch, intervals_of_effect, investigation.model, investigation.campaign
+        )
         name = f"a law of the family {effect.family}" if effect.shape else effect.name
-        if size:
-            parts.append(size if alone else f"{name}, {size}")
-    if not parts:
+        if sizes:
+            phrases.append(sizes if is_only_effect else f"{name}, {sizes}")
+    if not phrases:
         return ""
-    words = "In SI units" if named else "In SI units, were it the most probable member, which is not named"
-    brackets = "; 90 % intervals in brackets" if any(" to " in part for part in parts) else ""
-    return f"{words}: {'; '.join(parts)}{brackets}."
+    begin = "In SI units"
+    if not is_named:
+        begin = "In SI units, were it the most probable member, which is not named"
+    has_intervals = any(" to " in phrase for phrase in phrases)
+    brackets = "; 90 % intervals in brackets" if has_intervals else ""
+    return f"{begin}: {'; '.join(phrases)}{brackets}."
 
 
-def _words(parameter: str, primitive: Primitive, unit: str) -> str:
-    words = parameter.replace("_", " ")
+def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:
+    """Return the name of a primitive's parameter in words: a force, a moment, a flow, ..."""
     if parameter == "coefficient" and unit.endswith("capacity"):
         return "flow"  # into or out of a state
+    name = parameter.replace("_", " ")
     if parameter == "coefficient" and primitive.kind in ("power_damping", "power_stiffness"):
-        words = "force"
-    return words.replace("force", "moment") if unit == "N m" else words  # at a port that turns
+        name = "force"
+    is_at_turning_port = unit == "N m"
+    return name.replace("force", "moment") if is_at_turning_port else name
 
 
-def _where(primitive: Primitive, item: PrimitiveInterval, model: Model, campaign: Campaign) -> str:
-    """Return at which speed or displacement a force has its size, or where a mass sits."""
-    if primitive.kind == "point_mass" and item.parameter == "mass":
+def _where(primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign) -> str:
+    """Return at which speed or displacement a force has its size, or where a mass is.
+
+    Else empty.
+    """
+    if primitive.kind == "point_mass" and size.parameter == "mass":
         return f" at {getattr(primitive, 'station'):.3g} m"  # noqa: B009
-    if item.parameter != "coefficient":
+    if size.parameter != "coefficient":
         return ""
     marks = []
     for exponent in ("velocity_exponent", "displacement_exponent", "exponent"):
-        reference = "reference_velocity" if exponent.startswith("velocity") else "reference_displacement"
+        reference = "reference_displacement"
+        if exponent.startswith("velocity"):
+            reference = "reference_velocity"
         value = getattr(primitive, reference, None)
         if value is not None and getattr(primitive, exponent, 0.0) != 0.0:
-            unit = definite_unit(PRIMITIVE_UNITS[primitive.kind][reference], primitive, model, campaign)
+            reference_unit = PRIMITIVE_UNITS[primitive.kind][reference]
+            unit = definite_unit(reference_unit, primitive, model, campaign)
             marks.append(f"{value:.3g} {unit}")
     return f" at {' and '.join(marks)}" if marks else ""
 
 
 def definite_unit(unit: str, primitive: Primitive, model: Model, campaign: Campaign) -> str:
-    """Return the unit of a number, made definite as far as port and channel say it."""
+    """Return the unit of a primitive's parameter, as its port and its channel determine it.
+
+    Parameters
+    ----------
+    unit : str
+        Unit of the kind of primitive, which may be that of a channel, or one "or" another.
+    primitive : Primitive
+        The primitive, with a port or a channel.
+    model, campaign
+        Model and campaign.
+
+    Returns
+    -------
+    str
+        The unit; empty for a plain number, or if it is not determined.
+    """
     if unit.startswith(CHANNEL_UNIT):
-        names = campaign.channels if (name := getattr(primitive, "channel", "*")) == "*" else (name,)
-        measured = {campaign.channels[name].quantity for name in names if name in campaign.channels}
-        units = {"1" if item is Quantity.SIGNAL else UNITS[item].si for item in measured}
-        return unit_text(units.pop()) if len(units) == 1 and unit == CHANNEL_UNIT else ""
-    if " or " in unit:
-        port = str(getattr(primitive, "port", ""))
-        (moving, turning), (force, state) = unit.split(" or "), model.port_units(port)
-        of_state = state if unit.startswith("m/s") else force
-        return {MOVES[0]: moving, TURNS[0]: turning, EITHER[0]: unit}.get(force, of_state)
-    return unit_text(unit)
+        return _channel_unit(primitive, campaign) if unit == CHANNEL_UNIT else ""
+    if " or " not in unit:
+        return unit_text(unit)
+    port = str(getattr(primitive, "port", ""))
+    unit_if_moving, unit_if_turning = unit.split(" or ")
+    force_unit, state_unit = model.port_units(port)
+    if force_unit == MOVES[0]:
+        return unit_if_moving
+    if force_unit == TURNS[0]:
+        return unit_if_turning
+    if force_unit == EITHER[0]:
+        return unit
+    return state_unit if unit.startswith("m/s") else force_unit
 
 
-def seen_of(item: Detectability) -> tuple[str, str, str]:
-    """Return whether an effect can be seen, from which size on, and its prior median."""
-    seen = item.distance >= DETECTED
-    visible = "yes" if seen else "larger than usual only"
-    if not item.parameter:
-        return visible, "at once" if seen else "not at its prior median", ""
-    size, typical = (
-        f"{number(value, 2)} {unit_text(item.unit)}".rstrip() for value in (item.detectable, item.typical)
-    )
-    return (visible, size, typical) if isfinite(item.detectable) else ("not visible", "never", typical)
-
-
-def neighbours(found: Separability, name: str) -> list[str]:
-    """Return the effects that these data cannot tell from one, in either direction."""
-    if name not in found.identifiers:
-        return []
-    at = found.identifiers.index(name)
-    near = np.minimum(found.distance[at], found.distance[:, at]) < CONFUSED
-    return [other for place, other in enumerate(found.identifiers) if near[place] and place != at]
-
-
-def group_lines(found: Separability, told: str = "the table says to which") -> list[str]:
-    """Return one sentence for each confusion group, or one that there is none; `told`: where to look."""
-    seen = [item for item in found.detectability if not item.reason and isfinite(item.detectable)]
-    if not found.identifiers or not any(item.parameter and item.distance > 0.0 for item in seen):
-        return [WORDS.say("nothing_shown")]
-    if not found.groups:
-        return [WORDS.say("all_apart")]
-    lines = []
-    for group in found.groups:
-        names = [name.replace("_", " ") for name in group]
-        if len(names) == 2:
-            lines.append(f"These data cannot tell {names[0]} from {names[1]}.")
-        else:
-            lines.append(f"Confusion group, each close to at least one other ({told}): {listing(names)}.")
-    return lines
-
-
-def needs(
-    found: Separability, campaign: Campaign, effects: Sequence[Effect], possible: Collection[TrialKind]
-) -> list[str]:
-    """Return sentences on what the campaign would need to decide more; `possible`: what the model follows."""
-    known = {effect.identifier: effect for effect in effects}
-    there = {trial.kind for trial in campaign.trials}
-    lines = []
-    for group in found.groups:
-        acts = [known[name].acts_on for name in group if name in known]
-        union: frozenset[TrialKind] = frozenset().union(*acts)
-        common = frozenset(TrialKind).intersection(*acts)
-        apart = [
-            kind for kind in TrialKind if kind in union - common and kind in possible and kind not in there
-        ]
-        names = listing(name.replace("_", " ") for name in group)
-        kinds = " or ".join(WORDS.content["kinds"][kind.value] for kind in apart)
-        lines.append(WORDS.say("add_kinds" if apart else "vary", names=names, kinds=kinds))
-    hidden = [
-        item
-        for item in found.detectability
-        if not item.reason and item.parameter and isfinite(item.detectable) and item.distance < DETECTED
-    ]
-    if hidden:
-        first = max(hidden, key=lambda item: item.distance)
-        factor = (DETECTED / first.distance) ** 0.5 if first.distance > 0.0 else float("inf")
-        unseen = [item.effect.identifier.replace("_", " ") for item in hidden]
-        values = {"first": first.effect.identifier.replace("_", " "), "factor": factor, "trials": factor**2}
-        lines.append(WORDS.say("unseen" if unseen[1:] else "unseen_one", unseen=listing(unseen), **values))
-    unknown = [name for name, channel in campaign.channels.items() if channel.noise is None]
-    lines += [WORDS.say("give_noise", names=", ".join(unknown))] if unknown else []
-    return lines if campaign.held_out else [*lines, WORDS.say("hold_out")]
+def _channel_unit(primitive: Primitive, campaign: Campaign) -> str:
+    """Return the unit of a primitive's channels; empty if they have several."""
+    name = getattr(primitive, "channel", "*")
+    names = campaign.channels if name == "*" else (name,)
+    units = set()
+    for channel_name in names:
+        if channel_name in campaign.channels:
+            quantity = campaign.channels[channel_name].quantity
+            units.add("1" if quantity is Quantity.SIGNAL else UNITS[quantity].si)
+    return unit_text(units.pop()) if len(units) == 1 else ""

@@ -1,4 +1,4 @@
-"""Small campaigns to try: simulated trials of a model, with what every test has: noise, zeros, gains."""
+"""Small campaigns to try: simulated trials of a model with noise, zeros and errors of gain."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -7,13 +7,21 @@ from typing import Any, Literal
 
 import numpy as np
 
-from discrepancy.campaign.noise import pre_trigger_record
+from discrepancy.campaign.noise_records import pre_trigger_record
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.reading import read_campaign
-from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.campaign.records import (
+    Campaign,
+    Channel,
+    FloatArray,
+    NoiseRecord,
+    Quantity,
+    Trial,
+    TrialKind,
+)
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.checks.model_check import prior_mean
-from discrepancy.errors import CampaignFileError, ModelError, said
+from discrepancy.errors import CampaignFileError, ModelError
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -30,6 +38,7 @@ _KINDS: dict[str, tuple[TrialKind, ...]] = {
     "complete": (TrialKind.STATIC, TrialKind.RINGDOWN, TrialKind.FLIGHT),
 }
 _AT_REST_SAMPLES = 400
+"""Samples at rest of the noise record of a channel."""
 
 
 @dataclass(frozen=True)
@@ -39,19 +48,19 @@ class ExamplePlan:
     Attributes
     ----------
     channels : tuple of Channel
-        Their noise records say how noisy the sensors are; ring-downs replace them by recorded samples.
+        Channels, with the noise of their sensors; with ring-downs their noise records hold samples.
     force : float
         Largest static force [N].
     release : float
         Largest release displacement [m].
     load_factors : tuple of float
-        Of the flights [1].
+        Load factors of the flights [1].
     duration, interval : float
-        Of a ring-down and its samples [s].
+        Duration and sampling interval of a ring-down [s].
     load_place : str or tuple of float
-        Where the force acts.
+        Point at which the force acts.
     flight_channels : tuple of str
-        Names of the channels that flights measure; empty: all.
+        Names of the channels that flights measure; all if empty.
     """
 
     channels: tuple[Channel, ...]
@@ -65,23 +74,46 @@ class ExamplePlan:
 
     def names(self, kind: TrialKind) -> tuple[str, ...]:
         """Return the names of the channels that a kind of trial measures."""
-        chosen = self.flight_channels if kind is TrialKind.FLIGHT else ()
-        return chosen or tuple(channel.name for channel in self.channels)
+        if kind is TrialKind.FLIGHT and self.flight_channels:
+            return self.flight_channels
+        return tuple(channel.name for channel in self.channels)
 
 
 def wing_plan(gauges: tuple[int, ...] = (1, 5, 9, 13, 18, 22)) -> ExamplePlan:
-    """Return the plan of a wing test: some gauges of 2 microstrain and the tip's displacement of 0.05 mm."""
-    strain = NoiseRecord(2e-6, 200.0)
-    channels = [
-        Channel(f"g{number}", Quantity.STRAIN, f"strain[{number}]", strain, 0.005, 2e-6) for number in gauges
-    ]
-    tip = Channel("tip", Quantity.DISPLACEMENT, "tip_displacement", NoiseRecord(5e-5, 200.0), 0.0, 1e-4)
-    names = tuple(channel.name for channel in channels)
-    return ExamplePlan((*channels, tip), flight_channels=names)
+    """Return the plan of a test of the wing.
+
+    Gauges have noise of 2 microstrain, and the displacement of the tip has noise of 0.05 mm.
+
+    Parameters
+    ----------
+    gauges : tuple of int
+        Numbers of the gauges, from 1.
+    """
+    channels = []
+    for number in gauges:
+        channels.append(
+            Channel(
+                name=f"g{number}",
+                quantity=Quantity.STRAIN,
+                output=f"strain[{number}]",
+                noise=NoiseRecord(2e-6, 200.0),
+                gain_deviation=0.005,
+                offset_deviation=2e-6,
+            )
+        )
+    tip = Channel(
+        name="tip",
+        quantity=Quantity.DISPLACEMENT,
+        output="tip_displacement",
+        noise=NoiseRecord(5e-5, 200.0),
+        offset_deviation=1e-4,
+    )
+    names_of_gauges = tuple(channel.name for channel in channels)
+    return ExamplePlan((*channels, tip), flight_channels=names_of_gauges)
 
 
 def plan_of(model: Model) -> ExamplePlan:
-    """Return what an example measures: gauges and tip of a wing, every output of another model at rest.
+    """Return the usual plan for a model: gauges and tip of a wing, else outputs at rest.
 
     Raises
     ------
@@ -91,7 +123,9 @@ def plan_of(model: Model) -> ExamplePlan:
     if model.load_places is None:
         return wing_plan()
     if not model.load_places:
-        raise ModelError(said("examples.no_force", model=model))
+        raise ModelError(
+            f"{model.name} has no force, and an example is made by forces: write a campaign of it."
+        )
     outputs = tuple(name for name, quantity in model.quantities.items() if quantity.order == 0)
     return plan_for(model, outputs, model.load_places[0], model.largest_force)
 
@@ -102,18 +136,20 @@ def plan_for(
     load_place: str | tuple[float, float],
     largest_force: float = np.inf,
 ) -> ExamplePlan:
-    """Return a plan for any model: loads that move it by 2 % of its length, noise of 0.1 % of what they show.
+    """Return a plan for any model, from its natural scales.
+
+    Loads move the model by 2 % of its length, and noise is 0.1 % of what each channel shows then.
 
     Parameters
     ----------
     model : Model
-        Gives its natural scales and the size of its outputs.
+        The model.
     outputs : tuple of str
-        What is measured, one channel of the same name each.
+        Outputs that are measured, each by a channel of the same name.
     load_place : str or tuple of float
-        Where the force acts.
+        Point at which the force acts.
     largest_force : float
-        Which the model can take [N]; it may ask for less motion.
+        Largest force that the model can take [N]; it may limit the motion.
 
     Raises
     ------
@@ -124,22 +160,48 @@ def plan_for(
     for output in outputs:
         quantity = model.output_quantity(output)
         if quantity is None:
-            raise ModelError(f"{model.name} has no output {output!r}: an example cannot measure it.")
-        channels[output] = Channel(output, quantity, output, None, 0.005)
-    bare = Campaign("", channels, (), None, {}, "")
-    scales = model.scales(replace(bare, channels={}))
+            raise ModelError(
+                f"{model.name} has no output {output!r}: an example cannot measure it."
+            )
+        channels[output] = Channel(output, quantity, output, noise=None, gain_deviation=0.005)
+    campaign = _campaign_without_trials("", channels, reference_temperature=None)
+    scales = model.scales(replace(campaign, channels={}))
     period = 2.0 * np.pi / scales.angular_frequency
     motion = min(0.02 * scales.length, largest_force / scales.tip_stiffness)
-    force, plan = motion * scales.tip_stiffness, ExamplePlan(tuple(channels.values()), load_place=load_place)
-    plan = replace(plan, force=force, release=motion, duration=20.0 * period, interval=period / 50.0)
-    trial = _blank("", TrialKind.STATIC, plan, np.array([force]), 0.0)
-    seen = np.abs(observe(model, bare, trial, ModelPatch(), prior_mean(bare, model, trial)).values[0])
-    noises = 1e-3 * np.where(seen > 0.0, seen, seen.max() or 1.0)
-    sized = (
-        replace(channel, noise=NoiseRecord(noise, 200.0), offset_deviation=2.0 * noise)
-        for channel, noise in zip(plan.channels, noises.tolist(), strict=True)
+    force = motion * scales.tip_stiffness
+    plan = ExamplePlan(
+        tuple(channels.values()),
+        force=force,
+        release=motion,
+        duration=20.0 * period,
+        interval=period / 50.0,
+        load_place=load_place,
     )
-    return replace(plan, channels=tuple(sized))
+    # noise from the readings under the largest force
+    trial = _static_trial("", plan, np.array([force]), start=0.0)
+    conditions = prior_mean(campaign, model, trial)
+    readings = np.abs(observe(model, campaign, trial, ModelPatch(), conditions).values[0])
+    noises = 1e-3 * np.where(readings > 0.0, readings, readings.max() or 1.0)
+    noisy_channels = []
+    for channel, noise in zip(plan.channels, noises.tolist(), strict=True):
+        noisy_channels.append(
+            replace(channel, noise=NoiseRecord(noise, 200.0), offset_deviation=2.0 * noise)
+        )
+    return replace(plan, channels=tuple(noisy_channels))
+
+
+def _campaign_without_trials(
+    name: str, channels: Mapping[str, Channel], reference_temperature: float | None
+) -> Campaign:
+    """Return a campaign that has channels only."""
+    return Campaign(
+        name=name,
+        channels=channels,
+        trials=(),
+        reference_temperature=reference_temperature,
+        parameters={},
+        data_hash="",
+    )
 
 
 def example_campaign(
@@ -151,21 +213,22 @@ def example_campaign(
 ) -> Campaign:
     """Return a simulated campaign; equal seeds give equal campaigns to the last bit.
 
-    Static: six load levels up and the same down, in two runs. Ring-down: releases from 1, 0.7, 0.5 and 0.3 of
-    the largest displacement, the third held out, with 400 samples at rest for the noise record. Flight:
-    steady turns at each load factor. What a test has and nobody wants is drawn for each trial: sensors'
-    noise, their zeros and gains by their prior deviations, the release by its own.
+    Static: six load levels up and the same down, in two runs. Ring-down: releases from 1, 0.7, 0.5
+    and 0.3 of the largest displacement, the third held out, with 400 samples at rest for the noise
+    record. Flight: steady turns at each load factor. The errors of a real test are drawn: gains for
+    the whole campaign, and for each trial noise, zeros and the error of the release, by their prior
+    deviations.
 
     Parameters
     ----------
     model : Model
-        What is simulated, at its prior mean.
+        The model that is simulated, at its prior mean.
     kind : str
         "static", "ringdown", "flight", "laboratory" or "complete".
     seed : int
-        Of the `SeedSequence`.
+        Entropy of the `SeedSequence`.
     plan : ExamplePlan, optional
-        By default `wing_plan()`.
+        What is measured; `wing_plan()` by default.
     patch : ModelPatch, optional
         What the structure has and the model lacks; nothing by default.
 
@@ -174,33 +237,42 @@ def example_campaign(
     CampaignFileError
         If there is no such kind of example.
     ModelError, CatalogueError
-        As `discrepancy.system.sensing.observe`.
+        For the causes of `discrepancy.system.sensing.observe`.
     """
     if kind not in _KINDS:
         raise CampaignFileError(f"There is no example {kind!r}: the kinds are {', '.join(_KINDS)}.")
-    plan = wing_plan() if plan is None else plan
-    patch = ModelPatch() if patch is None else patch
+    if plan is None:
+        plan = wing_plan()
+    if patch is None:
+        patch = ModelPatch()
     generator = np.random.default_rng(np.random.SeedSequence(seed))
     kinds = _KINDS[kind]
-    measured = {name for item in kinds for name in plan.names(item)}
+    measured = {name for trial_kind in kinds for name in plan.names(trial_kind)}
     channels = {channel.name: channel for channel in plan.channels if channel.name in measured}
-    gains = {
-        name: 1.0 + _known(channel.gain_deviation) * generator.normal() for name, channel in channels.items()
-    }
-    recorded = dict(channels)
-    for name in plan.names(TrialKind.RINGDOWN) if TrialKind.RINGDOWN in kinds else ():
-        channel = channels[name]
-        if channel.noise is not None:
-            samples = channel.noise.standard_deviation * generator.normal(size=_AT_REST_SAMPLES)
-            noise = pre_trigger_record(samples, plan.interval, name, "the example")
-            recorded[name] = replace(channel, noise=noise)
-    bare = Campaign(f"Example: {kind}", channels, (), 20.0, {}, "")
-    trials = tuple(
-        _measure(model, bare, trial, patch, gains, generator)
-        for item in kinds
-        for trial in _trials(item, plan)
-    )
-    return replace(bare, channels=recorded, trials=trials)
+    gains = {}
+    for name, channel in channels.items():
+        gains[name] = 1.0 + _finite_or_zero(channel.gain_deviation) * generator.normal()
+    recorded_channels = dict(channels)
+    if TrialKind.RINGDOWN in kinds:
+        for name in plan.names(TrialKind.RINGDOWN):
+            recorded_channels[name] = _with_samples_at_rest(channels[name], plan, generator)
+    campaign = _campaign_without_trials(f"Example: {kind}", channels, reference_temperature=20.0)
+    trials = []
+    for trial_kind in kinds:
+        for trial in _planned_trials(trial_kind, plan):
+            trials.append(_measured(model, campaign, trial, patch, gains, generator))
+    return replace(campaign, channels=recorded_channels, trials=tuple(trials))
+
+
+def _with_samples_at_rest(
+    channel: Channel, plan: ExamplePlan, generator: np.random.Generator
+) -> Channel:
+    """Return a channel whose noise record holds drawn samples at rest; without noise as it is."""
+    if channel.noise is None:
+        return channel
+    samples = channel.noise.standard_deviation * generator.normal(size=_AT_REST_SAMPLES)
+    noise = pre_trigger_record(samples, plan.interval, channel.name, "the example")
+    return replace(channel, noise=noise)
 
 
 def write_example(
@@ -211,49 +283,86 @@ def write_example(
     plan: ExamplePlan | None = None,
     patch: ModelPatch | None = None,
 ) -> Campaign:
-    """Write `example_campaign` to a folder and return it as read from there; errors as there."""
-    return read_campaign(write_campaign(example_campaign(model, kind, seed, plan, patch), folder))
+    """Write an `example_campaign` to a folder, and return it as read from there.
+
+    Parameters and errors are those of `example_campaign`, and the folder.
+    """
+    campaign = example_campaign(model, kind, seed, plan, patch)
+    return read_campaign(write_campaign(campaign, folder))
 
 
-# ---------------------------------------------------------------- parts
+# ---------------------------------------------------------------- trials
 
 
-def _trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
+def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
+    """Return the trials of a kind without readings."""
     if kind is TrialKind.STATIC:
-        levels = plan.force * np.arange(6) / 5.0
+        levels = plan.force * np.arange(6, dtype=np.float64) / 5.0
         return [
-            _blank("loading", kind, plan, levels, start=0.0, run="A"),
-            _blank("unloading", kind, plan, levels[::-1], start=600.0, run="A"),
-            _blank("loading again", kind, plan, levels, start=3600.0, run="B", held_out=True),
+            _static_trial("loading", plan, levels, start=0.0, run="A"),
+            _static_trial("unloading", plan, levels[::-1], start=600.0, run="A"),
+            _static_trial("loading again", plan, levels, start=3600.0, run="B", held_out=True),
         ]
     if kind is TrialKind.FLIGHT:
         factors = np.array(plan.load_factors)
         return [
-            _blank("turns", kind, plan, factors, start=10000.0, run="flight"),
-            _blank("turns again", kind, plan, factors[1:], start=11000.0, run="flight", held_out=True),
+            _flight("turns", plan, factors, start=10000.0),
+            _flight("turns again", plan, factors[1:], start=11000.0, held_out=True),
         ]
-    time = plan.interval * np.arange(round(plan.duration / plan.interval) + 1)
-    return [
-        _blank(
-            f"release {number}", kind, plan, time, start=5000.0 + 300.0 * number, run="A",
-            release=Release(share * plan.release, 0.02, mode_count=3), held_out=number == 3,
+    samples = np.arange(round(plan.duration / plan.interval) + 1, dtype=np.float64)
+    time = plan.interval * samples
+    releases = []
+    for number, fraction in enumerate((1.0, 0.7, 0.5, 0.3), start=1):
+        releases.append(
+            Trial.plain(
+                f"release {number}",
+                kind,
+                plan.names(kind),
+                time,
+                load_place=plan.load_place,
+                start=5000.0 + 300.0 * number,
+                run="A",
+                release=Release(fraction * plan.release, deviation=0.02, mode_count=3),
+                held_out=number == 3,
+            )
         )
-        for number, share in enumerate((1.0, 0.7, 0.5, 0.3), start=1)
-    ]  # fmt: skip
+    return releases
 
 
-def _blank(
-    name: str, kind: TrialKind, plan: ExamplePlan, rows: np.ndarray, start: float, **given: Any
+def _static_trial(
+    name: str, plan: ExamplePlan, forces: FloatArray, start: float, **fields: Any
 ) -> Trial:
-    """Return a trial without readings; `rows` are forces, load factors or times."""
-    time = rows if kind is TrialKind.RINGDOWN else np.full(len(rows), start)
-    what = {TrialKind.STATIC: {"force": rows}, TrialKind.FLIGHT: {"load_factor": rows}}.get(kind, {})
+    """Return a static trial without readings, with a row for each force [N]."""
     return Trial.plain(
-        name, kind, plan.names(kind), time, load_place=plan.load_place, start=start, **what, **given
+        name,
+        TrialKind.STATIC,
+        plan.names(TrialKind.STATIC),
+        np.full(len(forces), start),
+        force=forces,
+        load_place=plan.load_place,
+        start=start,
+        **fields,
     )
 
 
-def _measure(
+def _flight(
+    name: str, plan: ExamplePlan, load_factors: FloatArray, start: float, **fields: Any
+) -> Trial:
+    """Return a flight without readings, with a row for each load factor [1]."""
+    return Trial.plain(
+        name,
+        TrialKind.FLIGHT,
+        plan.names(TrialKind.FLIGHT),
+        np.full(len(load_factors), start),
+        load_factor=load_factors,
+        load_place=plan.load_place,
+        start=start,
+        run="flight",
+        **fields,
+    )
+
+
+def _measured(
     model: Model,
     campaign: Campaign,
     trial: Trial,
@@ -261,19 +370,40 @@ def _measure(
     gains: Mapping[str, float],
     generator: np.random.Generator,
 ) -> Trial:
+    """Return a trial with simulated readings.
+
+    Parameters
+    ----------
+    model, patch
+        The model, and what the structure has besides.
+    campaign : Campaign
+        The campaign with its channels.
+    trial : Trial
+        The trial without readings.
+    gains : mapping of str to float
+        Gain of each channel.
+    generator : Generator
+        Source of the errors of release and zeros, and of noise.
+    """
     conditions = prior_mean(campaign, model, trial)
     if trial.release is not None:
-        initial = conditions.initial.copy()
-        initial[0, 0] = trial.release.deviation * generator.normal()
-        conditions = Conditions(conditions.parameters, initial, (0.0, 0.0), trial.health)
+        initial_modes = conditions.initial.copy()
+        initial_modes[0, 0] = trial.release.deviation * generator.normal()
+        conditions = Conditions(conditions.parameters, initial_modes, (0.0, 0.0), trial.health)
     values = observe(model, campaign, trial, patch, conditions).values.copy()
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
+        zero = _finite_or_zero(channel.offset_deviation) * generator.normal()
+        noise = trial.noise_deviation(channel) * generator.normal(size=len(values))
         values[:, column] = values[:, column] * gains[name]
-        values[:, column] += _known(channel.offset_deviation) * generator.normal()
-        values[:, column] += channel.noise_in(trial) * generator.normal(size=len(values))
+        values[:, column] += zero
+        values[:, column] += noise
     return replace(trial, values=values)
 
 
-def _known(deviation: float) -> float:
+def _finite_or_zero(deviation: float) -> float:
+    """Return a standard deviation.
+
+    0 for an infinite one, of a quantity that is not known at all.
+    """
     return deviation if np.isfinite(deviation) else 0.0

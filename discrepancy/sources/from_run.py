@@ -1,6 +1,6 @@
-"""The run folder of a mission as a campaign: every step is a row of a flight, its health uncertain.
+"""The run folder of a mission as a campaign: every step is a row of a flight.
 
-`docs/run_folder.md` describes the folder; it is read by its files alone.
+`docs/run_folder.md` describes the folder; only its files are read.
 """
 
 from itertools import product
@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from calibration.errors import CalibrationError
 from calibration.result.file import load_calibration
 from discrepancy.campaign import records
-from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError, said
+from discrepancy.campaign.records import BoolArray
+from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError
 from discrepancy.system.structures import WingModel
 from fmu_asset.client.binding import load_binding
 from fmu_asset.errors import FmuError
@@ -27,20 +27,30 @@ from reporting.json_file import read_json
 from reporting.netcdf import read_groups
 from reporting.words import counted
 
-RUN_FILE, CONFIG_FILE = "run.nc", "config.json"
-DESIGN_FILE, CALIBRATION_FILE = "asset/design.toml", "asset/calibration.nc"
-BINDING_FILE, MODEL_PATCH_FILE = "asset/binding.toml", "asset/model_patch.json"
-PATCH_NAME, PATCH_STEP = "model_patch", "model_patch_from_step"
-"""Attributes of `run.nc` where a watch adopted a patch on the way: its file, and the first step with it."""
+RUN_FILE = "run.nc"
+CONFIG_FILE = "config.json"
+DESIGN_FILE = "asset/design.toml"
+CALIBRATION_FILE = "asset/calibration.nc"
+BINDING_FILE = "asset/binding.toml"
+MODEL_PATCH_FILE = "asset/model_patch.json"
+PATCH_NAME = "model_patch"
+"""Attribute of `run.nc` with the file of a patch that a watch adopted during the mission."""
+PATCH_STEP = "model_patch_from_step"
+"""Attribute of `run.nc` with the first step with that patch."""
 STRAIN = "strain"
 TEMPERATURE = ("temperature_difference", "temperature")
-"""Names under which a run may record the temperature: less the reference [K], or itself [degC]."""
+"""Names of the temperature in a run: less the reference [K], or itself [degC]."""
 REFERENCE_TEMPERATURE = 20.0
+"""Reference temperature of the wing [degC]."""
 HEALTH_DEVIATION = 0.25
-"""Least prior deviation of a stiffness loss in a step, about its smoothed belief. The belief was led astray
-by what is looked for, and is much surer than it is right; 24 gauges tell the health of a step anyway."""
-BLOCK, HELD_OUT_SHARE = 4, 0.2
-"""Steps of a block that is held out; share of the steps that is, in whole blocks spread over the flight."""
+"""Least prior standard deviation of a stiffness loss in a step, about its smoothed belief.
+
+The belief was misled by the very effect that is searched, and is too certain; 24 gauges determine
+the health of a step anyway."""
+BLOCK = 4
+"""Steps of a block that is held out."""
+HELD_OUT_SHARE = 0.2
+"""Fraction of the steps that is held out, in whole blocks spread over the flight."""
 
 
 def run_campaign(
@@ -51,170 +61,299 @@ def run_campaign(
 ) -> records.Campaign:
     """Return the flight of a run folder as a campaign.
 
+    Health is uncertain in every step. Nothing of the truth is read but the noise of the gauges in
+    the scenario, and a temperature that the asset monitors.
+
     Parameters
     ----------
     folder : path
-        As `uav-twin run --out` leaves it.
+        Folder that `uav-twin run --out` leaves.
     first_step, last_step : int, optional
         Steps that are read; by default from the first of the flight to its last.
     held_out_share : float
-        Share of the steps that is held out.
+        Fraction of the steps that is held out.
 
     Returns
     -------
     Campaign
-        Strain channels g1, g2, ...; flight trials whose rows are steps, some of them held out. The time of a
-        step is that at its end, as the FMU has it. Health is uncertain in every step. Of the
-        truth, only a temperature that the asset monitors and the scenario's noise of the gauges are read.
+        Strain channels g1, g2, ...; flight trials whose rows are steps, some of them held out. The
+        time of a step is that at its end, as in the FMU.
 
     Raises
     ------
     CampaignFileError
-        If the folder is no run of a wing, or is not whole.
+        If the folder is not the run of a wing, or is not complete.
     CampaignDataError
         If nothing was observed, or a steady force acted beside the load factor.
     """
     folder = Path(folder)
     restore_folder(folder)
     try:
-        return _campaign(folder, (first_step, last_step), held_out_share, _config(folder)["scenario"])
+        scenario = _config(folder)["scenario"]
+        _check_scenario(folder, scenario)
+        run = _run(folder)
+        steps = _steps_with_last_patch(run, first_step, last_step)
+        return _campaign(folder, run, scenario, steps, held_out_share)
     except DiscrepancyError:
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as cause:
         reason = str(cause.args[0] if cause.args else cause).rstrip(".")
-        raise CampaignFileError(said("runs.layout", file=folder / RUN_FILE, reason=reason)) from cause
+        raise CampaignFileError(
+            f"{folder / RUN_FILE} or the config.json beside it does not have the layout of a run "
+            f"of this version ({reason}): fly the run again."
+        ) from cause
+
+
+def _check_scenario(folder: Path, scenario: dict[str, Any]) -> None:
+    """Refuse the run of another asset than the wing, or one with a steady force at the tip."""
+    states = {state["name"] for state in scenario["state"]}
+    is_of_wing = scenario["observation"].get("role") == STRAIN
+    if not is_of_wing or states != {*records.USUAL_REGIONS}:
+        raise CampaignFileError(
+            f"{folder} is the run of another asset than the wing: strains under the damage states "
+            "z1 and z2 are needed."
+        )
+    force = (scenario["asset"].get("load") or {}).get("tip_force", 0.0)
+    if force:
+        raise CampaignDataError(
+            f"A force of {force:g} N at the tip acts in all steps of {folder}; only flights "
+            "without it can be read."
+        )
+
+
+def _steps_with_last_patch(
+    run: xr.DataTree, first_step: int | None, last_step: int | None
+) -> slice:
+    """Return the steps that are asked for, without those before the twin's last patch.
+
+    What the twin believed in these it believed with another model.
+    """
+    firsts = [step for step in (run.attrs.get(PATCH_STEP), first_step) if step is not None]
+    return slice(max(firsts, default=None), last_step)
 
 
 def _campaign(
-    folder: Path, steps: tuple[int | None, int | None], held_out_share: float, scenario: dict[str, Any]
+    folder: Path,
+    run: xr.DataTree,
+    scenario: dict[str, Any],
+    steps: slice,
+    held_out_share: float,
 ) -> records.Campaign:
-    states = {item["name"] for item in scenario["state"]}
-    if scenario["observation"].get("role") != STRAIN or states != {*records.USUAL_REGIONS}:
-        raise CampaignFileError(said("runs.no_wing", folder=folder))
-    if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
-        raise CampaignDataError(said("runs.force", force=force, folder=folder))
-    run = _run(folder)
-    # Steps before a patch that was adopted on the way were believed with another model.
-    adopted = run.attrs.get(PATCH_STEP)
-    since = slice(max((step for step in (adopted, steps[0]) if step is not None), default=None), steps[1])
-    observed, smoothed = (run[name].to_dataset().sel(step=since) for name in ("observed", "smoothed"))
-    if not observed.sizes["step"]:
-        ends = zip(("from {} on", "up to {}"), steps, strict=True)
-        wanted = ", ".join(text.format(step) for text, step in ends if step is not None)
-        steps = np.asarray(run["observed"]["step"].values).tolist()
-        has = f"{steps[0]} to {steps[-1]}" if steps else "none"
-        raise CampaignDataError(f"{folder.name} has the steps {has}, and none {wanted}.")
+    """Return some steps of a run as a campaign.
+
+    Parameters
+    ----------
+    folder : path
+        The run folder.
+    run : DataTree
+        Content of `run.nc`.
+    scenario : dict
+        Content of the scenario.
+    steps : slice
+        Labels of the steps.
+    held_out_share : float
+        Fraction of the steps that is held out.
+    """
+    observed = run["observed"].to_dataset().sel(step=steps)
+    count = observed.sizes["step"]
+    if not count:
+        raise CampaignDataError(_no_steps(folder, run, steps))
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():
-        raise CampaignDataError(f"No strain reached the twin in {folder}: there is nothing to compare.")
-    size = len(strain)
-    names = tuple(f"g{number}" for number in observed["sensor"].values.tolist())
-    temperature, known = _temperature(run, since, size)
-    noise, source = _noise(scenario)
-    channels = {
-        name: records.Channel(
-            name, records.Quantity.STRAIN, f"strain[{name[1:]}]", records.NoiseRecord(noise, inf)
+        raise CampaignDataError(
+            f"No strain reached the twin in {folder}: there is nothing to compare."
         )
-        for name in names
-    }
-    whole = records.Trial.plain(
-        "steps", records.TrialKind.FLIGHT, names, _ends(folder, observed["step"].values),
-        values=np.where(used, strain, 0.0), used=used, temperature=temperature,
+    noise, source_of_noise = _noise(scenario)
+    channels = {}
+    for number in observed["sensor"].values.tolist():
+        channels[f"g{number}"] = records.Channel(
+            name=f"g{number}",
+            quantity=records.Quantity.STRAIN,
+            output=f"strain[{number}]",
+            noise=records.NoiseRecord(noise, inf),
+        )
+    temperature = _temperature(run, steps)
+    belief = run["smoothed"].to_dataset().sel(step=steps)
+    flight = records.Trial.plain(
+        "steps",
+        records.TrialKind.FLIGHT,
+        tuple(channels),
+        _end_times(folder, observed["step"].values),
+        values=np.where(used, strain, 0.0),
+        used=used,
+        temperature=np.zeros(count) if temperature is None else temperature,
         load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
-        run=str(run.attrs.get("scenario", "run")), health=np.asarray(smoothed["mean"].values, dtype=float),
-        health_deviation=np.maximum(smoothed["standard_deviation"].values, HEALTH_DEVIATION),
-    )  # fmt: skip
-    held = held_out_steps(size, BLOCK, held_out_share)
-    trials = [whole.rows(~held)]
-    if held.any():
-        trials.append(whole.rows(held, name="steps held out", held_out=True))
-    lost = int(used.size - used.sum())
-    be = "was" if lost == 1 else "were"
+        run=str(run.attrs.get("scenario", "run")),
+        health=np.asarray(belief["mean"].values, dtype=float),
+        health_deviation=np.maximum(belief["standard_deviation"].values, HEALTH_DEVIATION),
+    )
+    is_held_out = held_out_steps(count, BLOCK, held_out_share)
+    trials = [flight.rows(~is_held_out)]
+    if is_held_out.any():
+        trials.append(flight.rows(is_held_out, name="steps held out", held_out=True))
+    remarks = _remarks(used, noise, source_of_noise)
     return records.Campaign(
         name=str(run.attrs.get("title", folder.name)),
         channels=channels,
         trials=tuple(trials),
-        reference_temperature=REFERENCE_TEMPERATURE if known else None,
-        parameters=_calibrated(run),
+        reference_temperature=None if temperature is None else REFERENCE_TEMPERATURE,
+        parameters=_calibrated_parameter(run),
         data_hash=hash_file(folder / RUN_FILE),
-        remarks=(
-            f"Flight of {counted(size, 'step')} read from a run folder; health in each step: "
-            f"belief with a deviation of {HEALTH_DEVIATION:g} or more.",
-            f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
-            *([f"{lost} of {used.size} readings {be} lost."] if lost else []),
-        ),
+        remarks=remarks,
     )
 
 
-def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
-    """Return the model that the twin of a run believed, and the files of its wing and of its patch, if any.
+def _remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
+    """Return the remarks on a flight.
 
-    The wing is that of a calibration or a design. The whole patch of the twin's model is in it, sensors too:
-    they act in `discrepancy.system.sensing.observe`.
+    Parameters
+    ----------
+    used : (N, C) ndarray of bool
+        False for readings of N steps that were lost.
+    noise : float
+        Standard deviation of a gauge's noise [1].
+    source_of_noise : str
+        Where it is stated, as a phrase.
+    """
+    remarks = [
+        f"Flight of {counted(len(used), 'step')} read from a run folder; health in each step: "
+        f"belief with a deviation of {HEALTH_DEVIATION:g} or more.",
+        f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source_of_noise}.",
+    ]
+    lost = int(used.size - used.sum())
+    if lost:
+        was = "was" if lost == 1 else "were"
+        remarks.append(f"{lost} of {used.size} readings {was} lost.")
+    return tuple(remarks)
+
+
+def _no_steps(folder: Path, run: xr.DataTree, steps: slice) -> str:
+    """Return the message that a run has none of the steps that are asked for."""
+    flown_steps = np.asarray(run["observed"]["step"].values).tolist()
+    flown = f"{flown_steps[0]} to {flown_steps[-1]}" if flown_steps else "none"
+    ends = []
+    if steps.start is not None:
+        ends.append(f"from {steps.start} on")
+    if steps.stop is not None:
+        ends.append(f"up to {steps.stop}")
+    return f"{folder.name} has the steps {flown}, and none {', '.join(ends)}."
+
+
+def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
+    """Return the model in which the twin of a run believed.
+
+    The whole patch of the twin's model is in it. Its sensors, too: they act in
+    `discrepancy.system.sensing.observe`.
+
+    Parameters
+    ----------
+    folder : path
+        The run folder.
+
+    Returns
+    -------
+    model : WingModel
+        The patched model.
+    wing_file : Path
+        File of its calibration or design.
+    patch_file : Path or None
+        File of its patch, if there is one.
 
     Raises
     ------
     CampaignFileError
-        If the twin believed no design.
+        If the twin believed in no design of a wing.
     ModelError
         If the wing cannot be modelled.
     """
     folder = Path(folder)
     _config(folder)
-    wing = folder / (CALIBRATION_FILE if _is_calibrated_wing(folder) else DESIGN_FILE)
-    if not wing.is_file():
-        raise CampaignFileError(said("runs.no_design", folder=folder, file=DESIGN_FILE))
-    model = WingModel.of_calibration(wing) if wing.suffix == ".nc" else WingModel.of_design(wing)
+    wing_file = folder / (CALIBRATION_FILE if _is_calibrated_wing(folder) else DESIGN_FILE)
+    if not wing_file.is_file():
+        raise CampaignFileError(
+            f"{folder} holds no design (`{DESIGN_FILE}`): its twin believed no model of a wing "
+            "that could be patched."
+        )
+    if wing_file.suffix == ".nc":
+        model = WingModel.of_calibration(wing_file)
+    else:
+        model = WingModel.of_design(wing_file)
     run = _run(folder)
-    file = folder / str(run.attrs.get(PATCH_NAME, MODEL_PATCH_FILE))  # of the last one
-    patch = file if file.is_file() else None
-    if patch is not None:
-        with CampaignFileError.instead_of(FmuError, before="The patch of the twin's model cannot be read: "):
-            sensors = len(run["observed"]["sensor"])
-            effects = load_patch(patch).for_gauges(sensors).effects
-        for effect in effects:
-            model = model.patched(effect.patch)
-    return model, wing, patch
+    patch_file = folder / str(run.attrs.get(PATCH_NAME, MODEL_PATCH_FILE))
+    if not patch_file.is_file():
+        return model, wing_file, None
+    with CampaignFileError.instead_of(
+        FmuError, before="The patch of the twin's model cannot be read: "
+    ):
+        gauge_count = len(run["observed"]["sensor"])
+        effects = load_patch(patch_file).for_gauges(gauge_count).effects
+    for effect in effects:
+        model = model.patched(effect.patch)
+    return model, wing_file, patch_file
 
 
 def _is_calibrated_wing(folder: Path) -> bool:
-    """Return whether a run flew with the calibration of a wing; one of a model's parameters has no design."""
+    """Return whether a run flew with the calibration of a wing.
+
+    The calibration of a model's parameters has no design of a wing.
+    """
     file = folder / CALIBRATION_FILE
     if not file.is_file():
         return False
     try:
         return load_calibration(file).design is not None
-    except CalibrationError:  # said where it is used
+    except CalibrationError:  # its message is raised where the file is used
         return True
 
 
-def held_out_steps(count: int, block: int, share: float) -> NDArray[np.bool_]:
-    """Return which of `count` steps are held out (count,): whole blocks, evenly spread, never the first."""
-    blocks = count // block
-    wanted = min(round(share * count / block), blocks - 1)
-    chosen = np.linspace(1, blocks - 1, max(wanted, 0) + 1)[:-1].round()
-    return np.isin(np.arange(count) // block, chosen)
+def held_out_steps(count: int, block: int, share: float) -> BoolArray:
+    """Return which steps are held out: whole blocks, evenly spread, never the first.
+
+    Parameters
+    ----------
+    count : int
+        Number of steps.
+    block : int
+        Steps of a block.
+    share : float
+        Fraction of the steps that is held out.
+
+    Returns
+    -------
+    (count,) ndarray of bool
+    """
+    block_count = count // block
+    held_out_count = min(round(share * count / block), block_count - 1)
+    blocks = np.linspace(1, block_count - 1, max(held_out_count, 0) + 1)[:-1].round()
+    return np.isin(np.arange(count) // block, blocks)
 
 
-# ---------------------------------------------------------------- parts
+# ---------------------------------------------------------------- files of the run folder
 
 
 def _config(folder: Path) -> dict[str, Any]:
+    """Return the content of `config.json`, which has a scenario."""
     with CampaignFileError.instead_of(CampaignFileError, before=f"{folder} is no run folder. "):
         config = read_json(folder / CONFIG_FILE, CampaignFileError)
     if not isinstance(config, dict) or not isinstance(config.get("scenario"), dict):
-        raise CampaignFileError(f"{folder / CONFIG_FILE} is not that of a run: it has no `scenario`.")
+        raise CampaignFileError(
+            f"{folder / CONFIG_FILE} is not that of a run: it has no `scenario`."
+        )
     return config
 
 
 def _run(folder: Path) -> xr.DataTree:
+    """Return the groups of `run.nc`; refuse a file that lacks something of the run of a wing."""
     path = folder / RUN_FILE
     try:
         run = read_groups(path)
     except DamagedFileError as cause:
-        raise CampaignFileError(f"{cause}: it is not a whole run, resume the run or fly it again.") from cause
-    if missing := {"observed", "smoothed", "calibration"} - {*run.children}:
+        raise CampaignFileError(
+            f"{cause}: it is not a whole run, resume the run or fly it again."
+        ) from cause
+    missing = {"observed", "smoothed", "calibration"} - {*run.children}
+    if missing:
         groups = ", ".join(sorted(missing))
         raise CampaignFileError(f"{path} lacks the groups {groups}: it is no run of a twin.")
     for name in (STRAIN, "load_factor"):
@@ -223,34 +362,48 @@ def _run(folder: Path) -> xr.DataTree:
     return run
 
 
-def _ends(folder: Path, steps: records.FloatArray) -> records.FloatArray:
-    """Return when steps end [s]; each takes a second where the run has no binding of its own."""
+def _end_times(folder: Path, steps: records.FloatArray) -> records.FloatArray:
+    """Return the times at which steps (N,) end [s]; a step takes 1 s if the run has no binding."""
     path = folder / BINDING_FILE
-    with CampaignFileError.instead_of(FmuError, before="The binding of the run cannot be read: "):
-        bound = load_binding(path) if path.exists() else None
-    start, interval = (0.0, 1.0) if bound is None else (bound.binding.start_time, bound.interval)
+    start, interval = 0.0, 1.0
+    if path.exists():
+        with CampaignFileError.instead_of(
+            FmuError, before="The binding of the run cannot be read: "
+        ):
+            bound = load_binding(path)
+        start, interval = bound.binding.start_time, bound.interval
     return np.asarray(start + interval * (steps + 1.0))
 
 
-def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[records.FloatArray, bool]:
-    """Return temperatures less the reference [K], and whether they were recorded."""
+def _temperature(run: xr.DataTree, steps: slice) -> records.FloatArray | None:
+    """Return the temperatures of steps (N,) less the reference [K].
+
+    None if they were not recorded.
+    """
     for group, name in product(("observed", "truth"), TEMPERATURE):
         if group in run.children and name in run[group]:
-            values = np.asarray(run[group][name].sel(step=since).values, dtype=np.float64)
-            return values - (REFERENCE_TEMPERATURE if name == "temperature" else 0.0), True
-    return np.zeros(size), False
+            values = np.asarray(run[group][name].sel(step=steps).values, dtype=np.float64)
+            return values - REFERENCE_TEMPERATURE if name == "temperature" else values
+    return None
 
 
 def _noise(scenario: dict[str, Any]) -> tuple[float, str]:
-    """Return the deviation of a strain reading [1], and who says so."""
-    stated = ((scenario.get("truth") or {}).get("noise") or {}).get("standard_deviation")
-    if stated:
-        return float(stated), "as the scenario says of the gauges"
+    """Return the standard deviation of a strain reading [1], and its source as a phrase."""
+    truth = scenario.get("truth") or {}
+    deviation = (truth.get("noise") or {}).get("standard_deviation")
+    if deviation:
+        return float(deviation), "as the scenario says of the gauges"
     return float(scenario["observation"]["standard_deviation"]), "as the twin assumes"
 
 
-def _calibrated(run: xr.DataTree) -> dict[str, tuple[float, float]]:
+def _calibrated_parameter(run: xr.DataTree) -> dict[str, tuple[float, float]]:
+    """Return mean and standard deviation of the calibrated parameter by its name.
+
+    Empty without one.
+    """
     name = str(run.attrs.get("parameter", ""))
     draws = np.asarray(run["calibration"]["draw_value"].values, dtype=np.float64)
-    spread = float(draws.std(ddof=1)) if len(draws) > 1 else 0.0
-    return {name: (float(draws.mean()), spread)} if name and spread > 0.0 else {}
+    if not name or len(draws) < 2:
+        return {}
+    deviation = float(draws.std(ddof=1))
+    return {name: (float(draws.mean()), deviation)} if deviation > 0.0 else {}

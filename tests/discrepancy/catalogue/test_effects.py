@@ -19,7 +19,7 @@ from benchmarks.tank import tank_setting
 from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
 from discrepancy.catalogue.entry import LEAST_SHRINKAGE, Prior
 from discrepancy.catalogue.library import library
-from discrepancy.catalogue.needs import mains_lines
+from discrepancy.catalogue.places import mains_lines
 from discrepancy.errors import CatalogueError
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.system.lumped_model import LumpedModel

@@ -21,8 +21,9 @@ from discrepancy.judgement.next_experiment import (
     proposals,
 )
 from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
-from discrepancy.report.text import group_lines
-from discrepancy.self_calibration import Simulator, outcome_of, self_calibrate, wilson, write_self_calibration
+from discrepancy.report.decidability_text import group_lines
+from discrepancy.self_calibration import outcome_of, self_calibrate, wilson, write_self_calibration
+from discrepancy.simulation import Simulator
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from tests.discrepancy.rigs import FEW, ORIGIN, measured, model_of

@@ -19,7 +19,8 @@ from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import investigate, open_hypotheses, patch_draws, time_step_error, without_port
+from discrepancy.verdict_remarks import without_port
+from discrepancy.workflow import investigate, open_hypotheses, patch_draws, time_step_error
 from fe.runtime.patch import ModelPatch, PowerDamping, Window
 from tests.discrepancy.rigs import FEW, drag_found, measured, one_mass, setting_of
 from tests.refusals import Inputs

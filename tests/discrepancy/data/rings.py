@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from discrepancy.campaign.noise import pre_trigger_record
+from discrepancy.campaign.noise_records import pre_trigger_record
 from discrepancy.campaign.records import Channel, Quantity, Start, TrialKind
 from discrepancy.checks.fault import FaultKind
 from tests.discrepancy.rigs import asked, campaign, model_of

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from discrepancy import errors
-from discrepancy.campaign.noise import pre_trigger_record, repeat_record, repeated
+from discrepancy.campaign.noise_records import pre_trigger_record, repeat_record, repeated_readings
 from discrepancy.campaign.protocol import Event, Release
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Quantity, Start, TrialKind
@@ -356,13 +356,14 @@ def test_noise_from_repeats_is_the_pooled_deviation(tmp_path):
 def test_what_is_no_repeat():
     """A trial under something else, and a reading that is left out."""
     trial = asked(TrialKind.STATIC, np.zeros(3), channels=("w",), force=np.arange(3.0))
-    assert [group for group, *_ in repeated([trial, trial], "w")] == [[trial, trial]]
+    assert [group for group, *_ in repeated_readings([trial, trial], "w")] == [[trial, trial]]
     for what in ("force", "load_factor", "temperature", "health", "noise_factor"):
-        assert not [*repeated([trial, replace(trial, **{what: getattr(trial, what) + 1.0})], "w")], what
+        changed = replace(trial, **{what: getattr(trial, what) + 1.0})
+        assert not [*repeated_readings([trial, changed], "w")], what
     cracked = [
         replace(trial, regions=("z1", "z2", "web"), health=np.full((3, 3), loss)) for loss in (0.0, 0.1)
     ]
-    assert [group for group, *_ in repeated([trial, *cracked], "w")] == [[trial, cracked[0]]]
+    assert [group for group, *_ in repeated_readings([trial, *cracked], "w")] == [[trial, cracked[0]]]
     rows, used = np.random.default_rng(1).standard_normal((3, 6)), np.ones((3, 6), dtype=bool)
     used[1, 2] = False
     left_out = repeat_record(W, repeats(np.where(used, rows, 1e9), used))

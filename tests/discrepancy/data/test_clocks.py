@@ -5,7 +5,7 @@ from itertools import zip_longest
 import numpy as np
 import pytest
 
-from discrepancy.campaign.importing import Understanding
+from discrepancy.campaign.importing import LaboratoryImport
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.sheet import read_sheet
 from discrepancy.campaign.writing import write_campaign
@@ -32,7 +32,7 @@ def understood(sheet, kind="driven", **answers):
     roles = {head: ROLES[head] for head in sheet.heads if head in ROLES}
     given = {"kind": {"": kind}, "column": roles, "zero": {"": "exact"}, "gain": {"": "exact"}}
     given["column"] |= answers.pop("column", {})
-    return Understanding([sheet], given | answers)
+    return LaboratoryImport([sheet], given | answers)
 
 
 def two_clocks(
@@ -136,14 +136,14 @@ def test_samples_at_rest_of_one_rate_stand_beside_each_other(tmp_path):
     (tmp_path / "swing/lab.csv").rename(tmp_path / "swing/swing.csv")
     swing = read_sheet(tmp_path / "swing/swing.csv")
     given = {"kind": {"lab.csv": "noise", "swing.csv": "driven"}, "column": {"acc1": "a", "acc2": "b"}}
-    campaign = Understanding([rest, swing], given).campaign("lab")
+    campaign = LaboratoryImport([rest, swing], given).campaign("lab")
     noise = [campaign.channels[name].noise for name in ("acc1", "acc2")]
     assert [(len(item.samples), round(item.interval, 9)) for item in noise] == [(40, 0.01), (30, 0.01)]
     other = two_clocks(tmp_path)
     with pytest.raises(
         CampaignFileError, match=r"every 0\.01 s by 'time1' and 0\.025 s by 'time2', and a campaign"
     ):
-        Understanding([other, swing], given).campaign("lab")
+        LaboratoryImport([other, swing], given).campaign("lab")
 
 
 def test_what_cannot_be_put_on_one_clock_is_one_sentence(tmp_path):

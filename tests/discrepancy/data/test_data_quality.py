@@ -12,7 +12,8 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers
-from discrepancy.checks.quality import _freedom, check_data, clipped_run
+from discrepancy.checks.quality import check_data, clipped_run
+from discrepancy.checks.rest import _freedom
 from discrepancy.errors import ModelError
 from discrepancy.sources.examples import ExamplePlan, example_campaign, plan_for, write_example
 from discrepancy.system.lumped_model import LumpedModel

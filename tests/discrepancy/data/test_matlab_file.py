@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from discrepancy.campaign.importing import Understanding
+from discrepancy.campaign.importing import LaboratoryImport
 from discrepancy.campaign.sheet import read_sheet
 from discrepancy.errors import CampaignFileError
 
@@ -44,7 +44,7 @@ def test_a_file_becomes_a_campaign_and_what_is_no_number_is_left_out(tmp_path):
         "unit": {"data.time": "s", "data.w": "mm"},
         "column": {"data.w": "w"},
     }
-    campaign = Understanding([read_sheet(tmp_path / "lab.mat")], answers).campaign("lab")
+    campaign = LaboratoryImport([read_sheet(tmp_path / "lab.mat")], answers).campaign("lab")
     (trial,) = campaign.trials
     np.testing.assert_allclose(trial.time, TIME, rtol=1e-14)
     assert np.flatnonzero(~trial.used[:, 0]).tolist() == [3]
@@ -72,7 +72,7 @@ def test_vectors_of_several_lengths_have_clocks_of_their_own(tmp_path):
     assert sheet.heads == ("a.time", "a.value", "b.time", "b.value")
     units = {"a.time": "s", "b.time": "s", "a.value": "mm", "b.value": "mm"}
     answers = {"kind": {"": "driven"}, "unit": units, "column": {"a.value": "a", "b.value": "b"}}
-    (trial,) = Understanding([sheet], answers).campaign("lab").trials
+    (trial,) = LaboratoryImport([sheet], answers).campaign("lab").trials
     assert trial.used.sum(axis=0).tolist() == [12, 4]
     np.testing.assert_allclose(trial.values[::3, 1], 1e-3 * SWING[::3], rtol=1e-12)
 

@@ -5,9 +5,11 @@ import pytest
 from scipy.signal import lfilter
 
 from discrepancy.campaign.records import NoiseRecord, Quantity
-from discrepancy.checks.fault import FaultKind, slip_between
+from discrepancy.checks.fault import FaultKind
 from discrepancy.checks.model_check import check_against_model
-from discrepancy.checks.quality import check_data, moves
+from discrepancy.checks.quality import check_data
+from discrepancy.checks.rest import moves
+from discrepancy.checks.unit_slips import slip_between
 from tests.discrepancy.data.rings import MODEL, TIME, campaign_of, only
 from tests.refusals import Inputs
 

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from openpyxl import Workbook
 
-from discrepancy.campaign.importing import Understanding
+from discrepancy.campaign.importing import LaboratoryImport
 from discrepancy.campaign.records import Quantity
 from discrepancy.campaign.sheet import read_sheet
 from discrepancy.campaign.units import UNITS, conversion, conversion_of, quantities_of
@@ -75,7 +75,7 @@ def test_true_and_false_are_values(tmp_path):
 def test_an_output_of_a_driven_trial_may_be_called_force(tmp_path):
     sheet = sheet_of(tmp_path, b"t [s],force [N]\n" + b"".join(b"%d.5,%d\n" % (k, k) for k in range(9)))
     outputs = {"force": Quantity.FORCE}
-    campaign = Understanding([sheet], {"kind": {"": "driven"}}, outputs.get).campaign("cell")
+    campaign = LaboratoryImport([sheet], {"kind": {"": "driven"}}, outputs.get).campaign("cell")
     assert (campaign.channels["force"].output, campaign.trials[0].inputs) == ("force", ())
 
 
@@ -144,7 +144,9 @@ def test_a_temperature_in_kelvin_is_not_called_celsius(tmp_path):
     """And minutes of few digits are even."""
     rows = (b"%.3f;29%d\n" % (k / 12.0, k) for k in range(9))
     sheet = sheet_of(tmp_path, b"t [min];plate [K]\n" + b"".join(rows))
-    understood = Understanding([sheet], {"kind": {"": "driven"}, "column": {"t": "time", "plate": "plate"}})
+    understood = LaboratoryImport(
+        [sheet], {"kind": {"": "driven"}, "column": {"t": "time", "plate": "plate"}}
+    )
     campaign = understood.campaign("plate")
     assert campaign.channels["plate"].unit == "K"
     assert campaign.trials[0].values[0, 0] == 290.0
@@ -159,7 +161,7 @@ def refusal(path):
         columns = {first: "force", **{head: f"output {head}" for head in others}}
         units = {first: "N", **dict.fromkeys(others, "mm")}
         said = {"column": columns, "unit": units, "kind": {"": "static"}, "decimal": {"": ","}}
-        Understanding([sheet], said).campaign("fuzz")
+        LaboratoryImport([sheet], said).campaign("fuzz")
     except DiscrepancyError as error:
         return str(error)
     return ""

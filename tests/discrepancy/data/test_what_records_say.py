@@ -7,7 +7,7 @@ import pytest
 
 from discrepancy.campaign.records import Channel, Hold, NoiseRecord, Quantity, RecordedInput, Start, TrialKind
 from discrepancy.checks.fault import FaultKind
-from discrepancy.checks.model_check import check_against_model, prior_left, unobservable
+from discrepancy.checks.model_check import check_against_model, posterior_over_prior, unobservable
 from tests.discrepancy.rigs import asked, campaign, model_of
 from tests.refusals import Inputs
 
@@ -38,7 +38,7 @@ def fatal(campaign):
 def test_what_is_left_of_each_prior():
     """Beside least squares of x by the two parameters, by hand; a short push of a cart is no short record."""
     campaign = pushed()
-    left = prior_left(campaign, CART)
+    left = posterior_over_prior(campaign, CART)
     time = campaign.trials[0].time
 
     def x(mass, damping):

@@ -8,9 +8,11 @@ from scipy.stats import binom
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import FitError
-from discrepancy.location.dependence import backbones, modal_motion, predicted_frequencies
-from discrepancy.location.locate import kinds_of, locate, outlier_remarks, singular_patterns
+from discrepancy.location.backbones import backbones
+from discrepancy.location.dependence import modal_motion, predicted_frequencies
+from discrepancy.location.locate import locate, outlier_remarks
 from discrepancy.location.map import features, residual_map
+from discrepancy.location.patterns import kinds_of, singular_patterns
 from discrepancy.location.residuals import ResidualSet, quadratic_moments
 from tests.discrepancy.bench import SHAPES, Bench, with_noise
 

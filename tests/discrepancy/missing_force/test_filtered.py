@@ -17,7 +17,7 @@ from discrepancy.missing_force.switched_record import SwitchedRecord
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
 from discrepancy.missing_force.windows import _most_probable_place, residual_windows, sized_windows
-from discrepancy.report.residual_figures import time_line_figure
+from discrepancy.report.load_and_time_figures import time_line_figure
 from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 from discrepancy.workflow import investigate

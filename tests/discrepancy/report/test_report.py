@@ -20,19 +20,16 @@ from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import primitive_intervals, read_patch, read_verdict, read_verdict_file
 from discrepancy.judgement.conclusion import probability_text
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
+from discrepancy.report.decidability_text import group_lines, needs, neighbours, seen_of
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import parameter_rows, render_report, what_is_missing
 from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.text import (
     WORDS,
     formula,
-    group_lines,
     headline,
-    needs,
-    neighbours,
     number,
     remainders_sentence,
-    seen_of,
     share_text,
     si_sizes,
 )

@@ -14,7 +14,8 @@ from discrepancy.campaign.records import TrialKind
 from discrepancy.checks.model_check import check_against_model
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import load_model
-from discrepancy.sources.measured_rigs import READING_ERROR, SIGNAL, TIP, write_rig_campaign
+from discrepancy.sources.measured_rigs import write_rig_campaign
+from discrepancy.sources.real_wing import READING_ERROR, SIGNAL, TIP
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate

@@ -1,0 +1,123 @@
+"""A user's answers about a laboratory's files, and the questions that are still open."""
+
+from collections.abc import Collection, Mapping
+
+from discrepancy.errors import CampaignFileError
+from reporting.words import listing
+
+Answers = Mapping[str, Mapping[str, str]]
+"""Answers by option, and by the column or file that they are about."""
+
+OF_COLUMNS = ("column", "unit", "quantity", "scale", "zero", "gain", "hold")
+"""Options that are about columns."""
+OF_FILES = ("kind", "release", "load-place", "decimal", "interval", "begins", "held-out")
+"""Options that are about files or, under an empty name, all of them."""
+OF_ALL_COLUMNS = ("zero", "gain", "hold")
+"""Options about columns that may, under an empty name, be about all of them."""
+
+
+class Questionnaire:
+    """The answers of a user, with a list of the questions that were asked without an answer.
+
+    Parameters
+    ----------
+    answers : mapping
+        Answers by option and subject; the subject is a column, a file, or empty for all of them.
+
+    Attributes
+    ----------
+    questions : dict of (str, str) to list of str
+        Subjects of open questions, by option and what it expects.
+    assumptions : dict of (str, str) to dict of str to str
+        Default answers that were used, by subject, by option and what it expects.
+    """
+
+    def __init__(self, answers: Answers) -> None:
+        self.answers = answers
+        self.questions: dict[tuple[str, str], list[str]] = {}
+        self.assumptions: dict[tuple[str, str], dict[str, str]] = {}
+
+    def stated(self, option: str, subject: str) -> str | None:
+        """Return the answer about just this subject, without asking; None if there is none."""
+        return self.answers.get(option, {}).get(subject)
+
+    def ask(self, option: str, subject: str, expected: str, choices: Collection[str] = ()) -> str:
+        """Return an answer; without one, an empty text, and the question is noted as open.
+
+        Parameters
+        ----------
+        option : str
+            The option, without dashes.
+        subject : str
+            The column or file; empty for all.
+        expected : str
+            What the option expects, for the user.
+        choices : collection of str
+            The answers that are allowed; any if empty.
+
+        Raises
+        ------
+        CampaignFileError
+            If the answer is not one of the choices.
+        """
+        answers = self.answers.get(option, {})
+        answer = answers.get(subject, answers.get(""))
+        if answer is None:
+            subjects = self.questions.setdefault((option, expected), [])
+            if subject not in subjects:
+                subjects.append(subject)
+            return ""
+        if choices and answer not in choices:
+            raise CampaignFileError(
+                f"--{option} must be {listing(choices, 'or')}, and {answer!r} came."
+            )
+        return answer
+
+    def ask_or_assume(
+        self, default: str, option: str, subject: str, expected: str, choices: Collection[str] = ()
+    ) -> str:
+        """Return an answer; without one, the default, which is noted as an assumption.
+
+        Parameters and errors are those of `ask`.
+        """
+        answers = self.answers.get(option, {})
+        if subject not in answers and "" not in answers:
+            self.assumptions.setdefault((option, expected), {})[subject] = default
+            return default
+        return self.ask(option, subject, expected, choices)
+
+    def is_assumed(self, option: str, subject: str) -> bool:
+        """Return whether the default answer of an option was used for a subject."""
+        return any(
+            asked_option == option and subject in defaults
+            for (asked_option, _), defaults in self.assumptions.items()
+        )
+
+
+def check_subjects(answers: Answers, heads: Collection[str], files: Collection[str]) -> None:
+    """Refuse an answer about a column or a file that is not there.
+
+    Parameters
+    ----------
+    answers : mapping
+        Answers by option and subject.
+    heads : collection of str
+        Heads of all columns, in order.
+    files : collection of str
+        Names of all files, in order.
+
+    Raises
+    ------
+    CampaignFileError
+        If there is such an answer.
+    """
+    for option in (*OF_COLUMNS, *OF_FILES):
+        subjects = heads if option in OF_COLUMNS else files
+        allowed = {*subjects}
+        if option in OF_FILES or option in OF_ALL_COLUMNS:
+            allowed.add("")
+        for name in answers.get(option, {}).keys() - allowed:
+            expected = listing(map(repr, filter(None, subjects)), "or")
+            raise CampaignFileError(
+                f"--{option} must be NAME=... about {expected}, and {name!r} came."
+            )

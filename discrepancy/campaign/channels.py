@@ -1,0 +1,145 @@
+"""Channels and inputs of a campaign: what has a column in its tables, and the noise of it."""
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+from math import inf
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from discrepancy.campaign.protocol import IN_FILES, NOT_IN_FILES, Accepted, Deviation, InFiles
+from discrepancy.campaign.quantity import Quantity
+from reporting.toml_file import Name, NotNegative, Number, Positive
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+IntArray = NDArray[np.int64]
+
+
+class Hold(StrEnum):
+    """What an input does between its samples."""
+
+    ZERO_ORDER = "zero_order"  # each value is held until the next sample, as a converter does
+    LINEAR = "linear"  # straight lines
+    SMOOTH = "smooth"  # a cubic spline through all samples
+
+
+@dataclass(frozen=True)
+class NoiseRecord:
+    """What is known of the noise of a channel; the table `noise` of a channel in a file.
+
+    Attributes
+    ----------
+    standard_deviation : float
+        Standard deviation s0 of a reading [channel's unit].
+    degrees_of_freedom : float
+        Degrees of freedom n0 of s0; infinite if the standard deviation is taken as exact.
+    samples : (n,) ndarray or None
+        The recorded noise itself, mean removed, if there is one.
+    interval : float or None
+        Sampling interval of `samples` [s].
+    source : str
+        "pre-trigger", "repeats" or "stated".
+    file : str
+        Name of the file that holds `samples`; empty if there is none.
+    """
+
+    standard_deviation: Positive
+    degrees_of_freedom: Positive = inf
+    samples: Annotated[FloatArray | None, NOT_IN_FILES] = None
+    interval: Annotated[float | None, NOT_IN_FILES] = None
+    source: Literal["pre-trigger", "repeats", "stated"] = "stated"
+    file: Annotated[str, NOT_IN_FILES] = field(default="", compare=False)
+
+    __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
+
+
+@dataclass(frozen=True)
+class InTables:
+    """A channel or an input: anything that has a column in the tables of a campaign.
+
+    Attributes
+    ----------
+    name : str
+        Name, unique in the campaign; also that of its column unless `column` says otherwise.
+    quantity : Quantity
+        The physical quantity.
+    column : str
+        Name of its column in the files; empty if that is `name`.
+    unit : str
+        Unit of its column in the files; empty if the campaign was not read from files.
+    """
+
+    name: Name
+    quantity: Quantity
+    column: Name = field(default="", compare=False, kw_only=True)
+    unit: InFiles = field(default="", compare=False, kw_only=True)
+
+    __pydantic_config__ = ConfigDict(**IN_FILES, arbitrary_types_allowed=True)
+
+    @property
+    def table_column(self) -> str:
+        """Column of the tables."""
+        return self.column or self.name
+
+
+@dataclass(frozen=True)
+class RecordedInput(InTables):
+    """The time history of one input of a model in a trial.
+
+    Without its values `[[input]]` of a file.
+
+    Attributes
+    ----------
+    name : str
+        Name of the model's input.
+    values : (N,) ndarray
+        Values at the samples [SI].
+    hold : Hold or None
+        Course between the samples; None if the file does not state it, which means linear.
+    offset_deviation : float
+        Prior standard deviation of a constant error of the record in this trial [SI]; zero for
+        none.
+    reference : bool
+        True for a motion that a controller is to follow: it is not a motion of the structure, and
+        need not be smooth.
+    """
+
+    values: Annotated[FloatArray, NOT_IN_FILES, Field(default=np.empty(0), exclude=True)]
+    hold: Hold | None = None
+    offset_deviation: NotNegative = 0.0
+    reference: Annotated[bool, Field(strict=True)] = field(default=False, compare=False)
+
+
+@dataclass(frozen=True)
+class Channel(InTables):
+    """One measuring channel; in a file `[[channel]]`, with deviations in the unit of the file.
+
+    Attributes
+    ----------
+    output : str
+        Output of the model that it is compared with, such as "strain[17]" or "tip_displacement".
+    noise : NoiseRecord or None
+        Its noise; without it no absolute statement about a fit can be made.
+    gain_deviation : float
+        Prior standard deviation of the channel's relative gain error [1]; infinite for a signal of
+        unknown scale (one of them is then the scale of the release amplitudes).
+    offset_deviation : float
+        Prior standard deviation of its zero in each trial [channel's unit]; infinite: a free zero.
+    station : float or None
+        Position along the span [m], for maps.
+    chord : float or None
+        Position along the chord [fraction], for maps.
+    accept : tuple of str
+        Faults of its data that the user accepts, in all trials: words of `ACCEPTABLE`.
+    """
+
+    output: Name
+    noise: NoiseRecord | None = None
+    gain_deviation: Deviation = 0.0
+    offset_deviation: Deviation = 0.0
+    station: Number | None = None
+    chord: Number | None = None
+    accept: Accepted = ()

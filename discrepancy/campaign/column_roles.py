@@ -1,0 +1,188 @@
+"""What each column of a laboratory's table is: its role, unit and quantity."""
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from discrepancy.campaign.answers import Questionnaire
+from discrepancy.campaign.columns import (
+    INPUT,
+    LEFT_OUT,
+    NOISE,
+    LaboratoryColumn,
+    possible_quantities,
+    role_by_unit,
+    scaled_unit,
+)
+from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.campaign.schema import INPUT_COLUMNS
+from discrepancy.campaign.sheet import Sheet
+from discrepancy.campaign.units import (
+    LOGGER_NAMES,
+    NEVER_CONVERTED,
+    UNITS,
+    conversion,
+    conversion_of,
+)
+from discrepancy.errors import CampaignFileError
+from reporting.words import listing
+
+_UNITS_OF_INPUT_COLUMNS = dict(
+    zip(INPUT_COLUMNS, ("s", "N", "1", "degC", "1", "1", "1", "1"), strict=True)
+)
+_STRAIN = re.compile(r".*(strain|[εϵ]|m/m)")
+
+OutputQuantity = Callable[[str], Quantity | None]
+"""Returns the quantity of a model's output by its name; None for what is not an output."""
+
+
+class ColumnReader:
+    """Finds out what the columns of tables are, and asks the user where that is not clear.
+
+    Parameters
+    ----------
+    questionnaire : Questionnaire
+        The answers of the user; it notes the questions that stay open.
+    kinds : mapping of str to str
+        Kind of each file.
+    quantity_of : callable or None
+        Returns the quantity of a model's output. Without it any name can be that of an output.
+    """
+
+    def __init__(
+        self,
+        questionnaire: Questionnaire,
+        kinds: Mapping[str, str],
+        quantity_of: OutputQuantity | None,
+    ) -> None:
+        self.kinds = kinds
+        self._questionnaire = questionnaire
+        self._quantity_of = quantity_of
+
+    def column(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
+        """Return a column of a table by its head and the unit that the file states."""
+        cell_unit, reading_unit, factor = self._scaled_unit(head, unit)
+        column = self._column_of_readings(sheet, head, reading_unit)
+        to_si = None if column.to_si is None else factor * column.to_si
+        return replace(column, unit=cell_unit, read_in=reading_unit, to_si=to_si)
+
+    def _scaled_unit(self, head: str, unit: str) -> tuple[str, str, float]:
+        """Return the units of a column's cells and of its readings, and the factor between them."""
+        stated_unit = self._questionnaire.stated("unit", head)
+        unit = unit if stated_unit is None else stated_unit
+        scale = self._questionnaire.stated("scale", head)
+        if scale is None:
+            return unit, unit, 1.0
+        return scaled_unit(head, unit, scale)
+
+    def _column_of_readings(self, sheet: Sheet, head: str, unit: str) -> LaboratoryColumn:
+        """Return a column whose cells are readings in a unit; ask for its role and its unit."""
+        role = self._role(sheet, head, unit)
+        if not unit and role != LEFT_OUT:
+            self._questionnaire.ask("unit", head, "such as mm, kN or ms; 1 for a mere number")
+        if not unit or role == LEFT_OUT:
+            return LaboratoryColumn(sheet, head, role, unit)
+        try:
+            if role == "temperature" and unit == "K":
+                raise ValueError("a temperature must be in degC, and 'K' came")
+            is_driven = self.kinds[sheet.name] == TrialKind.DRIVEN
+            is_output = is_driven and self._output_quantity(role) is not None
+            if role == "force" and is_driven and not is_output:
+                raise ValueError(f"a driven trial has {INPUT}NAME in the place of force")
+            if role in _UNITS_OF_INPUT_COLUMNS and not (role == "force" and is_output):
+                return _column_of_table(sheet, head, role, unit)
+            return self._channel_or_input(sheet, head, role, unit)
+        except ValueError as cause:
+            raise CampaignFileError(
+                f"{sheet.name}, column {head!r}: {cause}; say another."
+            ) from None
+
+    def _channel_or_input(self, sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
+        """Return a column that is a channel or an input.
+
+        Without a quantity while that is not known.
+        """
+        quantity = self._quantity(head, role, unit)
+        if quantity is None:
+            return LaboratoryColumn(sheet, head, role, unit)
+        plain_name = LOGGER_NAMES.get(unit, unit)
+        return LaboratoryColumn(
+            sheet=sheet,
+            head=head,
+            role=role,
+            unit=unit,
+            si=plain_name if plain_name in NEVER_CONVERTED else UNITS[quantity].si,
+            quantity=quantity,
+            to_si=conversion_of(quantity, unit),
+        )
+
+    def _output_quantity(self, role: str) -> Quantity | None:
+        """Return the quantity of a model's output; None for what is not one, or without a model."""
+        return None if self._quantity_of is None else self._quantity_of(role)
+
+    def _role(self, sheet: Sheet, head: str, unit: str) -> str:
+        """Return the role of a column: as answered, by its name, or as the only time or force."""
+        answer = self._questionnaire.stated("column", head)
+        if answer is not None:
+            return answer
+        reads_force = self.kinds[sheet.name] in (
+            TrialKind.STATIC,
+            TrialKind.FORCED,
+            TrialKind.RINGDOWN,
+            NOISE,
+        )
+        name = head.casefold()
+        if name in _UNITS_OF_INPUT_COLUMNS and (reads_force or name != "force"):
+            return name
+        units = []
+        for other_head, other_unit in zip(sheet.heads, sheet.units, strict=True):
+            _, reading_unit, _ = self._scaled_unit(other_head, other_unit)
+            units.append(reading_unit)
+        decided_by_unit = ("time", "force") if reads_force else ("time",)
+        role = role_by_unit(head, sheet.heads, units, decided_by_unit)
+        if role:
+            return role
+        if self._output_quantity(head) is not None:
+            return head
+        other_roles = f"{', '.join(INPUT_COLUMNS[:4])}, {INPUT}NAME, or {LEFT_OUT} to leave it out"
+        expected = f"the model's output that it measures, {other_roles}"
+        return self._questionnaire.ask("column", head, expected)
+
+    def _quantity(self, head: str, role: str, unit: str) -> Quantity | None:
+        """Return the quantity of a channel or an input, None while that is not known."""
+        answer = self._questionnaire.stated("quantity", head)
+        possible = possible_quantities(unit, answer)
+        if self._quantity_of is not None and role and INPUT not in role:
+            modelled = self._quantity_of(role)
+            if modelled is None:
+                raise ValueError(f"the model has no output {role!r}")
+            if modelled in possible:
+                possible = (modelled,)
+        # a length is a displacement before it is a level, and a unit of strain is not a plain
+        # number
+        is_usual = possible[0] is Quantity.DISPLACEMENT or _STRAIN.fullmatch(unit)
+        if len(possible) == 1 or is_usual:
+            return possible[0]
+        expected = f"{listing(possible, 'or')}: {unit} is a unit of each"
+        self._questionnaire.ask("quantity", head, expected)
+        return None
+
+
+def _column_of_table(sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
+    """Return a column that every table may have, such as a time, a force or a temperature.
+
+    Raises
+    ------
+    ValueError
+        If the unit is not one of its quantity.
+    """
+    si = _UNITS_OF_INPUT_COLUMNS[role]
+    if role == "force":
+        to_si = conversion_of(Quantity.FORCE, unit)
+    elif role == "temperature":
+        to_si = conversion_of(Quantity.TEMPERATURE, unit)
+    elif role == "load_factor" and unit == "g":
+        to_si = 1.0
+    else:
+        to_si = conversion(unit, si)
+    return LaboratoryColumn(sheet, head, role, unit, si, to_si=to_si)

@@ -1,0 +1,176 @@
+"""Noise records of channels, from samples at rest or from repeated trials."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from discrepancy.campaign.records import BoolArray, Channel, FloatArray, NoiseRecord, Trial
+from discrepancy.errors import CampaignDataError
+from reporting.words import counted
+
+SAME_INPUT = 1e-6
+"""Relative difference, to the largest value in the trial, up to which two inputs are the same."""
+_LEAST_DEGREES = 3
+"""Fewest degrees of freedom of a noise record."""
+_LABELS = "kind", "run", "load_place", "noise_factor"
+"""Fields of trials that must agree for them to be repeats of each other."""
+
+
+def pre_trigger_record(
+    samples: FloatArray, interval: float | None, name: str, source: str
+) -> NoiseRecord:
+    """Return the noise record of samples at rest, with n - 1 degrees of freedom.
+
+    Parameters
+    ----------
+    samples : (n,) ndarray
+        Readings while nothing moves [channel's unit].
+    interval : float or None
+        Sampling interval [s]; None if the samples are not evenly spaced, so that their correlation
+        in time is not known.
+    name, source : str
+        Name of the channel, and of the file, for messages.
+
+    Raises
+    ------
+    CampaignDataError
+        If there are fewer than four samples, or all are equal.
+    """
+    least = _LEAST_DEGREES + 1
+    if len(samples) < least:
+        raise CampaignDataError(
+            f"{source} holds {counted(len(samples), 'sample')} of the channel {name!r}: a noise "
+            f"record needs at least {least}; record more before the trigger or leave the column "
+            "out."
+        )
+    if np.ptp(samples) == 0.0:
+        raise CampaignDataError(
+            f"{source}: all samples of the channel {name!r} are {samples[0]!r}, which is no noise; "
+            "record it with the amplifier on, or state its standard deviation."
+        )
+    mean = float(np.mean(samples))
+    deviation = float(np.std(samples, ddof=1))
+    # samples whose mean is zero to rounding stay as they are, to be the same when written and read
+    # again
+    if abs(mean) > 1e-12 * deviation:
+        samples = samples - mean
+        deviation = float(np.std(samples, ddof=1))
+    return NoiseRecord(
+        standard_deviation=deviation,
+        degrees_of_freedom=float(len(samples) - 1),
+        samples=samples,
+        interval=interval,
+        source="pre-trigger",
+        file=source,
+    )
+
+
+def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | None:
+    """Return the noise of a channel pooled from repeated static or flight trials.
+
+    Trials repeat each other if kind, run, load place, noise factor, number of rows and every row's
+    force, load factor, inputs, temperature and health agree. Deviations are taken from the mean of
+    each row over the repeats. If the channel's zero is free in each trial (`offset_deviation` above
+    zero), the mean deviation of each trial is removed too. R repeats of N rows then have (R - 1) N,
+    or (R - 1) (N - 1), degrees of freedom; sums of squares and degrees of freedom add up over
+    groups of repeats.
+
+    Returns
+    -------
+    NoiseRecord or None
+        None without repeats, or with fewer than three degrees of freedom.
+    """
+    sum_of_squares = 0.0
+    degrees = 0
+    for repeats in repeated_readings(trials, channel.name):
+        used_rows = repeats.used.all(axis=0)
+        readings = repeats.values[:, used_rows] / repeats.trials[0].noise_factor
+        residual = readings - readings.mean(axis=0)
+        free_rows = readings.shape[1]
+        if channel.offset_deviation > 0.0:
+            residual = residual - residual.mean(axis=1, keepdims=True)
+            free_rows -= 1
+        sum_of_squares += float(np.sum(residual**2))
+        degrees += (len(repeats.trials) - 1) * max(free_rows, 0)
+    if degrees < _LEAST_DEGREES or sum_of_squares == 0.0:
+        return None
+    return NoiseRecord(
+        standard_deviation=float(np.sqrt(sum_of_squares / degrees)),
+        degrees_of_freedom=float(degrees),
+        source="repeats",
+    )
+
+
+class RepeatedReadings(NamedTuple):
+    """Readings of one channel in R > 1 trials of N rows that repeat each other.
+
+    Attributes
+    ----------
+    trials : list of Trial
+        The trials; they have one noise factor.
+    values : (R, N) ndarray
+        Readings [channel's unit].
+    used : (R, N) ndarray of bool
+        False for readings that are left out.
+    """
+
+    trials: list[Trial]
+    values: FloatArray
+    used: BoolArray
+
+
+def repeated_readings(trials: Sequence[Trial], channel: str) -> Iterator[RepeatedReadings]:
+    """Yield the readings of a channel in each group of trials that repeat each other."""
+    groups: list[list[Trial]] = []
+    for trial in trials:
+        if trial.is_dynamic or channel not in trial.channels:
+            continue
+        for group in groups:
+            if _is_repeat(group[0], trial):
+                group.append(trial)
+                break
+        else:
+            groups.append([trial])
+    for group in groups:
+        if len(group) == 1:
+            continue
+        values = []
+        used = []
+        for trial in group:
+            column = trial.channels.index(channel)
+            values.append(trial.values[:, column])
+            used.append(trial.used[:, column])
+        yield RepeatedReadings(group, np.array(values), np.array(used))
+
+
+def _is_repeat(first: Trial, second: Trial) -> bool:
+    """Return whether two trials repeat each other: same labels, loads, inputs and health."""
+    if any(getattr(first, label) != getattr(second, label) for label in _LABELS):
+        return False
+    if len(first.time) != len(second.time):
+        return False
+    first_histories = _acting_histories(first)
+    second_histories = _acting_histories(second)
+    if first_histories.keys() != second_histories.keys():
+        return False
+    for name, history in first_histories.items():
+        largest_difference = np.max(np.abs(history - second_histories[name]))
+        if not largest_difference <= SAME_INPUT * np.max(np.abs(history)):
+            return False
+    return True
+
+
+def _acting_histories(trial: Trial) -> dict[str, FloatArray]:
+    """Return all that acts on the structure in a trial: values (N,) of its rows by name."""
+    histories = {
+        "force": trial.force,
+        "load_factor": trial.load_factor,
+        "temperature": trial.temperature,
+    }
+    for recorded in trial.inputs:
+        histories[f"input {recorded.name}"] = recorded.values
+    for region, loss in zip(trial.regions, trial.health.T, strict=True):
+        if np.any(loss):
+            histories[f"loss of {region}"] = loss
+    return histories

@@ -1,0 +1,120 @@
+"""How well zeros and gains of channels are known, as a user states it or by default."""
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+
+from discrepancy.campaign.answers import Questionnaire
+from discrepancy.campaign.columns import (
+    EXACT,
+    FREE,
+    NOISE,
+    LaboratoryColumn,
+    gain_deviation,
+    zero_deviation,
+)
+from discrepancy.campaign.units import conversion_of
+from reporting.words import listing
+
+ASSUMED_ZERO = "1%"
+"""Standard deviation of a zero, of the largest reading, if nobody states it."""
+ASSUMED_GAIN = "2%"
+"""Standard deviation of a gain if nobody states it."""
+
+
+class SensorDeviations:
+    """Standard deviations of the zeros and gains of a laboratory's columns.
+
+    Parameters
+    ----------
+    questionnaire : Questionnaire
+        The answers of the user; it notes the defaults that are used.
+    columns : sequence of LaboratoryColumn
+        Columns of all tables.
+    kinds : mapping of str to str
+        Kind of each file.
+    decimals : mapping of str to str
+        Decimal mark of each file.
+
+    Attributes
+    ----------
+    zeros : dict of str to (float or str)
+        Standard deviation of the zero of each channel and input [SI], or "free", by head.
+    gains : dict of str to (float or str)
+        Relative standard deviation of the gain of each channel, or "free", by head.
+    """
+
+    def __init__(
+        self,
+        questionnaire: Questionnaire,
+        columns: Sequence[LaboratoryColumn],
+        kinds: Mapping[str, str],
+        decimals: Mapping[str, str],
+    ) -> None:
+        self.columns = columns
+        self.kinds = kinds
+        self.decimals = decimals
+        self._questionnaire = questionnaire
+        self.zeros = {column.head: self._zero(column) for column in self._columns_with_zero()}
+        self.gains = {
+            column.head: self._gain(column.head) for column in columns if column.is_channel
+        }
+
+    def _columns_with_zero(self) -> list[LaboratoryColumn]:
+        """Return the first column of each channel or input whose unit and quantity are known."""
+        first_columns: dict[str, LaboratoryColumn] = {}
+        for column in self.columns:
+            if column.quantity is not None:
+                first_columns.setdefault(column.head, column)
+        return [*first_columns.values()]
+
+    def _zero(self, column: LaboratoryColumn) -> float | str:
+        """Return the standard deviation of a channel's or input's zero [SI], or "free"."""
+        default = ASSUMED_ZERO if column.is_channel else EXACT
+        expected = (
+            "how well its zero is known in each trial: a standard deviation such as "
+            f"0.1{column.read_in} or 1% of the largest reading, {EXACT} or {FREE}"
+        )
+        answer = self._questionnaire.ask_or_assume(default, "zero", column.head, expected)
+        return zero_deviation(column, answer, self._largest_reading(column.head))
+
+    def _largest_reading(self, head: str) -> float:
+        """Return the largest absolute reading of a column in all trials [SI].
+
+        0 if not readable yet.
+        """
+        largest = 0.0
+        for column in self.columns:
+            if column.head != head or self.kinds[column.sheet.name] == NOISE:
+                continue
+            for cell in column.in_si(self.decimals[column.sheet.name]):
+                if cell and isfinite(float(cell)):
+                    largest = max(largest, abs(float(cell)))
+        return largest
+
+    def _gain(self, head: str) -> float | str:
+        """Return the relative standard deviation of a channel's gain, or "free"."""
+        expected = (
+            f"how well its gain is known: a standard deviation such as 2%, {EXACT}, or {FREE} for "
+            "a signal"
+        )
+        answer = self._questionnaire.ask_or_assume(ASSUMED_GAIN, "gain", head, expected)
+        return gain_deviation(head, answer)
+
+    @property
+    def assumed(self) -> str:
+        """The remark on zeros and gains that nobody stated; empty if all are stated."""
+        phrases = []
+        for column in self._columns_with_zero():
+            zero = self.zeros[column.head]
+            is_assumed = self._questionnaire.is_assumed("zero", column.head)
+            if column.is_channel and is_assumed and not isinstance(zero, str):
+                assert column.quantity is not None
+                deviation = zero / conversion_of(column.quantity, column.read_in)
+                phrases.append(f"the zero of {column.head!r} to {deviation:.2g} {column.read_in}")
+        gains = [repr(head) for head in self.gains if self._questionnaire.is_assumed("gain", head)]
+        if gains:
+            noun = "gain" if len(gains) == 1 else "gains"
+            phrases.append(f"the {noun} of {listing(gains)} to {ASSUMED_GAIN.replace('%', ' %')}")
+        if not phrases:
+            return ""
+        return f"Zeros and gains that nobody stated are assumed to be known: {listing(phrases)}."

@@ -1,0 +1,239 @@
+"""The table among the rows of a laboratory's file: its head, its units and its body."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from discrepancy.campaign.cells import CLOCK, is_value
+from discrepancy.campaign.heads import is_unit, named, plain_unit, times_among
+from discrepancy.errors import CampaignFileError
+from reporting.toml_file import short_repr
+from reporting.words import counted, listing
+
+SEPARATORS = {"\t": "tabs", ";": "semicolons", ",": "commas"}
+"""Characters that separate cells, and their names in messages."""
+Rows = list[tuple[int, list[str]]]
+"""Rows of a file that are not empty: the number of the line or row, and the cells."""
+
+
+def _is_single_column(rows: Rows) -> bool:
+    """Return whether rows of one cell each are a single column: titles, and numbers below them.
+
+    Cells that look like several cells with another separator between them are not a column.
+    """
+    if any(any(row[1:]) for _, row in rows):
+        return False
+    cells = [row[0] for _, row in rows]
+    rows_of_numbers = [index for index, cell in enumerate(cells) if is_value(cell)]
+    if not rows_of_numbers or rows_of_numbers[0] == 0:
+        return False
+    first = rows_of_numbers[0]
+    numbers = [cells[index] for index in rows_of_numbers]
+    has_blanks = any(" " in cell and not CLOCK.fullmatch(cell) for cell in numbers)
+    title = cells[first - 1]
+    is_separated = any(mark in title and mark in " ".join(numbers) for mark in SEPARATORS)
+    are_most = 2 * len(numbers) > len(cells) - first
+    return are_most and not has_blanks and not is_separated
+
+
+def _rows_of_longer_clocks(
+    rows: Rows,
+    first: int,
+    head: Sequence[str],
+    units: Sequence[str],
+    places_of_values: Sequence[set[int]],
+) -> list[int]:
+    """Return the rows right below a table in which only a longer one of its clocks goes on.
+
+    Parameters
+    ----------
+    rows : list of (int, list of str)
+        Rows below the table.
+    first : int
+        Index of the first of them.
+    head, units : sequence of str
+        Heads and units of the table.
+    places_of_values : sequence of set of int
+        Places of numbers and times in all rows, the table's own included.
+    """
+    names = []
+    units_of_names = []
+    for title, unit in zip(head, units, strict=False):  # a row of units may be shorter
+        name, own_unit = named(title, unit)
+        names.append(name)
+        units_of_names.append(own_unit)
+    times = times_among(names, units_of_names)
+    places_of_times = {place for place, name in enumerate(names) if name in times}
+    if len(places_of_times) < 2:
+        return []
+    further_rows: list[int] = []
+    for index, (_, row) in enumerate(rows, start=first):
+        filled = {place for place, cell in enumerate(row) if cell}
+        has_other_texts = bool(filled - places_of_values[index])
+        if not filled & places_of_times or has_other_texts:
+            break
+        further_rows.append(index)
+    return further_rows
+
+
+class TableLayout(NamedTuple):
+    """The table among the rows of a file.
+
+    Attributes
+    ----------
+    head : list of str
+        Heads (C,) of its columns.
+    units : list of str
+        Units (C,) from a row of units; empty where there is none.
+    body : list of (int, list of str)
+        Rows of numbers, with their line.
+    remark : str
+        Remark on the rows below it that are left out.
+    """
+
+    head: list[str]
+    units: list[str]
+    body: Rows
+    remark: str
+
+
+def find_table(rows: Rows, name: str, place: str) -> TableLayout:
+    """Return the table among the rows of a file: its head, perhaps a row of units, and its body.
+
+    The columns that have a number in at least half of the rows with numbers are the core of the
+    table. Its body goes from the first row to the last that has a number in the first core column
+    and no text in any.
+
+    Parameters
+    ----------
+    rows : list of (int, list of str)
+        Rows of the file that are not empty.
+    name : str
+        Name of the file, for messages.
+    place : str
+        Begin of the place of a row, for messages, before its number.
+
+    Raises
+    ------
+    CampaignFileError
+        If there is no table, its columns have no names, or there are numbers that do not fit into
+        it.
+    """
+    places_of_values = [
+        {index for index, cell in enumerate(row) if is_value(cell)} for _, row in rows
+    ]
+    core = _core_columns(rows, places_of_values)
+    has_text = [
+        any(index not in values and index < len(row) and row[index] for index in core)
+        for (_, row), values in zip(rows, places_of_values, strict=True)
+    ]
+    body = []
+    if core:
+        body = [
+            index
+            for index, values in enumerate(places_of_values)
+            if not has_text[index] and core[0] in values
+        ]
+    if not body or body[0] == 0:
+        raise CampaignFileError(
+            f"{name} holds no table: a row with the names of the columns is needed, and rows of "
+            "numbers under it, with commas, semicolons or tabs between cells."
+        )
+    first, last = body[0], body[-1]
+    body = [
+        index for index in range(first, last + 1) if not has_text[index] and places_of_values[index]
+    ]
+    head, units = _head_and_units(rows, first)
+    body += _rows_of_longer_clocks(rows[last + 1 :], last + 1, head, units, places_of_values)
+    last = body[-1]
+
+    width = 0
+    for index in body:
+        width = max(width, *(column + 1 for column, cell in enumerate(rows[index][1]) if cell))
+    _check_names(head, width, f"{place} {rows[first][0]}")
+    _check_other_rows(rows, body, core, places_of_values, head, place)
+    if width == 1:
+        _check_no_empty_lines(rows, body, place)
+    lines_below = [line for line, _ in rows[last + 1 :]]
+    remark = f"; what stands from {lines_below[0]} on is left out" if lines_below else ""
+    names = [cell.lstrip("# ") for cell in head[:width]]
+    padded_units = [*units, *[""] * width][:width]
+    return TableLayout(names, padded_units, [rows[index] for index in body], remark)
+
+
+def _core_columns(rows: Rows, places_of_values: Sequence[set[int]]) -> list[int]:
+    """Return the columns that have a number in at least half of the rows with several numbers.
+
+    If the file is a single column, rows with one number count.
+    """
+    rows_of_values = [values for values in places_of_values if len(values) > 1]
+    if not rows_of_values and _is_single_column(rows):
+        rows_of_values = [values for values in places_of_values if values]
+    counts = Counter(column for values in rows_of_values for column in values)
+    return sorted(column for column, count in counts.items() if 2 * count >= len(rows_of_values))
+
+
+def _head_and_units(rows: Rows, first: int) -> tuple[list[str], list[str]]:
+    """Return heads and units of the columns, from the rows above the first row of numbers."""
+    row_above = rows[first - 1][1]
+    second_above = rows[first - 2][1] if first > 1 else []
+    no_units = [""] * len(row_above)
+    if sum(map(bool, second_above)) < sum(map(bool, row_above)):
+        return row_above, no_units
+    if all(is_unit(cell) for cell in row_above if cell):
+        return second_above, [plain_unit(cell) for cell in row_above]
+    return row_above, no_units
+
+
+def _check_names(head: Sequence[str], width: int, place: str) -> None:
+    """Refuse a table of more columns than have a name, or with few named columns."""
+    named_columns = sum(map(bool, head))
+    if 2 * named_columns <= width or len(head) < width:
+        raise CampaignFileError(
+            f"{place}: {counted(width, 'cell')} came, and the row above names "
+            f"{counted(named_columns, 'column')}: a table needs a name over each, and between "
+            "commas a decimal comma makes two cells of a number."
+        )
+
+
+def _check_other_rows(
+    rows: Rows,
+    body: Sequence[int],
+    core: Sequence[int],
+    places_of_values: Sequence[set[int]],
+    head: Sequence[str],
+    place: str,
+) -> None:
+    """Refuse a row with texts between the rows of numbers, and numbers that go on below the table.
+
+    Comments and repeated heads are allowed. A footer has no number in the first core column.
+    """
+    first, last = body[0], body[-1]
+    not_in_body = {*range(first, last)} - {*body}
+    for index in range(last + 1, len(rows)):
+        values = places_of_values[index]
+        is_torn_off = core[0] in values and 2 * len(values & {*core}) >= len(core)
+        if is_torn_off:
+            not_in_body.add(index)
+    for index in sorted(not_in_body):
+        line, row = rows[index]
+        is_head = row in (head, rows[first - 1][1])
+        if is_head or row[0].startswith("#"):
+            continue
+        cells = short_repr(listing(filter(None, row)))
+        raise CampaignFileError(
+            f"{place} {line}: numbers must stand under {head[core[0]]!r} and the other names, and "
+            f"{cells} came; leave the cell of a reading empty that is to be left out, and remove "
+            "what is no row of the table."
+        )
+
+
+def _check_no_empty_lines(rows: Rows, body: Sequence[int], place: str) -> None:
+    """Refuse an empty line within a single column, where a reading may be missing."""
+    for index in body[1:]:
+        line, previous_line = rows[index][0], rows[index - 1][0]
+        if line != previous_line + 1:
+            raise CampaignFileError(
+                f"{place} {line - 1} is empty, and the only column has numbers above and below: "
+                "remove the line, or give the table a column of times."
+            )

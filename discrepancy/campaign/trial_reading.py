@@ -1,0 +1,366 @@
+"""A trial from its description in `campaign.toml` and its table."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf
+from typing import NamedTuple
+
+import numpy as np
+
+from discrepancy.campaign import schema
+from discrepancy.campaign.protocol import Release
+from discrepancy.campaign.records import (
+    USUAL_REGIONS,
+    BoolArray,
+    Channel,
+    FloatArray,
+    InTables,
+    IntArray,
+    Quantity,
+    RecordedInput,
+    Start,
+    Trial,
+    TrialKind,
+)
+from discrepancy.campaign.sampling import check_sampling
+from discrepancy.campaign.units import conversion, conversion_of
+from discrepancy.errors import CampaignDataError, CampaignFileError
+from reporting.table_file import TextTable
+from reporting.words import counted, is_or_are
+
+LATE = 1.5
+"""Intervals after a release from rest within which its first sample is."""
+_REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
+
+
+def read_trial(
+    section: schema.TrialSection,
+    table: TextTable,
+    campaign: schema.CampaignSection,
+    remarks: list[str],
+) -> Trial:
+    """Return a trial of a description and its table.
+
+    Parameters
+    ----------
+    section : TrialSection
+        What `campaign.toml` states of the trial.
+    table : TextTable
+        Its table.
+    campaign : CampaignSection
+        The whole content of `campaign.toml`.
+    remarks : list of str
+        Remarks of the reader; those on this trial are added.
+    """
+    user = f"the trial {section.name!r}"
+    time, start = _times(section, table, campaign, user)
+    channels = _channels_of_trial(section, table, campaign)
+    values = []
+    used = []
+    for channel in channels:
+        channel_values, channel_used = _readings(channel, section, table, remarks)
+        values.append(channel_values)
+        used.append(channel_used)
+    losses = _stiffness_losses(section, table, user)
+    inputs = _inputs(section, table, campaign, user)
+    load_factor = np.zeros(len(table))
+    if section.kind is TrialKind.FLIGHT:
+        load_factor = table.numbers("load_factor", user)
+    return Trial(
+        **section.keys_in_file,
+        channels=tuple(channel.name for channel in channels),
+        values=np.stack(values, axis=1),
+        used=np.stack(used, axis=1),
+        time=time,
+        force=_force(section, table, campaign, inputs),
+        load_factor=load_factor,
+        temperature=_temperature(section, table, campaign, user),
+        start=start,
+        health=losses.means,
+        regions=losses.regions,
+        health_deviation=losses.deviations,
+        begins=section.begins or Start.SETTLED,
+        begin_assumed=section.begins is None,
+        inputs=inputs,
+    )
+
+
+def _inputs(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
+) -> tuple[RecordedInput, ...]:
+    """Return the recorded inputs of a driven or static trial."""
+    if section.kind not in (TrialKind.DRIVEN, TrialKind.STATIC):
+        return ()
+    return tuple(
+        replace(recorded, values=numbers_in_si(table, recorded, user))
+        for recorded in campaign.input
+        if recorded.table_column in table.columns
+    )
+
+
+def _force(
+    section: schema.TrialSection,
+    table: TextTable,
+    campaign: schema.CampaignSection,
+    inputs: Sequence[RecordedInput],
+) -> FloatArray:
+    """Return the force of a trial (N,) [N], or the first force or torque among its inputs."""
+    # a static trial with other inputs needs no force
+    has_other_loads = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
+    if section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not has_other_loads:
+        to_newton = conversion(campaign.force_unit, schema.FORCE_UNIT)
+        return table.numbers("force", f"the trial {section.name!r}") * to_newton
+    for recorded in inputs:
+        if recorded.quantity in (Quantity.FORCE, Quantity.TORQUE):
+            return recorded.values
+    return np.zeros(len(table))
+
+
+def numbers_in_si(
+    table: TextTable, recorded: InTables, user: str, *, empty_allowed: bool = False
+) -> FloatArray:
+    """Return the column of a channel or an input (N,) in SI.
+
+    Empty cells are nan where they are allowed.
+    """
+    numbers = table.numbers(recorded.table_column, user, empty_allowed=empty_allowed)
+    return numbers * conversion_of(recorded.quantity, recorded.unit)
+
+
+def _times(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
+) -> tuple[FloatArray, float]:
+    """Return the times of a trial's rows (N,) [s], and its start since the campaign's start [s].
+
+    Raises
+    ------
+    CampaignFileError
+        If a row at rest comes twice.
+    CampaignDataError
+        If times run backwards, or a ring-down does not begin at its release.
+    """
+    if section.kind in (TrialKind.STATIC, TrialKind.FLIGHT):
+        return _times_of_rows_at_rest(section, table, campaign, user)
+    cells = table.cells("time", user)
+    time = check_sampling(table.numbers("time", user), cells, user, table.name)
+    if section.release is not None:
+        _check_release_time(section.release, time, table.name, user)
+    return time, section.start or 0.0
+
+
+def _check_release_time(release: Release, time: FloatArray, file: str, user: str) -> None:
+    """Refuse a ring-down whose times (N,) [s] do not begin at the release."""
+    if release.at_rest and time[0] > LATE * (time[1] - time[0]):
+        raise CampaignDataError(
+            f"{file}: the time of {user} begins at {time[0]:g} s, and the first sample of a "
+            "release from rest is at the release, at 0: count times from there, or set `at_rest = "
+            "false` where the record begins later."
+        )
+    if time[0] < 0.0:
+        raise CampaignDataError(
+            f"{file}: the time of {user} begins at {time[0]:g} s, and its release is at 0: leave "
+            "out what was recorded before it (samples at rest are a noise record), or count times "
+            "from the release."
+        )
+
+
+def _times_of_rows_at_rest(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
+) -> tuple[FloatArray, float]:
+    """Return times (N,) and start of a static or flight trial [s].
+
+    Refuse a row that comes twice.
+    """
+    start = section.start or 0.0
+    names_of_loads = dict.fromkeys(
+        ("force", "load_factor", *(recorded.table_column for recorded in campaign.input))
+    )
+    loads = [name for name in names_of_loads if name in table.columns]
+    branches = _load_branches(table, loads, user).tolist()
+    rows_with_branch = [*zip(branches, *table.columns.values(), strict=True)]
+    table.refuse_repeated(rows_with_branch, "row", _REPEATED)
+    if "time" not in table.columns:
+        return np.full(len(table), start), start
+    time = table.numbers("time", user)
+    if np.any(np.diff(time) < 0.0):
+        raise CampaignDataError(
+            f"{table.name}: the times of {user} run backwards; put its rows in order."
+        )
+    return time, float(time[0]) if section.start is None else start
+
+
+def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArray:
+    """Return the number (N,) of the branch of its load cycle on which each row lies.
+
+    A load cycle passes each level upwards and downwards, where a coarse gauge may read the same.
+    Such rows are not repeats, as they lie on different branches.
+
+    Parameters
+    ----------
+    table : TextTable
+        Table of a static or flight trial.
+    loads : sequence of str
+        Its columns of loads; a branch ends where any of them turns.
+    user : str
+        Whose columns they are, for messages.
+    """
+    begins_branch = np.zeros(len(table), dtype=np.int64)
+    for column in loads:
+        steps = np.diff(table.numbers(column, user))
+        moving = np.flatnonzero(steps)
+        turns = np.diff(np.sign(steps[moving])) != 0.0
+        begins_branch[moving[1:][turns] + 1] = 1
+    return np.cumsum(begins_branch)
+
+
+def _channels_of_trial(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection
+) -> tuple[Channel, ...]:
+    """Return the channels that a trial names, or all that have a column in its table."""
+    if section.channels is None:
+        channels = tuple(
+            channel for channel in campaign.channel if channel.table_column in table.columns
+        )
+    else:
+        by_name = {channel.name: channel for channel in campaign.channel}
+        channels = tuple(by_name[name] for name in section.channels)
+    for channel in channels:
+        table.cells(channel.table_column, f"the channel {channel.name!r}")
+    if not channels:
+        columns = ", ".join(table.columns)
+        wanted = ", ".join(channel.table_column for channel in campaign.channel)
+        raise CampaignFileError(
+            f"{table.name} of the trial {section.name!r} holds no channel: its columns are "
+            f"{columns}, and those of the channels {wanted}."
+        )
+    return channels
+
+
+def _readings(
+    channel: Channel, section: schema.TrialSection, table: TextTable, remarks: list[str]
+) -> tuple[FloatArray, BoolArray]:
+    """Return a channel's readings in a trial (N,) [SI], and which of them are used (N,).
+
+    The reading of an empty cell is interpolated and not used, with a remark; a row in `left_out` is
+    not used.
+    """
+    values = numbers_in_si(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
+    used = np.isfinite(values)
+    if not used.any():
+        raise CampaignDataError(
+            f"{table.name} has no reading in the column {channel.table_column!r} of the trial "
+            f"{section.name!r}."
+        )
+    if not used.all():
+        rows = np.arange(len(values))
+        values[~used] = np.interp(rows[~used], rows[used], values[used])
+        count = int((~used).sum())
+        remarks.append(
+            f"{count} of {len(values)} readings of {channel.name!r} in the trial {section.name!r} "
+            f"{is_or_are(count)} empty and left out."
+        )
+    for row in section.left_out.get(channel.name, ()):
+        if row > len(values):
+            raise CampaignFileError(
+                f"The trial {section.name!r} leaves out row {row} of {channel.name!r}, and "
+                f"{table.name} has {counted(len(values), 'row')}."
+            )
+        used[row - 1] = False
+    return values, used
+
+
+def _temperature(
+    section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
+) -> FloatArray:
+    """Return the temperature of a trial (N,) less the reference temperature [K].
+
+    0 if not recorded.
+    """
+    has_column = "temperature" in table.columns
+    if has_column and section.temperature is not None:
+        raise CampaignFileError(
+            f"The trial {section.name!r} gives its temperature twice: remove `temperature` or the "
+            f"column of {table.name}."
+        )
+    if not has_column and section.temperature is None:
+        return np.zeros(len(table))
+    if campaign.reference_temperature is None:
+        raise CampaignFileError(no_reference_temperature(section.name))
+    if has_column:
+        return table.numbers("temperature", user) - campaign.reference_temperature
+    return np.full(len(table), section.temperature) - campaign.reference_temperature
+
+
+def no_reference_temperature(trial: str) -> str:
+    """Return the message that a trial has a temperature, and the campaign no reference for it."""
+    return (
+        f"The trial {trial!r} has a temperature, but the campaign has no `reference_temperature`: "
+        "give it, in degC."
+    )
+
+
+class _StiffnessLosses(NamedTuple):
+    """Stiffness losses of a trial's K damage regions in its N rows.
+
+    Attributes
+    ----------
+    regions : tuple of str
+        Names of the regions.
+    means, deviations : (N, K) ndarray
+        Losses [fraction], and their prior standard deviations.
+    """
+
+    regions: tuple[str, ...]
+    means: FloatArray
+    deviations: FloatArray
+
+
+def _stiffness_losses(
+    section: schema.TrialSection, table: TextTable, user: str
+) -> _StiffnessLosses:
+    """Return the stiffness losses from columns, or from the keys of the trial; else zero.
+
+    Raises
+    ------
+    CampaignFileError
+        If a region has both a column and a key, or a value is out of its range.
+    """
+    stated = dict(section.health)
+    stated_deviation = stated.pop("deviation", 0.0)
+    prefix = schema.OF_REGION
+    columns = [name.removeprefix(prefix) for name in table.columns if name.startswith(prefix)]
+    regions_of_columns = [name.removesuffix("_deviation") for name in columns]
+    regions = tuple(dict.fromkeys((*USUAL_REGIONS, *stated, *regions_of_columns)))
+    means = np.zeros((len(table), len(regions)))
+    deviations = np.zeros((len(table), len(regions)))
+    for index, region in enumerate(regions):
+        column = region if region in USUAL_REGIONS else f"{prefix}{region}"
+        if column in table.columns and region in stated:
+            raise CampaignFileError(
+                f"The trial {section.name!r} gives {region} twice: remove it from `health` or from "
+                f"{table.name}."
+            )
+        means[:, index] = stated.get(region, 0.0)
+        if column in table.columns:
+            means[:, index] = table.numbers(column, user)
+        _check_range(means[:, index], table, column, "a fraction from 0 to 1", largest=1.0)
+
+        column = f"{column}_deviation"
+        deviations[:, index] = stated_deviation
+        if column in table.columns:
+            deviations[:, index] = table.numbers(column, user)
+        _check_range(deviations[:, index], table, column, "a standard deviation", largest=inf)
+    return _StiffnessLosses(regions, means, deviations)
+
+
+def _check_range(
+    values: FloatArray, table: TextTable, column: str, expected: str, *, largest: float
+) -> None:
+    """Refuse values (N,) of a column below zero or above the largest that is allowed."""
+    outside = np.flatnonzero((values < 0.0) | (values > largest))
+    if outside.size:
+        row = int(outside[0])
+        raise CampaignFileError(
+            f"{table.name}, line {table.lines[row]}: {column} is {expected}, and {values[row]:g} "
+            "came."
+        )

@@ -1,0 +1,184 @@
+"""Where an effect may act, by the word in its file."""
+
+from collections.abc import Callable
+from math import isinf
+
+import numpy as np
+
+from discrepancy.campaign.noise import MAINS, aliased
+from discrepancy.campaign.records import FloatArray, Quantity
+from discrepancy.catalogue.effect_in_setting import (
+    ALL,
+    CHANNELS_OR_ALL_OF_A_QUANTITY,
+    EVERY_PORT,
+    SKINS,
+    EffectInSetting,
+    Names,
+)
+from discrepancy.catalogue.entry import Setting
+from fe.runtime.patch import EVERY_CHANNEL
+
+
+def _or_all(names: Names) -> Names:
+    """Return places, with the place of all channels before them if there are several."""
+    return (EVERY_CHANNEL, *names) if len(names) > 1 else names
+
+
+def _state_ports_or_all(effect: EffectInSetting) -> Names:
+    """Return the ports of states, with the place of all of them at the end if there are several."""
+    ports = effect.state_ports
+    return (*ports, EVERY_PORT) if len(ports) > 1 else ports
+
+
+def _runs(effect: EffectInSetting) -> Names:
+    """Return the runs of the fitted trials."""
+    return tuple(dict.fromkeys(trial.run for trial in effect.setting.campaign.fitted))
+
+
+def _skins_at_ports(effect: EffectInSetting) -> Names:
+    """Return both skins at each port of forces."""
+    return tuple(f"{port}, {skin}" for port in effect.force_ports() for skin in SKINS)
+
+
+def _held_ports(effect: EffectInSetting) -> Names:
+    """Return the ports that something holds, for forces that depend on where a port is."""
+    return effect.force_ports(lambda scale: not scale.free)
+
+
+def _calibrated_channels(effect: EffectInSetting) -> Names:
+    """Return the channels with a known gain; a free gain absorbs an error of it."""
+    return effect.channels_of(lambda channel: not isinf(channel.gain_deviation))
+
+
+def _timed_gauges(effect: EffectInSetting) -> Names:
+    """Return the gauges, or else channels, that were read at several times."""
+    places = []
+    for name in effect.strain_channels or effect.channels_of():
+        times = [
+            trial.time + (trial.start if trial.is_dynamic else 0.0)
+            for trial in effect.setting.campaign.fitted
+            if name in trial.channels and trial.time.size
+        ]
+        if not times:
+            continue
+        last = max(np.max(trial_times) for trial_times in times)
+        first = min(np.min(trial_times) for trial_times in times)
+        if last > max(first, 0.0):
+            places.append(name)
+    return tuple(places)
+
+
+def _zeroed_runs(effect: EffectInSetting) -> Names:
+    """Return the runs with a displacement channel whose zero is known."""
+    with_zero = effect.channels_of(
+        lambda channel: (
+            channel.quantity is Quantity.DISPLACEMENT and not isinf(channel.offset_deviation)
+        )
+    )
+    runs = [trial.run for trial in effect.trials if {*with_zero}.intersection(trial.channels)]
+    return tuple(dict.fromkeys(runs))
+
+
+def _loggers(effect: EffectInSetting) -> Names:
+    """Return the loggers of a campaign; no choice if one records everything."""
+    loggers = tuple(effect.setting.campaign.loggers)
+    return loggers if len(loggers) > 1 else ("",)
+
+
+def mains_lines(setting: Setting) -> Names:
+    """Return the mains lines that can be seen, such as "50 Hz" or "50 or 400 Hz".
+
+    A line whose alias makes less than one period in every record is an offset there and left out.
+    Lines whose aliases differ by less than half a period in every record look alike and are one
+    place.
+    """
+    trials = [trial for trial in setting.campaign.fitted if trial.is_dynamic]
+
+    def periods(frequency: float) -> FloatArray:
+        """Return the periods (T,) that the alias of a line makes in each record."""
+        counts = []
+        for trial in trials:
+            duration = float(trial.time[-1] - trial.time[0])
+            counts.append(aliased(frequency, trial.interval) * duration)
+        return np.array(counts)
+
+    groups: list[list[float]] = []
+    for frequency in MAINS:
+        periods_of_line = periods(frequency)
+        if not np.any(periods_of_line >= 1.0):
+            continue
+        for group in groups:
+            if np.all(np.abs(periods_of_line - periods(group[0])) < 0.5):
+                group.append(frequency)
+                break
+        else:
+            groups.append([frequency])
+    return tuple(" or ".join(f"{frequency:g}" for frequency in group) + " Hz" for group in groups)
+
+
+def _channels_or_all_of_a_quantity(effect: EffectInSetting) -> Names:
+    """Return the channels, after "all strain" and the like if several have a quantity."""
+    quantities = [channel.quantity.value for channel in effect.channels]
+    repeated = [quantity for quantity in quantities if quantities.count(quantity) > 1]
+    all_of_quantities = dict.fromkeys(f"{ALL}{quantity}" for quantity in repeated)
+    return (*all_of_quantities, *effect.channels_of())
+
+
+def _lines_in_channels(effect: EffectInSetting) -> Names:
+    """Return the mains lines in single channels, and in all channels of a quantity."""
+    channels = _channels_or_all_of_a_quantity(effect)
+    lines = mains_lines(effect.setting)
+    return tuple(f"{line}, {channel}" for line in lines for channel in channels)
+
+
+PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
+    "ports": lambda effect: effect.setting.model.ports,
+    "channels": EffectInSetting.channels_of,
+    "channels, or all": lambda effect: _or_all(effect.channels_of()),
+    CHANNELS_OR_ALL_OF_A_QUANTITY: _channels_or_all_of_a_quantity,
+    "strain channels": lambda effect: effect.strain_channels,
+    "strain channels, or all": lambda effect: _or_all(effect.strain_channels),
+    "runs": _runs,
+    "ports of forces": EffectInSetting.force_ports,
+    "held ports": _held_ports,
+    "turning ports": lambda effect: effect.turning_ports,
+    "skins at ports": _skins_at_ports,
+    "ports of states": lambda effect: effect.state_ports,
+    "ports of states, or all": _state_ports_or_all,
+    "calibrated channels": _calibrated_channels,
+    "timed gauges": _timed_gauges,
+    "zeroed runs": _zeroed_runs,
+    "loggers": _loggers,
+    "mains lines": _lines_in_channels,
+}
+"""Functions that return the places of an effect, by the word in its file."""
+
+
+def places_of(effect: EffectInSetting) -> Names:
+    """Return the places where an effect may act in its setting; ("",) if there is no choice."""
+    places = effect.section.places
+    if isinstance(places, str):
+        return PLACES[places](effect)
+    return places or ("",)
+
+
+_NO_STRAIN = "The campaign has no strain channel."
+NO_TURNING_PORT = (
+    "No port has a motion that turns: one that goes one way shows no memory and no zero."
+)
+_NO_STATE = "The model has no port of a state (a level, a charge), at which a flow could act."
+NO_PLACES = {
+    "strain channels": _NO_STRAIN,
+    "strain channels, or all": _NO_STRAIN,
+    "held ports": "Nothing holds a port of the model, so that no place is its zero.",
+    "turning ports": NO_TURNING_PORT,
+    "ports of states": _NO_STATE,
+    "ports of states, or all": _NO_STATE,
+    "calibrated channels": (
+        "The campaign has no channel whose gain is known, so no gain can be wrong."
+    ),
+    "timed gauges": "The campaign does not say at which times its channels were read.",
+    "zeroed runs": "No static trial has a displacement channel whose zero is known.",
+    "mains lines": "At these sampling rates every mains line is aliased to zero frequency.",
+}
+"""Why there is no place, by the word of `PLACES`."""

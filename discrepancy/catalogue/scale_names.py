@@ -1,0 +1,185 @@
+"""Names of scales in the expressions of effects, and their values where a patch is built."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from math import inf, pi
+from operator import attrgetter
+
+import numpy as np
+from scipy.special import beta
+
+from discrepancy.catalogue.effect_in_setting import EffectInSetting, Target
+from discrepancy.catalogue.entry import Setting
+from discrepancy.errors import CatalogueError
+from discrepancy.system.scales import PortScale
+from fe.runtime.patch import EVERY_CHANNEL
+
+LARGEST_SHARE = 0.9
+"""Largest fraction of a port's stiffness at rest for a force that does not fall with the speed."""
+
+
+@dataclass(frozen=True)
+class BuildContext:
+    """Where a patch of an effect is built, for the names in its expressions.
+
+    Attributes
+    ----------
+    effect : EffectInSetting
+        The effect in its setting.
+    target : Target
+        What its place stands for.
+    values : mapping of str to float
+        Values of its parameters and shape by name.
+    """
+
+    effect: EffectInSetting
+    target: Target
+    values: Mapping[str, float]
+
+    @property
+    def setting(self) -> Setting:
+        """Campaign and model."""
+        return self.effect.setting
+
+    @property
+    def port(self) -> PortScale:
+        """Natural scales of the port; raises `CatalogueError` if the model has no such port."""
+        ports = self.setting.scales.ports
+        if self.target.name not in ports:
+            known = ", ".join(ports) or "none"
+            raise CatalogueError(
+                f"The model {self.setting.model.name!r} has no port {self.target.name!r}; it has "
+                f"{known}."
+            )
+        return ports[self.target.name]
+
+
+def loss_integral(velocity_exponent: float, displacement_exponent: float) -> float:
+    """Return B((p + 2) / 2, (a + 1) / 2): half the loss of a cycle over F_0 A; 2 for p = a = 0."""
+    return float(beta(0.5 * velocity_exponent + 1.0, 0.5 * displacement_exponent + 0.5))
+
+
+def _cycle_loss(context: BuildContext) -> float:
+    """Return the loss of a cycle of a force |v|^p |x|^a over F_0 A, spread over the port's area."""
+    p = max(context.values["velocity_exponent"], 0.0)
+    a = max(context.values["displacement_exponent"], 0.0) * _is_held(context)
+    return loss_integral(p, a) * context.port.mean_power(p + a + 1.0)
+
+
+def _is_held(context: BuildContext) -> float:
+    """Return 1 if something holds the port, else 0: a free port has no zero of displacement."""
+    return 0.0 if context.port.free else 1.0
+
+
+def _holding_force(context: BuildContext) -> float:
+    """Return the largest force that lets the port move, unless the force falls with the speed."""
+    port = context.port
+    falls_with_speed = context.values["velocity_exponent"] >= 1.0
+    if port.static_stiffness is None or port.driven or falls_with_speed:
+        return inf
+    return LARGEST_SHARE * port.static_stiffness * port.displacement
+
+
+def _port_scale(name: str, fallback: str) -> Callable[[BuildContext], float]:
+    """Return the function of a natural scale of the port, with another scale if it is not known."""
+
+    def scale(context: BuildContext) -> float:
+        value: float | None = getattr(context.port, name)
+        return getattr(context.port, fallback) if value is None else value
+
+    return scale
+
+
+def _largest_reading(context: BuildContext) -> float:
+    """Return the largest absolute reading that is used at the place [its unit]; 1 if all are zero.
+
+    It is kept in the setting, because a fit builds patches at every step.
+    """
+    kept = context.setting.largest
+    key = (context.target, context.effect.section.acts_on)
+    if key not in kept:
+        largest = _compute_largest_reading(context)
+        kept[key] = largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    return kept[key]
+
+
+def _compute_largest_reading(context: BuildContext) -> float:
+    """Return the largest absolute reading that is used at the place [its unit]; 0 without any."""
+    target = context.target
+    names: tuple[str, ...] = (target.name,)
+    if target.name == EVERY_CHANNEL:
+        names = context.effect.channels_of(
+            lambda channel: target.quantity in ("", channel.quantity.value)
+        )
+    largest = 0.0
+    for trial in context.effect.trials:
+        for column, name in enumerate(trial.channels):
+            used = trial.used[:, column]
+            if name in names and used.any():
+                readings = np.abs(trial.values[used, column])
+                largest = max(largest, float(np.max(readings)))
+    return largest
+
+
+def _sampling_interval(context: BuildContext) -> float:
+    """Return the median time between two samples of the trials that the effect changes [s]."""
+    intervals = [np.diff(trial.time) for trial in context.effect.trials if len(trial.time) > 1]
+    return float(np.median(np.concatenate(intervals))) if intervals else 0.0
+
+
+def _largest_release(context: BuildContext) -> float:
+    """Return the largest release displacement of the trials with the channel; 1 without any."""
+    releases = [
+        abs(trial.release.displacement)
+        for trial in context.setting.campaign.fitted
+        if trial.release is not None and context.target.name in trial.channels
+    ]
+    return max(releases, default=0.0) or 1.0
+
+
+def _station(end: int, context: BuildContext) -> float:
+    """Return the station of an end of the model [m]: 0 for its root, 1 for its tip."""
+    stations = context.setting.model.stations or (0.0, 0.0)
+    return stations[end]
+
+
+_SCALES_OF_MODEL = (
+    "length",
+    "tip_stiffness",
+    "modal_mass",
+    "angular_frequency",
+    "force",
+    "load_factor",
+    "duration",
+    "campaign_time",
+)
+SCALES: dict[str, Callable[[BuildContext], float]] = {
+    **{name: attrgetter(f"setting.scales.{name}") for name in _SCALES_OF_MODEL},
+    "pi": lambda context: pi,
+    "root_station": partial(_station, 0),
+    "tip_station": partial(_station, 1),
+    "largest_reading": _largest_reading,
+    "largest_release": _largest_release,
+    "sampling_interval": _sampling_interval,
+    "number": lambda context: context.target.number,
+    "port_displacement": lambda context: context.port.displacement,
+    "port_stiffness": lambda context: context.port.stiffness,
+    "port_angular_frequency": lambda context: context.port.angular_frequency,
+    "port_stiffness_at_rest": _port_scale("static_stiffness", "stiffness"),
+    "port_largest_displacement": _port_scale("largest_displacement", "displacement"),
+    "port_holding_force": _holding_force,
+    "port_is_held": _is_held,
+    "mean_power": lambda context: context.port.mean_power(context.values["exponent"] + 1.0),
+    "cycle_loss": _cycle_loss,
+}
+"""Values [SI] of the names in expressions, as functions of where a patch is built.
+
+`number` is the number in the name of the place (side of a skin, frequency of a line), `mean_power`
+that of the motion under a spread force with `exponent`.
+"""
+SHAPES_OF_SCALES: dict[str, set[str]] = {
+    "mean_power": {"exponent"},
+    "cycle_loss": {"velocity_exponent", "displacement_exponent"},
+    "port_holding_force": {"velocity_exponent"},
+}

@@ -1,0 +1,140 @@
+"""Channels of a trial that are copies of each other: scaled, shifted in time, or neither."""
+
+from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+
+from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Trial
+from discrepancy.checks.fault import DataFault, FaultKind, place_of
+from discrepancy.checks.held import roughness
+
+COPIED = 0.01
+"""A channel is a copy if another one leaves less than this fraction of its noise unexplained."""
+LEAST_COPIED = 32
+"""Fewest samples in which copies are searched."""
+_LAGS = 2**14
+"""Samples in which the shift between two channels is searched."""
+
+
+class _Copy(NamedTuple):
+    """A pair of channels of which one is a copy, and how, as a phrase for a message."""
+
+    original: str
+    copy: str
+    how: str
+
+
+def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
+    """Yield a fault for each pair of channels of which one is a copy of the other."""
+    trials_of_pairs: dict[tuple[str, str], list[tuple[Trial, str]]] = {}
+    for trial in campaign.trials:
+        if not trial.is_dynamic:
+            continue
+        for original, copy, how in _copies(trial):
+            trials_of_pairs.setdefault((original, copy), []).append((trial, how))
+    for (original, copy), trials in trials_of_pairs.items():
+        trial, how = trials[0]
+        further_trials = ""
+        if len(trials) > 1:
+            further_trials = f", and so in {len(trials) - 1} more of its trials"
+        place = place_of(campaign.channels[copy], trial)
+        sentence = (
+            f"The channel {copy!r} is the channel {original!r} {how} in {place}{further_trials}: "
+            "two sensors never share their noise, so correct `column` or the table, or leave one "
+            "of them out."
+        )
+        yield DataFault(FaultKind.COPIED, sentence, copy, trial.name)
+
+
+def _copies(trial: Trial) -> Iterator[_Copy]:
+    """Yield the copies among the channels of a trial.
+
+    Copies share their noise. It is separated from the motion by sixth differences, and the shift
+    between two channels is that of their largest cross-correlation.
+    """
+    if len(trial.time) < LEAST_COPIED:
+        return
+    noise = _noise_by_differences(trial.values[:_LAGS])
+    power = np.sum(noise**2, axis=0)
+    # sixth differences of noise turn at each sample; those of a motion without noise do not
+    has_noise = np.sum(noise[1:] * noise[:-1], axis=0) < -0.5 * power
+    spectra = np.fft.rfft(noise, 2 * len(noise), axis=0)
+    changes = np.count_nonzero(np.diff(trial.values, axis=0), axis=0)
+    for i, j in combinations(range(len(trial.channels)), 2):
+        how = ""
+        if not (has_noise[i] and has_noise[j]):
+            moves = changes[i] >= 2 * LEAST_COPIED
+            if moves and np.array_equal(trial.values[:, i], trial.values[:, j]):
+                how = "digit for digit"
+        else:
+            correlation = np.fft.irfft(spectra[:, j] * np.conj(spectra[:, i]))
+            peak = int(np.argmax(np.abs(correlation)))
+            if abs(correlation[peak]) >= 0.5 * np.sqrt(power[i] * power[j]):
+                # the second half of the transform has the negative shifts
+                shift = peak if peak < len(noise) else peak - len(correlation)
+                how = _how_copied(
+                    trial.values[:, i],
+                    trial.values[:, j],
+                    trial.used[:, i],
+                    trial.used[:, j],
+                    shift,
+                )
+        if how:
+            yield _Copy(trial.channels[i], trial.channels[j], how)
+
+
+def _noise_by_differences(values: FloatArray) -> FloatArray:
+    """Return the sixth differences (N - 6, C) of records (N, C), with zeros for jumps.
+
+    A jump or a wrong reading would outweigh all noise.
+    """
+    differences = np.diff(values, 6, axis=0)
+    limit = 15.0 * np.median(np.abs(differences), axis=0)
+    is_jump = (np.abs(differences) > limit) & (limit > 0.0)
+    return np.where(is_jump, 0.0, differences)
+
+
+def _how_copied(
+    original: FloatArray,
+    copy: FloatArray,
+    original_used: BoolArray,
+    copy_used: BoolArray,
+    shift: int,
+) -> str:
+    """Return how a record is a copy of another one, as a phrase; empty if it is not.
+
+    Parameters
+    ----------
+    original, copy : (N,) ndarrays
+        The two records.
+    original_used, copy_used : (N,) ndarrays of bool
+        False for samples that are left out.
+    shift : int
+        Samples by which the copy comes later.
+    """
+    # samples that both have, in the clock of the original
+    count = len(original) - abs(shift)
+    first = max(-shift, 0)
+    first_of_copy = max(shift, 0)
+    in_original = slice(first, first + count)
+    in_copy = slice(first_of_copy, first_of_copy + count)
+    used = original_used[in_original] & copy_used[in_copy]
+    x = original[in_original][used]
+    y = copy[in_copy][used]
+    if len(y) < LEAST_COPIED or len(np.unique(x)) < LEAST_COPIED // 2:
+        return ""
+    noise = roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
+    if noise == 0.0:
+        return ""
+    delay = ""
+    if shift:
+        delay = f", {abs(shift)} samples {'later' if shift > 0 else 'earlier'},"
+    if np.array_equal(x, y):
+        return f"digit for digit{delay}"
+    # scale by least squares
+    centred = x - x.mean()
+    scale = float(centred @ (y - y.mean()) / (centred @ centred))
+    unexplained = float(np.std(y - scale * x))
+    return f"times {scale:.6g}{delay}" if unexplained < COPIED * noise else ""

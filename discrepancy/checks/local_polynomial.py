@@ -1,0 +1,127 @@
+"""Local polynomials that predict each sample of a record from its neighbours."""
+
+from collections.abc import Callable
+from functools import cache, lru_cache, partial
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy.signal import savgol_coeffs
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.sampling import is_even
+
+LOW_DEGREE = 5
+"""Least degree of the local polynomials, and the only one for unevenly spaced samples."""
+Weights = Callable[[int, int], FloatArray]
+"""Returns the weights of a local polynomial's residual, by its half width and degree.
+
+They are (2 width + 1,) for even samples, (N - 2 width, 2 width + 1) for uneven ones."""
+
+
+@lru_cache(maxsize=32)
+def event_patterns(width: int, degree: int) -> FloatArray:
+    """Return the residuals (4, 2 width + 1) of a wrong reading, a kink and two steps."""
+    places = np.arange(-2 * width, 2 * width + 1)
+    wrong_reading = places == 0
+    kink = np.abs(places)
+    step_at_sample = places >= 0
+    step_after_sample = places > 0
+    weights = even_weights(width, degree)
+    patterns = []
+    for signal in (wrong_reading, kink, step_at_sample, step_after_sample):
+        patterns.append(np.convolve(np.asarray(signal, dtype=float), weights, "valid"))
+    return np.stack(patterns)
+
+
+class LocalPolynomial:
+    """A polynomial through the neighbours of each sample of a record, without the sample itself.
+
+    Near the ends of the record narrower neighbourhoods replace the full one.
+
+    Parameters
+    ----------
+    weights : callable
+        Weights of residuals; see `Weights`.
+    width : int
+        Half width of the neighbourhood in samples.
+    degree : int
+        Degree of the polynomial.
+    """
+
+    def __init__(self, weights: Weights, width: int, degree: int) -> None:
+        self.width = width
+        self.degree = degree
+        narrower = [half_width for half_width in (3, 4, 6, 9, 13) if half_width < width]
+        # in order of width: where neighbourhoods of several widths fit, the widest counts
+        self._weights = {half_width: weights(half_width, LOW_DEGREE) for half_width in narrower}
+        self._weights[width] = weights(width, degree)
+
+    def residual(self, values: FloatArray) -> FloatArray:
+        """Return samples minus prediction (N,), scaled to one scatter for noise.
+
+        Zero at the edges.
+        """
+        residual = np.zeros(len(values))
+        for width, weights in self._weights.items():
+            if weights.ndim == 1:
+                inner = np.convolve(values, weights, mode="valid")
+            else:
+                windows = sliding_window_view(values, 2 * width + 1)
+                inner = np.einsum("nw,nw->n", windows, weights)
+            residual[width : len(values) - width] = inner
+        return residual
+
+    def weight_of_sample(self, count: int) -> FloatArray:
+        """Return the weight of each of `count` samples in its own residual."""
+        weight = np.ones(count)
+        for width, weights in self._weights.items():
+            weight[width : count - width] = weights[..., width]
+        return weight
+
+
+@lru_cache(maxsize=32)
+def even_weights(width: int, degree: int) -> FloatArray:
+    """Return the weights (2 width + 1,) of a sample and its neighbours in the sample's residual.
+
+    The residual is that of a polynomial that is fitted to the neighbours alone: the residual of a
+    Savitzky-Golay filter over its weight for the sample itself.
+    """
+    weights = -savgol_coeffs(2 * width + 1, degree)
+    weights[width] += 1.0
+    return np.asarray(weights / weights[width])
+
+
+def weights_at(time: FloatArray) -> Weights:
+    """Return the weights of local polynomials at times (N,), which are kept for all channels."""
+    return even_weights if is_even(time) else cache(partial(uneven_weights, time))
+
+
+def uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
+    """Return the weights of each sample and its neighbours for unevenly spaced times.
+
+    They are scaled so that noise gives the same scatter as with evenly spaced samples.
+
+    Parameters
+    ----------
+    time : (N,) ndarray
+        Times [s].
+    width, degree : int
+        Half width of the neighbourhood in samples, and degree of the polynomial.
+
+    Returns
+    -------
+    (N - 2 width, 2 width + 1) ndarray
+        Weights of each sample that has all its neighbours.
+    """
+    inner_times = time[width : len(time) - width, np.newaxis]
+    places = sliding_window_view(time, 2 * width + 1) - inner_times
+    places /= np.max(np.abs(places), axis=1, keepdims=True)
+    basis = np.polynomial.polynomial.polyvander(np.delete(places, width, axis=1), degree)
+    # ridge: beside a wide gap the samples may not determine the whole polynomial
+    ridge = 1e-10 * np.eye(degree + 1)
+    inverse = np.linalg.inv(basis.transpose(0, 2, 1) @ basis + ridge)
+    # the prediction at the sample itself is the constant of the polynomial
+    prediction_weights = (basis @ inverse[..., :1])[..., 0]
+    weights = np.insert(-prediction_weights, width, 1.0, axis=1)
+    norm = np.linalg.norm(weights, axis=1, keepdims=True)
+    return np.asarray(weights * (np.linalg.norm(even_weights(width, degree)) / norm))

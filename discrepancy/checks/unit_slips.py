@@ -1,0 +1,269 @@
+"""Unit slips: factors between data and model that two units of a quantity explain."""
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from math import log
+from statistics import median
+from typing import NamedTuple
+
+from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
+from discrepancy.campaign.units import UNITS, conversion_of
+from discrepancy.checks.fault import DataFault, FaultKind
+
+_DRIVES = {
+    TrialKind.STATIC: (Quantity.FORCE, "N"),
+    TrialKind.FORCED: (Quantity.FORCE, "N"),
+    TrialKind.RINGDOWN: (Quantity.DISPLACEMENT, ""),
+    TrialKind.FLIGHT: (Quantity.ACCELERATION, "g"),
+}
+"""Quantity that drives a trial, and its unit; a load factor may have been recorded in m/s2."""
+SURE_SLIP = 500.0
+"""Slips beyond this factor are certain from one record.
+
+Smaller ones are a doubt until several agree.
+"""
+DOUBT = 7.0
+"""Slips within this factor may be physical: a doubt if several records agree, else nothing."""
+LEAST = 2.0
+"""Least factor between two units that is a slip."""
+
+
+class Slip(NamedTuple):
+    """A factor of data over model that two units explain.
+
+    Attributes
+    ----------
+    factor : float
+        Factor of data over model if one unit was given as the other.
+    meant : str
+        The unit that the data have.
+    stated : str
+        The unit that the file states.
+    """
+
+    factor: float
+    meant: str
+    stated: str
+
+    @property
+    def size(self) -> float:
+        """The factor or its reciprocal, whichever is larger."""
+        return max(self.factor, 1.0 / self.factor)
+
+    @property
+    def width(self) -> float:
+        """Factor by which physics may change the ratio besides: the more, the larger the slip."""
+        for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBT, 1.35)):
+            if self.size >= least_size:
+                return width
+        return 1.1
+
+    def distance(self, scale: float) -> float:
+        """Return the absolute logarithm of a data scale over the factor of this slip."""
+        return abs(log(abs(scale) / self.factor))
+
+    def __str__(self) -> str:
+        """Return the pair of units, in brackets."""
+        meant = "strain" if self.meant == "1" else self.meant
+        stated = "strain" if self.stated == "1" else self.stated
+        return f"({meant} given as {stated}?)"
+
+
+def slip_between(
+    scale: float, quantity: Quantity, stated: str = "", *, drive: bool = False
+) -> Slip | None:
+    """Return the pair of a quantity's units that explains a factor of data over model best.
+
+    Parameters
+    ----------
+    scale : float
+        Data over model, of any sign.
+    quantity : Quantity
+        The quantity whose units may have been mixed up.
+    stated : str
+        The unit that the file states; if empty, any pair of units counts of which one is SI.
+    drive : bool
+        True if the quantity drives the model: a drive that is too small shows as data that are too
+        large.
+
+    Returns
+    -------
+    Slip or None
+        None if no pair of units explains the factor.
+    """
+    if abs(log(abs(scale))) < log(LEAST / 1.1):
+        return None
+    names = {*UNITS[quantity].usual}
+    if stated:
+        names.add(stated)
+    units_in_si = {unit: conversion_of(quantity, unit) for unit in sorted(names)}
+    units_in_si |= UNITS[quantity].foreign
+    distances: dict[Slip, float] = {}
+    for given, given_in_si in units_in_si.items():
+        for meant, meant_in_si in units_in_si.items():
+            has_si = 1.0 in (given_in_si, meant_in_si)
+            if given != stated and (stated or not has_si):
+                continue
+            factor = meant_in_si / given_in_si if drive else given_in_si / meant_in_si
+            slip = Slip(factor, meant, given)
+            if slip.size > LEAST:
+                distances[slip] = slip.distance(scale)
+    explaining = [slip for slip, distance in distances.items() if distance < log(slip.width)]
+    return min(explaining, key=lambda slip: distances[slip], default=None)
+
+
+def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> Iterator[DataFault]:
+    """Yield the unit slips of channels, and of the inputs of trials.
+
+    A channel that slips between its units in all its trials has a wrong unit itself. If all other
+    channels of a trial slip alike, the input of that trial has a wrong unit.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    scales : mapping of (str, str) to float
+        Data over model by channel and trial.
+    """
+    trials = {trial.name: trial for trial in campaign.trials}
+    input_slips = {key: _slip_of_input(trials[key[1]], scale) for key, scale in scales.items()}
+    trials_of_channels: dict[str, list[str]] = defaultdict(list)
+    for channel, trial_name in scales:
+        trials_of_channels[channel].append(trial_name)
+    common = _common_slip([*input_slips.values()])
+    if len(trials_of_channels) > 1 and common is not None:
+        sentence = (
+            f"All channels of all trials are about {common.factor:.6g} times what the model says "
+            f"{common}: check the units of forces (N), load factors (1) and release displacements, "
+            "or of the channels"
+        )
+        fault = DataFault(FaultKind.INPUT_SLIP, sentence)
+        yield from _graded(fault, common, agreeing=len(input_slips))
+        return
+    wrong_channels = set()
+    for channel, trial_names in trials_of_channels.items():
+        slip = _slip_of_channel(campaign, channel, [scales[channel, name] for name in trial_names])
+        if slip is not None:
+            wrong_channels.add(channel)
+            slipping_trials = [trials[name] for name in trial_names]
+            yield from _channel_faults(campaign, channel, slip, slipping_trials)
+    for trial in trials.values():
+        keys = [key for key in scales if key[1] == trial.name and key[0] not in wrong_channels]
+        yield from _slips_in_trial(campaign, trial, keys, scales, input_slips)
+
+
+def _slips_in_trial(
+    campaign: Campaign,
+    trial: Trial,
+    keys: Sequence[tuple[str, str]],
+    scales: Mapping[tuple[str, str], float],
+    input_slips: Mapping[tuple[str, str], Slip | None],
+) -> Iterator[DataFault]:
+    """Yield the slip of a trial's input, or those of channels in this trial alone.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    trial : Trial
+        The trial.
+    keys : sequence of (str, str)
+        Channel and trial for its channels whose own unit is right.
+    scales : mapping of (str, str) to float
+        Data over model by channel and trial.
+    input_slips : mapping of (str, str) to Slip or None
+        Slip of the trial's input that would explain each scale.
+    """
+    common = _common_slip([input_slips[key] for key in keys])
+    if common is not None:
+        sentence = (
+            f"All channels of the trial {trial.name!r} are about {common.factor:.6g} times what "
+            f"the model says {common}, and those of other trials are not: check the unit of its "
+            "force, load factor, release displacement or inputs"
+        )
+        fault = DataFault(FaultKind.INPUT_SLIP, sentence, trial=trial.name)
+        yield from _graded(fault, common, agreeing=len(keys))
+        return
+    for key in keys:
+        channel, _ = key
+        slip = _slip_of_channel(campaign, channel, [scales[key]])
+        # a small factor in one trial alone may be physical: lift that leaves the outer wing
+        if slip is not None and slip.size >= SURE_SLIP:
+            yield from _channel_faults(campaign, channel, slip, [trial])
+
+
+def _common_slip(slips: Sequence[Slip | None]) -> Slip | None:
+    """Return the slip that all of several scales have; None if they differ or there are none."""
+    if not slips or any(slip != slips[0] for slip in slips):
+        return None
+    return slips[0]
+
+
+def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> Slip | None:
+    """Return the slip between a channel's units that explains all its scales; None if none does."""
+    channel = campaign.channels[name]
+    slip = slip_between(median(map(abs, scales)), channel.quantity, channel.unit)
+    if slip is None:
+        return None
+    if any(slip.distance(scale) > 2.0 * log(slip.width) for scale in scales):
+        return None
+    return slip
+
+
+def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
+    """Return the slip between units of a trial's inputs that explains a scale.
+
+    None if none does.
+    """
+    drives = []
+    if trial.kind in _DRIVES:
+        drives.append(_DRIVES[trial.kind])
+    drives += [(recorded.quantity, recorded.unit) for recorded in trial.inputs]
+    for quantity, unit in drives:
+        slip = slip_between(scale, quantity, unit, drive=True)
+        if slip is not None:
+            return slip
+    return None
+
+
+def _channel_faults(
+    campaign: Campaign, name: str, slip: Slip, trials: Sequence[Trial]
+) -> Iterator[DataFault]:
+    """Yield the fault of a channel that slips in some trials."""
+    channel = campaign.channels[name]
+    first = trials[0]
+    column = ""
+    if channel.column and first.file:
+        column = f", column {channel.column!r} of {first.file},"
+    number_of_trials = sum(name in trial.channels for trial in campaign.trials)
+    is_in_one_of_several = len(trials) == 1 and number_of_trials > 1
+    where = f" in the trial {first.name!r}" if is_in_one_of_several else ""
+    sentence = (
+        f"The channel {name!r}{column} shows about {slip.factor:.6g} times what the model "
+        f"says{where} {slip}: correct its `unit`, or convert the column"
+    )
+    trial_name = first.name if is_in_one_of_several else ""
+    fault = DataFault(FaultKind.UNIT_SLIP, sentence, name, trial_name)
+    # gravity in an acceleration is known, so that a single record shows the slip
+    witnesses = 1 if channel.quantity is Quantity.ACCELERATION else 0
+    yield from _graded(fault, slip, agreeing=len(trials) + witnesses)
+
+
+def _graded(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
+    """Yield a slip as a fault, as a doubt, or not at all.
+
+    Parameters
+    ----------
+    fault : DataFault
+        The fault, with a sentence that may go on.
+    slip : Slip
+        The slip.
+    agreeing : int
+        Number of records that agree on it.
+    """
+    sentence = fault.sentence
+    if slip.size >= SURE_SLIP or (slip.size >= DOUBT and agreeing > 1):
+        yield replace(fault, sentence=f"{sentence}; no physical effect is that large.")
+    elif slip.size >= DOUBT or agreeing > 1:
+        yield replace(fault, kind=FaultKind.UNIT_DOUBT, sentence=f"{sentence}, or mend the model.")

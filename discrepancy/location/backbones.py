@@ -1,0 +1,187 @@
+"""Backbones of ring-downs: frequency and damping of each mode over its amplitude."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from calibration.dynamics.damped_cosine import DampedCosineFit, DampedCosines
+from discrepancy.campaign.records import FloatArray
+from discrepancy.errors import FitError
+
+SMALLEST_SIGNAL = 4.0
+"""A mode counts in a window while its amplitude there is this many standard errors."""
+_GREATEST_CHANGE = 0.3
+"""Largest relative change of a frequency from its start value."""
+_FEWEST_PER_UNKNOWN = 2.0
+"""Fewest samples in a window for each unknown."""
+
+
+@dataclass(frozen=True, eq=False)
+class Backbone:
+    """Frequency and damping ratio of one mode along a ring-down.
+
+    Attributes
+    ----------
+    mode : int
+        Number of the mode from one, by start frequency.
+    time : (W,) ndarray
+        Centroid of the mode's energy in each window [s].
+    amplitude, amplitude_error : (W,) ndarray
+        Amplitude at that time and its standard error [signal's unit].
+    frequency, frequency_error : (W,) ndarray
+        Natural frequency |s| / 2 pi with s = -decay + i omega_d, and its standard error [Hz].
+    damping_ratio, damping_ratio_error : (W,) ndarray
+        Damping ratio decay / |s| and its standard error [1].
+    """
+
+    mode: int
+    time: FloatArray
+    amplitude: FloatArray
+    amplitude_error: FloatArray
+    frequency: FloatArray
+    frequency_error: FloatArray
+    damping_ratio: FloatArray
+    damping_ratio_error: FloatArray
+
+
+def backbones(
+    time: FloatArray,
+    signal: FloatArray,
+    frequencies: Sequence[float],
+    *,
+    noise_deviation: float | None = None,
+    averaging_width: float = 0.0,
+    periods: float = 4.0,
+) -> tuple[Backbone, ...]:
+    """Return the backbone of each mode: damped cosines are fitted in windows along a ring-down.
+
+    Parameters
+    ----------
+    time, signal : (N,) ndarray
+        The record, evenly spaced [s], [any unit].
+    frequencies : sequence of float
+        Start values of the frequencies of all modes that ring [Hz].
+    noise_deviation : float, optional
+        Standard deviation of the noise. Without it that of each window's residuals is used, which
+        also contains what the cosines do not describe.
+    averaging_width : float
+        Interval over which each value is an average [s]; 0 for samples.
+    periods : float
+        Length of a window in periods of the lowest frequency. Longer windows have smaller errors
+        and smear what changes with amplitude: three periods of a quadratic damping with a ratio of
+        0.045 give 0.043. The next window repeats half of it.
+
+    Raises
+    ------
+    FitError
+        If the record is shorter than a window, or a window has too few samples.
+    """
+    interval = float(time[-1] - time[0]) / (time.size - 1)
+    start = 2.0 * np.pi * np.sort(np.asarray(frequencies, dtype=float))
+    width = round(periods * 2.0 * np.pi / (start[0] * interval)) + 1
+    unknown_count = 4 * start.size + 2
+    least_width = _FEWEST_PER_UNKNOWN * unknown_count
+    if width < least_width or width > time.size:
+        raise FitError(
+            f"A window of {periods:g} periods has {width} samples, but at least {least_width:.0f} "
+            f"and at most {time.size}, the record's length, are needed: give a longer or more "
+            "finely sampled record."
+        )
+    is_ringing = np.ones(start.size, dtype=bool)
+    poles = (1j - 0.02) * start
+    points: list[list[BackbonePoint]] = [[] for _ in start]
+    for first in range(0, time.size - width + 1, max(1, round(0.5 * width))):
+        samples = slice(first, first + width)
+        window = DampedCosines(time[samples], signal[samples], averaging_width)
+        while is_ringing.any():
+            solution = window.fit(poles[is_ringing])
+            window_time = time[samples] - time[first]
+            modes = np.flatnonzero(is_ringing).tolist()
+            points_of_window = dict(
+                zip(modes, _points(window_time, solution, noise_deviation), strict=True)
+            )
+            died_away = [
+                mode
+                for mode, point in points_of_window.items()
+                if not point.is_credible(start[mode])
+            ]
+            if died_away:
+                # fit again without these modes, which would spoil the errors of the others
+                is_ringing[died_away] = False
+                continue
+            for mode, point in points_of_window.items():
+                points[mode].append(point._replace(time=float(time[first]) + point.time))
+            # the next window begins from here, with some damping
+            fitted = solution.pole
+            poles[is_ringing] = np.minimum(fitted.real, -1e-4 * fitted.imag) + 1j * fitted.imag
+            break
+        if not is_ringing.any():
+            break
+    return tuple(_backbone(mode, points_of_mode) for mode, points_of_mode in enumerate(points, 1))
+
+
+class BackbonePoint(NamedTuple):
+    """One mode in one window of a ring-down; the entries are those of a `Backbone`."""
+
+    time: float
+    amplitude: float
+    amplitude_error: float
+    frequency: float
+    frequency_error: float
+    damping_ratio: float
+    damping_ratio_error: float
+
+    def is_credible(self, start: float) -> bool:
+        """Return whether the mode still rings, near its start frequency [rad/s]."""
+        change = abs(2.0 * np.pi * self.frequency / start - 1.0)
+        is_above_error = self.amplitude > SMALLEST_SIGNAL * self.amplitude_error
+        return is_above_error and change < _GREATEST_CHANGE and abs(self.damping_ratio) < 0.5
+
+
+def _backbone(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
+    """Return the points of a mode as one record of arrays."""
+    arrays: dict[str, FloatArray] = {}
+    for name in BackbonePoint._fields:
+        arrays[name] = np.array([getattr(point, name) for point in points], dtype=float)
+    return Backbone(mode=mode, **arrays)
+
+
+def _points(
+    time: FloatArray, solution: DampedCosineFit, noise_deviation: float | None
+) -> list[BackbonePoint]:
+    """Return each mode of a window at the centroid of its energy.
+
+    Parameters
+    ----------
+    time : (N,) ndarray
+        Times in the window [s].
+    solution : DampedCosineFit
+        Fit of the window.
+    noise_deviation : float or None
+        Standard deviation of the noise; that of the window's residuals if None.
+    """
+    residual_deviation = float(solution.deviation[0])
+    deviation = residual_deviation if noise_deviation is None else noise_deviation
+    points = []
+    for mode in solution.modes:
+        decay = -mode.pole.real
+        energy = np.exp(-2.0 * np.clip(decay * (time - time[-1] / 2.0), -50.0, 50.0))
+        centroid = float(energy @ time / energy.sum())
+        effective_samples = float(energy.sum()) ** 2 / float(energy @ energy)
+        frequency_error = mode.standard_error["frequency"]
+        damping_ratio_error = mode.standard_error["damping_ratio"]
+        points.append(
+            BackbonePoint(
+                time=centroid,
+                amplitude=mode.amplitude * float(np.exp(-np.clip(decay * centroid, -50.0, 50.0))),
+                amplitude_error=deviation * sqrt(2.0 / effective_samples),
+                frequency=mode.frequency,
+                frequency_error=frequency_error * deviation / residual_deviation,
+                damping_ratio=mode.damping_ratio,
+                damping_ratio_error=damping_ratio_error * deviation / residual_deviation,
+            )
+        )
+    return points

@@ -1,0 +1,205 @@
+"""Omnibus tests of all residuals of a fit: their variance, whiteness and lines."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from discrepancy.campaign import noise_tests
+from discrepancy.campaign.noise import NOISE_RECORD_LEVEL, record_at_rest, whiteness_is_tested
+from discrepancy.campaign.records import FloatArray
+from discrepancy.location.residuals import ResidualSet, mean_square
+
+LEAST_FREEDOM = 0.5
+"""Fewest degrees of freedom of residuals whose variance is tested."""
+
+
+@dataclass(frozen=True)
+class OmnibusTest:
+    """One test of the whole set.
+
+    Attributes
+    ----------
+    name : str
+        "variance", "Ljung-Box", "cumulative periodogram" or "Fisher g".
+    p_value : float
+        p-value over all trials and channels; nan if it could not be applied.
+    statistic : float
+        Variance: mean square over its expectation; else the statistic of the record with the least
+        p-value.
+    where : str
+        Trial and channel of that record.
+    rejected : bool
+        True if Holm's rule over all tests rejects it.
+    """
+
+    name: str
+    p_value: float
+    statistic: float
+    where: str
+    rejected: bool = False
+
+
+def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
+    """Return the channels that share a noise record, by the first of them.
+
+    Channels whose stated records are equal share one; channels without a noise record are left out.
+    """
+    groups: dict[tuple[object, ...], list[str]] = {}
+    for name in residuals.recorded:
+        channel = residuals.channels[name]
+        noise = channel.noise
+        assert noise is not None
+        owner = "" if noise.source == "stated" else name
+        key = (channel.quantity, noise.standard_deviation, noise.degrees_of_freedom, owner)
+        groups.setdefault(key, []).append(name)
+    return {names[0]: tuple(names) for names in groups.values()}
+
+
+def variance_test(residuals: ResidualSet) -> OmnibusTest:
+    """Return the test of the mean squares against the noise records; nan without any record.
+
+    Each noise record gives one p-value: Bonferroni's over all its trials together and each kind of
+    trial, because few static readings would be lost among thousands of samples of ring-downs. These
+    p-values are combined. Each channel in each trial gives a further one, for a gap in a single
+    record.
+    """
+    subsets = [residuals, *_by_kind(residuals)]
+    p_values_of_groups: list[float] = []
+    records: list[_RecordVariance] = []
+    weighted_sum = 0.0
+    total_freedom = 0.0
+    for names in noise_groups(residuals).values():
+        noise_freedom = residuals.degrees_of_freedom(names[0])
+        p_values = []
+        for subset in subsets:
+            square, freedom = mean_square(subset, names)
+            if freedom < LEAST_FREEDOM:
+                continue
+            p_values.append(noise_tests.variance_p_value(square, freedom, noise_freedom))
+            if subset is residuals:
+                weighted_sum = weighted_sum + square * freedom
+                total_freedom = total_freedom + freedom
+        if p_values:
+            p_values_of_groups.append(min(1.0, len(p_values) * min(p_values)))
+        records += _variances_of_records(residuals, names)
+    if not p_values_of_groups:
+        return OmnibusTest("variance", np.nan, np.nan, "")
+    p_value = noise_tests.combine(p_values_of_groups)
+    worst = min(records, key=lambda record: record.p_value, default=_RecordVariance("", 2.0))
+    if len(records) > 1:
+        p_value = min(1.0, 2.0 * min(p_value, len(records) * worst.p_value))
+    # far from the truth a fit may leave no degree of freedom to the whole, but some to a trial
+    statistic = weighted_sum / total_freedom if total_freedom > 0.0 else np.nan
+    return OmnibusTest("variance", p_value, statistic, worst.where)
+
+
+class _RecordVariance(NamedTuple):
+    """The variance test of a single record: its trial and channel, and the p-value."""
+
+    where: str
+    p_value: float
+
+
+def _variances_of_records(
+    residuals: ResidualSet, channels: Sequence[str]
+) -> Iterator[_RecordVariance]:
+    """Yield the variance test of each record of channels that share a noise record."""
+    noise_freedom = residuals.degrees_of_freedom(channels[0])
+    for fitted in residuals.trials:
+        single_trial = replace(residuals, trials=(fitted,))
+        for name in channels:
+            square, freedom = mean_square(single_trial, (name,))
+            if freedom >= LEAST_FREEDOM:
+                p_value = noise_tests.variance_p_value(square, freedom, noise_freedom)
+                yield _RecordVariance(f"{fitted.trial.name}, {name}", p_value)
+
+
+def _by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
+    """Return the set split by the kind of its trials; nothing if there is only one kind."""
+    kinds = list(dict.fromkeys(fitted.trial.kind for fitted in residuals.trials))
+    if len(kinds) < 2:
+        return ()
+    subsets = []
+    for kind in kinds:
+        trials = tuple(fitted for fitted in residuals.trials if fitted.trial.kind is kind)
+        subsets.append(replace(residuals, trials=trials))
+    return tuple(subsets)
+
+
+def serial_tests(
+    residuals: ResidualSet, white: Sequence[FloatArray], coloured: Sequence[str] = ()
+) -> tuple[OmnibusTest, ...]:
+    """Return Ljung-Box, cumulative periodogram and Fisher g over all series of dynamic trials.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The set.
+    white : sequence of (N, C) ndarray
+        White residuals of each trial, from its method `white`.
+    coloured : sequence of str
+        Channels whose noise record itself is not white: they are left out.
+    """
+    ljung_box: list[_SerialTest] = []
+    cumulative_periodogram: list[_SerialTest] = []
+    fisher_g: list[_SerialTest] = []
+    for fitted, name, series in residuals.series(white):
+        if name in coloured:
+            continue
+        where = f"{fitted.trial.name}, {name}"
+        statistic, p_value = noise_tests.ljung_box(series)
+        ljung_box.append(_SerialTest(statistic, p_value, where))
+        statistic, p_value = noise_tests.cumulative_periodogram(series)
+        cumulative_periodogram.append(_SerialTest(statistic, p_value, where))
+        statistic, p_value, index = noise_tests.fisher_g(series)
+        frequency = index / (len(series) * fitted.trial.interval)
+        fisher_g.append(_SerialTest(statistic, p_value, f"{where}, {frequency:.4g} Hz"))
+    return (
+        _combined("Ljung-Box", ljung_box),
+        _combined("cumulative periodogram", cumulative_periodogram),
+        _combined("Fisher g", fisher_g),
+    )
+
+
+class _SerialTest(NamedTuple):
+    """A test of one series: statistic, p-value, and its trial and channel."""
+
+    statistic: float
+    p_value: float
+    where: str
+
+
+def _combined(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
+    """Return the tests of all series as one; nan without any."""
+    if not tests:
+        return OmnibusTest(name, np.nan, np.nan, "")
+    worst = min(tests, key=lambda test: test.p_value)
+    p_value = noise_tests.combine([test.p_value for test in tests])
+    return OmnibusTest(name, p_value, worst.statistic, worst.where)
+
+
+def coloured_noise(residuals: ResidualSet) -> dict[str, str]:
+    """Return the channels whose noise record itself is not white, with a remark for each."""
+    remarks = {}
+    for name, channel in residuals.channels.items():
+        series = record_at_rest(channel)
+        if series is None or channel.noise is None or whiteness_is_tested(channel):
+            continue
+        fraction, p_value, index = noise_tests.fisher_g(series)
+        if p_value < NOISE_RECORD_LEVEL:
+            frequency = ""
+            if channel.noise.interval:
+                frequency = f" at {index / (series.size * channel.noise.interval):.4g} Hz"
+            remarks[name] = (
+                f"The noise record of {name} holds a line{frequency} ({100.0 * fraction:.0f} % of "
+                "its variance): the line is in the acquisition, and whiteness is not tested on "
+                "this channel."
+            )
+        else:
+            remarks[name] = (
+                f"The noise record of {name} is not white: whiteness is not tested on this "
+                "channel, and its degrees of freedom are fewer than its samples."
+            )
+    return remarks

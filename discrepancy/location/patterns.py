@@ -1,0 +1,253 @@
+"""Singular patterns of residuals over the channels, and what they mean."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.location.residuals import FittedTrial, ResidualSet
+
+ALIKE = 0.9
+"""Squared cosine from which two patterns over the channels count as the same."""
+PATTERN_LEVEL = 0.01
+"""Largest p-value of a pattern that is reported."""
+MOST_PATTERNS = 3
+"""Most patterns that are reported for a kind of trial."""
+
+
+@dataclass(frozen=True)
+class Disagreement:
+    """One finding on where model and data disagree.
+
+    Attributes
+    ----------
+    trials : str
+        Kind of the trials in which it shows.
+    subject : str
+        "mode 1", "channel g17", "all channels", ...; for a pattern over channels its meaning.
+    dependence : str
+        What the residuals depend on: "amplitude", "time", "load (not proportional)", "channels",
+        ...
+    share : float
+        Fraction of the excess variance of these trials that it explains.
+    p_value : float
+        p-value of the finding.
+    sentence : str
+        The finding in words.
+    channel : str
+        Channel on which a pattern over channels is strongest.
+    """
+
+    trials: str
+    subject: str
+    dependence: str
+    share: float
+    p_value: float
+    sentence: str
+    channel: str = ""
+
+
+class TrialsOfKind(NamedTuple):
+    """Trials of one kind with the same C channels.
+
+    Attributes
+    ----------
+    name : str
+        Name of the kind, for messages.
+    trials : list of FittedTrial
+        The trials.
+    white : list of (N, C) ndarray
+        Their white residuals.
+    """
+
+    name: str
+    trials: list[FittedTrial]
+    white: list[FloatArray]
+
+    def disagreement(
+        self, subject: str, dependence: str, phrase: str, share: float, p_value: float
+    ) -> Disagreement:
+        """Return a finding in these trials.
+
+        Parameters
+        ----------
+        subject, dependence : str
+            Entries of the finding.
+        phrase : str
+            Begin of its sentence.
+        share : float
+            Fraction of the excess variance that it explains.
+        p_value : float
+            p-value of the finding.
+        """
+        p_text = "p < 1e-6" if p_value < 1e-6 else f"p = {p_value:.1g}"
+        sentence = (
+            f"{phrase} in {self.name} trials; explains {100.0 * share:.0f} % of the excess "
+            f"variance ({p_text})."
+        )
+        return Disagreement(self.name, subject, dependence, share, p_value, sentence)
+
+
+def kinds_of(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[TrialsOfKind]:
+    """Return the trials grouped by kind and channels; the residuals of a group form one matrix.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The set.
+    white : sequence of (N, C) ndarray
+        White residuals of each trial.
+    """
+    groups: dict[tuple[str, tuple[str, ...]], TrialsOfKind] = {}
+    for fitted, values in zip(residuals.trials, white, strict=True):
+        kind = fitted.trial.kind.value.replace("ringdown", "ring-down")
+        key = (kind, fitted.trial.channels)
+        if key not in groups:
+            is_first_of_kind = all(other_kind != kind for other_kind, _ in groups)
+            name = kind if is_first_of_kind else f"{kind} ({len(groups) + 1})"
+            groups[key] = TrialsOfKind(name, [], [])
+        groups[key].trials.append(fitted)
+        groups[key].white.append(values)
+    return list(groups.values())
+
+
+def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagreement]:
+    """Return the significant singular patterns of a kind of trial, largest first.
+
+    They are singular vectors of the residual matrix (samples x channels, in units of the noise).
+    Their p-value is that of the largest singular value of a noise matrix of this size: Tracy and
+    Widom's law (Johnstone 2001, Ann. Statist. 29, 295-327) by the gamma distribution of its moments
+    (Chiani 2014, J. Multivar. Anal. 129, 69-81), averaged over the error of the noise record of the
+    loudest channel.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The set, for the noise records.
+    kind : TrialsOfKind
+        The trials.
+    """
+    matrix = np.vstack(kind.white)
+    sample_count, channel_count = matrix.shape
+    if min(sample_count, channel_count) < 2:
+        return []
+    _, singular_values, right_vectors = np.linalg.svd(matrix, full_matrices=False)
+    sum_of_squares = float(np.sum(singular_values**2))
+    excess_squares = max(sum_of_squares - sample_count * channel_count, 1e-9)
+    # centre and scale of the largest squared singular value of noise (Johnstone 2001, theorem 1.1)
+    longer_root = np.sqrt(max(sample_count, channel_count) - 1.0)
+    shorter_root = np.sqrt(min(sample_count, channel_count))
+    centre = (longer_root + shorter_root) ** 2
+    scale = (longer_root + shorter_root) * (1.0 / longer_root + 1.0 / shorter_root) ** (1.0 / 3.0)
+    noise_ratios = _largest_noise_ratios(residuals, kind)
+    patterns: list[Disagreement] = []
+    # after k patterns the rest is compared with whole noise matrices: a little too strict, never
+    # lax
+    for square, weights in zip(singular_values[:MOST_PATTERNS] ** 2, right_vectors, strict=False):
+        standardised = (square / noise_ratios - centre) / scale
+        tail = stats.gamma.sf(standardised + 9.84801, 46.446, scale=0.186054)
+        p_value = float(np.mean(tail))
+        if p_value > PATTERN_LEVEL:
+            break
+        square_of_noise = max(sample_count, channel_count)
+        share = float(np.clip((square - square_of_noise) / excess_squares, 0.0, 1.0))
+        meaning, phrase = _meaning(residuals, kind.trials, weights)
+        channel = kind.trials[0].trial.channels[int(np.argmax(np.abs(weights)))]
+        finding = kind.disagreement(meaning, "channels", phrase, share, p_value)
+        patterns.append(replace(finding, channel=channel))
+    return patterns
+
+
+def _largest_noise_ratios(residuals: ResidualSet, kind: TrialsOfKind) -> FloatArray:
+    """Return quantiles (1000,) of the largest true variance of C channels over that of its record.
+
+    The records are taken to have the degrees of freedom of the shortest one.
+    """
+    channels = kind.trials[0].trial.channels
+    freedoms = [residuals.degrees_of_freedom(name) for name in channels]
+    freedom = min([freedom for freedom in freedoms if freedom > 0.0], default=np.inf)
+    freedom = min(freedom, 1e9)
+    probabilities = (np.arange(1000) + 0.5) / 1000
+    quantiles = stats.chi2.isf(probabilities ** (1.0 / len(channels)), freedom)
+    return np.asarray(freedom / quantiles)
+
+
+class _PatternMeaning(NamedTuple):
+    """What a pattern over the channels may mean.
+
+    Attributes
+    ----------
+    subject : str
+        "sensor", "common", "dynamics or load" or "mixed".
+    phrase : str
+        Begin of a sentence about it.
+    """
+
+    subject: str
+    phrase: str
+
+
+def _meaning(
+    residuals: ResidualSet, trials: Sequence[FittedTrial], weights: FloatArray
+) -> _PatternMeaning:
+    """Return the meaning of a pattern over the channels.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The set, for the channels.
+    trials : sequence of FittedTrial
+        The trials in which it shows.
+    weights : (C,) ndarray
+        The pattern.
+    """
+    channels = trials[0].trial.channels
+    candidates = []
+    for meaning, pattern in _known_patterns(residuals, trials, weights):
+        if np.any(pattern):
+            norms = (weights @ weights) * (pattern @ pattern)
+            candidates.append((float((weights @ pattern) ** 2 / norms), meaning))
+    best_agreement, best = max(candidates, key=lambda candidate: candidate[0])
+    if best_agreement < ALIKE:
+        strongest = np.argsort(-np.abs(weights))[:3]
+        names = ", ".join(channels[index] for index in strongest)
+        return _PatternMeaning("mixed", f"A pattern of its own, strongest on {names},")
+    rivals = set()
+    for agreement, meaning in candidates:
+        agrees_as_well = agreement >= max(ALIKE, best_agreement - 0.05)
+        if agrees_as_well and meaning.subject != best.subject:
+            rivals.add(meaning.subject)
+    if rivals:
+        phrase = f"{best.phrase.rstrip(',')} or equally {' or '.join(sorted(rivals))}"
+        return _PatternMeaning("mixed", phrase)
+    return best
+
+
+def _known_patterns(
+    residuals: ResidualSet, trials: Sequence[FittedTrial], weights: FloatArray
+) -> Iterator[tuple[_PatternMeaning, FloatArray]]:
+    """Yield meanings with their patterns over the channels (C,), in units of the noise.
+
+    A pattern is zero if the predictions are zero.
+    """
+    channels = trials[0].trial.channels
+    noise = trials[0].noise_deviation
+    largest = int(np.argmax(np.abs(weights)))
+    single_channel = np.eye(len(weights))[largest]
+    sensor = _PatternMeaning("sensor", f"One channel, {channels[largest]} (a sensor),")
+    yield sensor, single_channel
+    if len({residuals.channels[name].quantity for name in channels}) == 1:
+        phrase = "All channels alike, whatever they measure (hum, temperature or zero),"
+        yield _PatternMeaning("common", phrase), 1.0 / noise
+    # the main pattern of the predictions
+    predictions = []
+    for fitted in trials:
+        predictions.append((fitted.prediction - fitted.prediction.mean(axis=0)) / noise)
+    prediction = np.vstack(predictions)
+    _, _, right_vectors = np.linalg.svd(prediction, full_matrices=False)
+    response = right_vectors[0] if np.any(prediction) else 0.0 * right_vectors[0]
+    phrase = "The pattern of the predicted response itself (dynamics, load, or clock)"
+    yield _PatternMeaning("dynamics or load", phrase), response

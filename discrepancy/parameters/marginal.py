@@ -1,0 +1,207 @@
+"""The posterior density of a model's parameters, with all nuisances integrated out."""
+
+from contextlib import suppress
+from copy import copy
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.errors import FitError, ModelError
+from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.fitting import CandidateFit, fit
+from discrepancy.fits.normal_equations import cholesky_factor, normal_equations, solve_factored
+from discrepancy.fits.problem import Problem
+from discrepancy.parameters.cut_gaussian import CutGaussian
+
+NOTHING = Candidate()
+"""The hypothesis that the model lacks nothing."""
+STARTS = 4
+"""Draws of the prior from which further fits begin, to find several optima."""
+APART = 3.0
+"""Distance of two optima, in standard deviations, from which on they are different ones."""
+COMPARABLE = 10.0
+"""Difference of evidence to the best optimum [nat] up to which another one counts."""
+
+
+class Refusal(NamedTuple):
+    """Parameters within the range that the model refused.
+
+    Attributes
+    ----------
+    parameters : (P,) ndarray
+        Scaled parameters; nan for those that were fitted.
+    reason : str
+        Message of the model.
+    """
+
+    parameters: FloatArray
+    reason: str
+
+
+class Marginal:
+    """The posterior density of the parameters, with all nuisances integrated out.
+
+    Called with scaled parameters u = (value - prior mean) / deviation it returns the energy: -ln
+    p(parameters | campaign) up to a constant [nat].
+
+    Parameters
+    ----------
+    problem : Problem
+        Campaign and model.
+
+    Attributes
+    ----------
+    free : (P,) ndarray of int
+        Indices of the calibrated parameters with a prior deviation; u has an entry for each.
+    low, high : (P,) ndarray
+        Ends of the model's range as scaled parameters; the prior is cut off there.
+    refused : list of Refusal
+        Parameters within the range that the model refused.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        self._problem = problem
+        shared = problem.shared
+        self.free = np.flatnonzero(shared.scale[: shared.count] > 0.0)
+        self.low, self.high = shared.ends[:, self.free]
+        self._near = problem.start(NOTHING)
+        self.refused: list[Refusal] = []
+
+    def values(self, u: FloatArray) -> FloatArray:
+        """Return the parameters (..., P) in their units, of scaled ones."""
+        shared = self._problem.shared
+        return shared.centre[self.free] + shared.scale[self.free] * u
+
+    def inside(self, u: FloatArray) -> NDArray[np.bool_]:
+        """Return which scaled parameters (..., P) lie within the model's range."""
+        return np.asarray(np.all((u >= self.low) & (u <= self.high), axis=-1))
+
+    def fitted(
+        self,
+        u: FloatArray,
+        trials: Problem | None = None,
+        *,
+        fixed: NDArray[np.bool_] | None = None,
+        near: Point | None = None,
+    ) -> CandidateFit:
+        """Return the fit of the nuisances, with parameters fixed at given values.
+
+        Parameters
+        ----------
+        u : (P,) ndarray
+            Scaled parameters.
+        trials : Problem, optional
+            Other trials of the campaign.
+        fixed : (P,) ndarray of bool, optional
+            Parameters that stay at `u`, all by default; the others are fitted with the nuisances.
+        near : Point, optional
+            Where the fit begins.
+
+        Raises
+        ------
+        FitError, ModelError
+            If the model cannot have these parameters.
+        """
+        problem = copy(trials or self._problem)
+        shared = problem.shared
+        if fixed is None:
+            fixed = np.ones(len(self.free), dtype=bool)
+        fixed_indices = self.free[fixed]
+        # priors of the fixed parameters: no deviation, and the range is their value
+        arrays = {name: getattr(shared, name).copy() for name in ("centre", "low", "high", "scale")}
+        for array in arrays.values():
+            array[fixed_indices] = self.values(u)[fixed]
+        arrays["scale"][fixed_indices] = 0.0
+        problem.shared = replace(shared, **arrays)
+        start = near
+        if start is None:
+            start = self._near if trials is None else problem.start(NOTHING)
+        start_shared = start.shared.copy()
+        start_shared[fixed_indices] = 0.0
+        try:
+            return fit(problem, NOTHING, replace(start, shared=start_shared))
+        except ModelError as cause:
+            self.refused.append(Refusal(np.where(fixed, u, np.nan), str(cause)))
+            raise
+
+    def __call__(self, u: FloatArray) -> float:
+        """Return the energy at scaled parameters (P,); infinite outside the model's range."""
+        if not self.inside(u):
+            return np.inf
+        try:
+            fitted = self.fitted(u)
+        except (FitError, ModelError):
+            return np.inf
+        return 0.5 * float(u @ u) - fitted.log_evidence
+
+    def optima(self, seed: int) -> list[CandidateFit]:
+        """Return the maxima of the posterior that count, most probable first.
+
+        Their evidence is that within the model's range.
+
+        Parameters
+        ----------
+        seed : int
+            Seed of the draws from which fits begin.
+
+        Raises
+        ------
+        FitError, ModelError
+            If the model fails at its prior mean.
+        """
+        problem = self._problem
+        fits = [fit(problem, NOTHING, problem.start(NOTHING), iterations=40)]
+        generator = np.random.default_rng(seed)
+        for _ in range(STARTS):
+            start = problem.start(NOTHING)
+            start.shared[self.free] = generator.standard_normal(len(self.free))
+            with suppress(FitError, ModelError):
+                fits.append(fit(problem, NOTHING, start, iterations=40))
+        # of equal fits the first one counts
+        fits.sort(key=lambda fitted: round(fitted.objective, 3))
+        all_fitted = np.ones(len(self.free), dtype=bool)
+        optima: list[CandidateFit] = []
+        for fitted in fits:
+            if not any(self._is_same_optimum(optimum, fitted) for optimum in optima):
+                evidence = self.gaussian_about(fitted, all_fitted).log_evidence
+                optima.append(replace(fitted, log_evidence=evidence))
+        optima.sort(key=lambda optimum: -optimum.log_evidence)
+        best = optima[0]
+        self._near = best.point
+        least_evidence = best.log_evidence - COMPARABLE
+        return [optimum for optimum in optima if optimum.log_evidence > least_evidence]
+
+    def _is_same_optimum(self, first: CandidateFit, second: CandidateFit) -> bool:
+        """Return whether two fits are one optimum, by their distance in standard deviations."""
+        free = self.free
+        shift = first.point.shared[free] - second.point.shared[free]
+        covariance = first.covariance[np.ix_(free, free)]
+        return bool(shift @ np.linalg.solve(covariance, shift) < APART**2)
+
+    def gaussian_about(self, fitted: CandidateFit, which: NDArray[np.bool_]) -> CutGaussian:
+        """Return the Gaussian approximation about a fit (Laplace's method), cut off at the range.
+
+        A fit may lie at an end of the range; the Gaussian has its mean beyond it then.
+
+        Parameters
+        ----------
+        fitted : CandidateFit
+            The fit.
+        which : (P,) ndarray of bool
+            The parameters that were fitted, of which the Gaussian is.
+        """
+        problem = self._problem
+        indices = self.free[which]
+        equations = normal_equations(problem, fitted, NOTHING, problem.precisions(fitted.sums))
+        # the Newton step to the maximum without the range
+        step = solve_factored(cholesky_factor(equations.matrix), equations.gradient)
+        return CutGaussian(
+            mean=fitted.point.shared[indices] + step[indices],
+            covariance=fitted.covariance[np.ix_(indices, indices)],
+            low=self.low[which],
+            high=self.high[which],
+            log_integral=fitted.log_evidence + 0.5 * float(equations.gradient @ step),
+        )

@@ -1,0 +1,160 @@
+"""Texts on what a campaign can decide: visible effects, and effects that look alike."""
+
+from collections.abc import Collection, Sequence
+from math import inf, isfinite
+
+import numpy as np
+
+from discrepancy.campaign.records import Campaign, TrialKind
+from discrepancy.catalogue.entry import Effect
+from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
+from discrepancy.report.text import WORDS, number, unit_text
+from reporting.words import listing
+
+
+def seen_of(detectability: Detectability) -> tuple[str, str, str]:
+    """Return texts on whether an effect is visible, from which size on, and its prior median."""
+    is_visible = detectability.distance >= DETECTED
+    visible = "yes" if is_visible else "larger than usual only"
+    if not detectability.parameter:
+        return visible, "at once" if is_visible else "not at its prior median", ""
+    unit = unit_text(detectability.unit)
+    least_size = f"{number(detectability.detectable, 2)} {unit}".rstrip()
+    median = f"{number(detectability.typical, 2)} {unit}".rstrip()
+    if not isfinite(detectability.detectable):
+        return "not visible", "never", median
+    return visible, least_size, median
+
+
+def neighbours(separability: Separability, name: str) -> list[str]:
+    """Return the effects that these data cannot distinguish from one, in either direction."""
+    if name not in separability.identifiers:
+        return []
+    index = separability.identifiers.index(name)
+    distance = np.minimum(separability.distance[index], separability.distance[:, index])
+    is_near = distance < CONFUSED
+    return [
+        other
+        for other_index, other in enumerate(separability.identifiers)
+        if is_near[other_index] and other_index != index
+    ]
+
+
+def group_lines(separability: Separability, hint: str = "the table says to which") -> list[str]:
+    """Return a sentence for each group of effects that look alike, or one that there is none.
+
+    Parameters
+    ----------
+    separability : Separability
+        What the campaign can distinguish.
+    hint : str
+        Where a reader finds which member is close to which.
+    """
+    detectable = [
+        item for item in separability.detectability if not item.reason and isfinite(item.detectable)
+    ]
+    shows_any = any(item.parameter and item.distance > 0.0 for item in detectable)
+    if not separability.identifiers or not shows_any:
+        return [WORDS.say("nothing_shown")]
+    if not separability.groups:
+        return [WORDS.say("all_apart")]
+    lines = []
+    for group in separability.groups:
+        names = [name.replace("_", " ") for name in group]
+        if len(names) == 2:
+            lines.append(f"These data cannot tell {names[0]} from {names[1]}.")
+        else:
+            lines.append(
+                f"Confusion group, each close to at least one other ({hint}): {listing(names)}."
+            )
+    return lines
+
+
+def needs(
+    separability: Separability,
+    campaign: Campaign,
+    effects: Sequence[Effect],
+    possible: Collection[TrialKind],
+) -> list[str]:
+    """Return sentences on what the campaign would need to decide more.
+
+    Parameters
+    ----------
+    separability : Separability
+        What the campaign can distinguish.
+    campaign : Campaign
+        The campaign.
+    effects : sequence of Effect
+        The catalogue.
+    possible : collection of TrialKind
+        Kinds of trials that the model follows.
+    """
+    known_effects = {effect.identifier: effect for effect in effects}
+    missing_kinds = set(possible) - {trial.kind for trial in campaign.trials}
+    lines = []
+    for group in separability.groups:
+        kinds_of_effects = [known_effects[name].acts_on for name in group if name in known_effects]
+        lines.append(_sentence_on_group(group, kinds_of_effects, missing_kinds))
+    lines += _sentence_on_hidden_effects(separability)
+    without_noise = [name for name, channel in campaign.channels.items() if channel.noise is None]
+    if without_noise:
+        lines.append(WORDS.say("give_noise", names=", ".join(without_noise)))
+    if not campaign.held_out:
+        lines.append(WORDS.say("hold_out"))
+    return lines
+
+
+def _sentence_on_group(
+    group: Sequence[str],
+    kinds_of_effects: Sequence[frozenset[TrialKind]],
+    missing_kinds: Collection[TrialKind],
+) -> str:
+    """Return which trials would distinguish effects that look alike, or that loads must vary.
+
+    Parameters
+    ----------
+    group : sequence of str
+        Identifiers of the effects.
+    kinds_of_effects : sequence of frozenset of TrialKind
+        Kinds of trials that each of them changes.
+    missing_kinds : collection of TrialKind
+        Kinds that are possible and not in the campaign.
+    """
+    changed_by_some: frozenset[TrialKind] = frozenset().union(*kinds_of_effects)
+    changed_by_all = frozenset(TrialKind).intersection(*kinds_of_effects)
+    distinguishing = changed_by_some - changed_by_all
+    kinds = [kind for kind in TrialKind if kind in distinguishing and kind in missing_kinds]
+    return WORDS.say(
+        "add_kinds" if kinds else "vary",
+        names=listing(name.replace("_", " ") for name in group),
+        kinds=" or ".join(WORDS.content["kinds"][kind.value] for kind in kinds),
+    )
+
+
+def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
+    """Return the sentence on effects that these data show only if they are large.
+
+    Empty without any.
+    """
+    hidden = [
+        item
+        for item in separability.detectability
+        if not item.reason
+        and item.parameter
+        and isfinite(item.detectable)
+        and item.distance < DETECTED
+    ]
+    if not hidden:
+        return []
+    nearest = max(hidden, key=lambda item: item.distance)
+    factor = inf
+    if nearest.distance > 0.0:
+        factor = (DETECTED / nearest.distance) ** 0.5
+    sentence = WORDS.say(
+        "unseen" if len(hidden) > 1 else "unseen_one",
+        unseen=listing(item.effect.identifier.replace("_", " ") for item in hidden),
+        first=nearest.effect.identifier.replace("_", " "),
+        factor=factor,
+        trials=factor**2,
+    )
+    return [sentence]

@@ -1,0 +1,203 @@
+"""Figures of residuals over the load, and of the windows in time with the largest gaps."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from discrepancy.campaign.records import Quantity, TrialKind
+from discrepancy.campaign.units import UNITS
+from discrepancy.location.residuals import ResidualSet
+from discrepancy.report.residual_figures import (
+    DrawnModel,
+    draw_noise,
+    models,
+    panels,
+    scale_of,
+    size_bar,
+)
+from discrepancy.verdict import GapWindow
+from reporting import figures as style
+
+MOST_RECORDS = 12
+"""Records that are drawn; those with the largest gaps go first."""
+LONGEST_NAME = 26
+
+
+class _LoadPanel(NamedTuple):
+    """A panel of residuals over the load: trials, label of the load, quantity and channels."""
+
+    kind: TrialKind
+    label: str
+    quantity: Quantity
+    names: list[str]
+
+
+def _load_panels(residuals: ResidualSet) -> list[_LoadPanel]:
+    """Return a panel for each quantity of static trials and of flights."""
+    found = []
+    for kind, label in ((TrialKind.STATIC, "force, N"), (TrialKind.FLIGHT, "load factor")):
+        measured: set[str] = set()
+        for fitted in residuals.trials:
+            if fitted.trial.kind is kind:
+                measured.update(fitted.trial.channels)
+        for quantity in Quantity:
+            names = [
+                name
+                for name, channel in residuals.channels.items()
+                if channel.quantity is quantity and name in measured
+            ]
+            if names:
+                found.append(_LoadPanel(kind, label, quantity, names))
+    return found
+
+
+def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
+    """Draw residuals of static trials and flights over the load, by quantity.
+
+    None without such trials.
+    """
+    load_panels = _load_panels(before)[:4]
+    if not load_panels:
+        return None
+    columns = min(len(load_panels), 2)
+    rows = (len(load_panels) + columns - 1) // columns
+    figure, grid = panels(rows, columns, 2.25 * rows + 0.3)
+    all_axes = style.keep_first_panels(grid, len(load_panels))
+    for letter, axes, panel in zip("abcd", all_axes, load_panels, strict=False):
+        factor, unit = UNITS[panel.quantity].drawn
+        noises = []
+        for drawn in models(before, after):
+            noises.append(_draw_loads(axes, drawn, panel.kind, panel.names, factor))
+        draw_noise(axes, noises[0], 0.25)
+        axes.axhline(0.0, color=style.OBSERVED, lw=0.6)
+        title = f"{letter}  {panel.kind.value}, {panel.quantity.value}"
+        axes.set(xlabel=panel.label, ylabel=f"residual, {unit}", title=title)
+    handles, labels = all_axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3)
+    return figure
+
+
+def _draw_loads(
+    axes: Axes, drawn: DrawnModel, kind: TrialKind, names: Sequence[str], factor: float
+) -> float:
+    """Draw the residuals of a model over the load, and return the largest deviation of the noise.
+
+    Parameters
+    ----------
+    axes : Axes
+        Where they are drawn.
+    drawn : DrawnModel
+        The model.
+    kind : TrialKind
+        Kind of the trials.
+    names : sequence of str
+        Names of the channels.
+    factor : float
+        Factor from SI to the unit of the figure.
+    """
+    noise = 0.0
+    label = drawn.label
+    shift = 0.0 if drawn.marker == "o" else 0.006  # so that models do not hide each other
+    for fitted in drawn.residuals.trials:
+        trial = fitted.trial
+        if trial.kind is not kind:
+            continue
+        load_range = float(np.ptp(trial.load)) or 1.0
+        for name in names:
+            if name not in trial.channels:
+                continue
+            column = fitted.column(name)
+            used = fitted.used[:, column]
+            noise = max(noise, factor * float(fitted.noise_deviation[column]))
+            axes.plot(
+                trial.load[used] + shift * load_range,
+                factor * fitted.residual[used, column],
+                drawn.marker,
+                ms=2.8,
+                lw=0.0,
+                mfc="none" if trial.held_out else drawn.colour,
+                mec=drawn.colour,
+                mew=0.7,
+                alpha=0.8,
+                label=label,
+            )
+            label = "_nolegend_"
+    return noise
+
+
+def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
+    """Draw the windows of the records with the largest gaps; None without a window."""
+    if not windows:
+        return None
+    sizes: dict[str, float] = {}
+    for window in windows:
+        sizes[window.trial] = max(sizes.get(window.trial, 0.0), window.size)
+    largest = sorted(sizes, key=lambda name: -sizes[name])[:MOST_RECORDS]
+    trials = [name for name in sizes if name in largest]
+    norm = scale_of([window.size for window in windows])
+    has_two_rows = any(window.with_effect for window in windows)
+    figure, ((axes,),) = panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
+    for row, name in enumerate(trials):
+        windows_of_trial = [window for window in windows if window.trial == name]
+        _draw_record(axes, row, windows_of_trial, norm, both=has_two_rows)
+    axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
+    axes.set_ylim(len(trials) - 0.4, -0.6)
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+    axes.set_xlabel("time since the start of the trial, s")
+    size_bar(figure, norm, [axes])
+    return figure
+
+
+def _draw_record(
+    axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool
+) -> None:
+    """Draw the windows of a record as bars.
+
+    `both`: those with the effect have a row of their own.
+    """
+    first, last = windows[0].first, windows[0].last
+    lines = (row - 0.14, row + 0.2) if both else row
+    axes.hlines(lines, first, last, color=style.REFERENCE, lw=1.0, zorder=1)
+    for window in windows:
+        begin = first if window.begin is None else window.begin.value
+        end = last if window.end is None else window.end.value
+        if window.with_effect:
+            bottom, height = row + 0.1, 0.2
+        else:
+            bottom, height = row - 0.34, 0.4 if both else 0.68
+        axes.broken_barh(
+            [(begin, end - begin)],
+            (bottom, height),
+            facecolor=colormaps[style.LEVELS](float(norm(window.size))),
+            edgecolor="#333333",
+            lw=0.5,
+            zorder=2,
+        )
+        middle = bottom + 0.5 * height
+        cap = 0.3 * height
+        for moment in (window.begin, window.end):
+            if moment is None:
+                continue
+            axes.hlines(middle, moment.low, moment.high, color="white", lw=2.6, zorder=3)
+            axes.hlines(middle, moment.low, moment.high, color=style.OBSERVED, lw=1.2, zorder=4)
+            axes.vlines(
+                [moment.low, moment.high],
+                middle - cap,
+                middle + cap,
+                color=style.OBSERVED,
+                lw=0.9,
+                zorder=4,
+            )
+
+
+def _short(name: str) -> str:
+    """Return a name, cut off with an ellipsis if it is long."""
+    if len(name) <= LONGEST_NAME:
+        return name
+    return f"{name[: LONGEST_NAME - 1]}\N{HORIZONTAL ELLIPSIS}"

@@ -1,0 +1,241 @@
+"""The published measurements of the wing of Kapteyn et al. 2021 as a campaign."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import helmert
+
+from calibration.dynamics.records import RingDownRecord, read_records
+from calibration.errors import CalibrationError
+from calibration.static.experiments import LoadDisplacementData, read_measurements
+from discrepancy.campaign.records import FloatArray
+from discrepancy.errors import CampaignDataError, CampaignFileError
+from discrepancy.sources.rig_files import RigFiles
+from reporting.table_file import table_text
+from reporting.words import counted, is_or_are
+
+
+class PlotWindow(NamedTuple):
+    """Samples of a ring-down in a window of a published plot.
+
+    Attributes
+    ----------
+    time : (N,) ndarray
+        Times since the first sample [s].
+    signal : (N,) ndarray
+        Strain signal [V].
+    """
+
+    time: FloatArray
+    signal: FloatArray
+
+
+SIGNAL = "spanwise"
+"""Name of the channel of the ring-downs: their strain signal."""
+TIP = "tip"
+"""Name of the channel of the loading runs: the displacement of the tip."""
+READING_ERROR = 33e-6 / 3.0**0.5
+"""Standard deviation of a value read off the plot [V]: uniform within +-33 microvolt.
+
+The plots show the same motion on the same grid, so that the error is common to the trials, and
+averaging does not reduce it.
+"""
+TREND = 67
+"""Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
+BEGIN = 0.8
+"""Begin of the window after the release [s].
+
+Before it higher modes ring, which the model does not have.
+"""
+COLUMNS = 4
+"""Columns of the plot that are averaged into one sample.
+
+Four columns (32 ms) have a zero of their frequency response at 30.8 Hz, where the second bending
+mode rings."""
+RELEASE = {"displacement": 0.05, "deviation": 1.0, "at_rest": False, "mode_count": 2}
+"""Release of the ring-downs: nominal displacement of the tip at the begin of the window [m].
+
+As the scale of the signal is unknown, any displacement would do. The state of two modes is free."""
+AT_TIP = {"name": TIP, "quantity": "displacement", "unit": "m", "output": "load_point_displacement"}
+HELD_OUT = (3, 5)
+"""Trials kept for proof, counted from 1."""
+
+
+def real_wing(
+    data: Path, *, begin: float = BEGIN, columns: int = COLUMNS, detrended: bool = True
+) -> RigFiles:
+    """Return the ring-downs of the wing of Kapteyn et al., and its loading runs.
+
+    Parameters
+    ----------
+    data : Path
+        The authors' calibration folder, with `step2` and `step3`.
+    begin : float
+        Begin of the window after the release [s].
+    columns : int
+        Columns of the plot that are averaged into one sample.
+    detrended : bool
+        True to subtract the slow zero that the trials share: a moving average over three periods
+        (Hann weights), averaged over the trials. It moves by a third of a millivolt and is not a
+        motion of the wing. Slow changes of a single trial are noise and stay.
+
+    Raises
+    ------
+    CampaignFileError
+        If the measurements cannot be read.
+    CampaignDataError
+        If there are fewer than two records, or of several lengths, or too short ones.
+    """
+    with CampaignFileError.instead_of(
+        CalibrationError, before="The measurements of the wing cannot be read: "
+    ):
+        records = read_records(data)
+        folders = [data / above / "step2" for above in (".", "datafiles", "src/datafiles")]
+        measurements = None
+        if any(folder.is_dir() for folder in folders):
+            measurements = read_measurements(data)
+    if len({len(record.time) for record in records}) > 1 or len(records) < 2:
+        raise CampaignDataError(
+            f"{data} must hold two or more ring-down records of one length; it holds "
+            f"{len(records)}."
+        )
+    zero = _shared_zero(records) if detrended else np.zeros(records[0].count)
+    windows = [_plot_window(record, zero, begin, columns) for record in records]
+    interval = float(windows[0].time[1])
+    scatter = trial_scatter(windows)
+    deviation = float(np.std(scatter, ddof=1))
+    # scaled, so that the noise includes the reading error that all trials share
+    noise = scatter * np.hypot(1.0, READING_ERROR / deviation)
+    tables = {
+        "noise.csv": table_text({"time": interval * np.arange(float(len(noise))), SIGNAL: noise})
+    }
+    keys: dict[str, Any] = {
+        "remarks": (
+            f"Ring-downs: {records[0].source} to {records[-1].source}, from {begin:g} s after the "
+            f"release; {counted(columns, 'column')} of the plot averaged into a sample of "
+            f"{1e3 * interval:.3g} ms.",
+            f"Noise of the signal: scatter between the trials, {1e6 * deviation:.3g} microvolt, "
+            f"and the reading error that all share, {1e6 * READING_ERROR:.3g} microvolt.",
+        )
+    }
+    trials: list[dict[str, Any]] = []
+    if measurements is not None:
+        loading = _loading_runs(measurements)
+        tables |= loading.tables
+        keys["channel"] = loading.campaign_keys["channel"]
+        trials += loading.campaign_keys["trial"]
+    for number, window in enumerate(windows, start=1):
+        file = f"release_{number}.csv"
+        tables[file] = table_text({"time": window.time, SIGNAL: window.signal})
+        trials.append(
+            {
+                "name": f"release {number}",
+                "kind": "ringdown",
+                "file": file,
+                "held_out": number in HELD_OUT,
+                "release": RELEASE,
+            }
+        )
+    return RigFiles(tables, {**keys, "trial": trials})
+
+
+def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
+    """Return the loading runs of the wing as static trials, and the channel of the tip."""
+    # an error of the load shows as one of the displacement
+    compliance = float(np.median(measurements.displacement / measurements.load))
+    by_load = measurements.load_standard_deviation * compliance
+    deviation = float(np.hypot(measurements.displacement_standard_deviation, by_load))
+    channel = {**AT_TIP, "noise": {"standard_deviation": deviation}}
+    tables = {}
+    trials = []
+    for index in np.unique(measurements.run).tolist():
+        rows = measurements.run == index
+        run = f"run {index + 1}"
+        file = f"loading_{index + 1}.csv"
+        tables[file] = table_text(
+            {"force": measurements.load[rows], TIP: measurements.displacement[rows]}
+        )
+        trials.append({"name": f"loading {run}", "kind": "static", "file": file, "run": run})
+    return RigFiles(tables, {"channel": [channel], "trial": trials})
+
+
+def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
+    """Return the noise of the signal from the differences between R trials of N samples.
+
+    All trials are releases of one kind, so that they share the motion, whatever its law;
+    differences beyond amplitude, delay and zero are noise. Each trial is fitted by the mean of all,
+    its first and second time derivatives, and a constant. The R - 1 orthonormal contrasts of the
+    residuals (Helmert) are independent and have the variance of a single trial. The fit takes four
+    degrees of freedom of each contrast, for which the variance is corrected.
+
+    Parameters
+    ----------
+    windows : sequence of PlotWindow
+        The trials.
+
+    Returns
+    -------
+    ((R - 1) N,) ndarray
+        Noise [V].
+    """
+    signals = np.array([window.signal for window in windows])
+    trial_count, sample_count = signals.shape
+    mean = signals.mean(axis=0)
+    rate = np.gradient(mean)
+    basis = np.stack((mean, rate, np.gradient(rate), np.ones(sample_count)), axis=1)
+    basis /= np.linalg.norm(basis, axis=0)
+    coefficients, *_ = np.linalg.lstsq(basis, signals.T, rcond=None)
+    residual = signals.T - basis @ coefficients
+    contrasts = (residual @ helmert(trial_count).T).T
+    correction = np.sqrt(sample_count / (sample_count - basis.shape[1]))
+    return np.asarray(contrasts.ravel() * correction)
+
+
+def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
+    """Return the slow zero (N,) [V] that all records share.
+
+    nan at the ends, where it is not known.
+    """
+    weights = np.hanning(TREND + 2)[1:-1]
+    mean = np.mean([record.signal for record in records], axis=0)
+    zero = np.full(len(mean), np.nan)
+    half = TREND // 2
+    zero[half : len(mean) - half] = np.convolve(mean, weights / weights.sum(), "valid")
+    return zero
+
+
+def _plot_window(
+    record: RingDownRecord, zero: FloatArray, begin: float, columns: int
+) -> PlotWindow:
+    """Return the samples of a record after the begin of the window.
+
+    Parameters
+    ----------
+    record : RingDownRecord
+        The record, with a value for each column of the plot.
+    zero : (N,) ndarray
+        Slow zero that is subtracted [V]; nan where it is not known.
+    begin : float
+        Begin of the window after the release [s].
+    columns : int
+        Columns that are averaged into one sample.
+
+    Raises
+    ------
+    CampaignDataError
+        If fewer than 60 samples are left.
+    """
+    inside = np.flatnonzero(np.isfinite(zero) & (record.time >= begin))
+    count = len(inside) // columns
+    if count < 60:
+        raise CampaignDataError(
+            f"{record.source}: {counted(count, 'sample')} {is_or_are(count)} left after {begin:g} "
+            "s; 60 are needed."
+        )
+    averaged = inside[: count * columns].reshape(count, columns)
+    time = record.time[averaged].mean(axis=1)
+    interval = float(time[-1] - time[0]) / (count - 1)
+    signal = np.asarray((record.signal - zero)[averaged].mean(axis=1))
+    return PlotWindow(interval * np.arange(float(count)), signal)

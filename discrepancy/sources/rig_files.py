@@ -1,0 +1,18 @@
+"""Files of a campaign that are made from published measurements."""
+
+from typing import Any, NamedTuple
+
+
+class RigFiles(NamedTuple):
+    """Files of a campaign that are made from published measurements.
+
+    Attributes
+    ----------
+    tables : dict of str to str
+        Texts of the tables by the names of their files.
+    campaign_keys : dict
+        What `campaign.toml` states beside the shipped part: trials, channels and remarks.
+    """
+
+    tables: dict[str, str]
+    campaign_keys: dict[str, Any]

@@ -1,0 +1,95 @@
+"""Remarks beside a verdict: strained priors, and effects that were not tested or fitted."""
+
+from collections.abc import Sequence
+from math import isnan, nan
+
+from discrepancy.catalogue.entry import Effect, Setting
+from discrepancy.catalogue.needs import NO_PORT
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.problem import Problem
+from discrepancy.search.strategy import Search
+from discrepancy.search_settings import SEARCH
+from discrepancy.system.lumped_model import LumpedModel
+from discrepancy.verdict import NotFitted
+from reporting.words import listing
+
+IMPLAUSIBLE = 4.0
+"""Prior deviations from which on a parameter or a gain is remarked on."""
+
+
+def strained(problem: Problem, fit: CandidateFit) -> list[str]:
+    """Return a remark on each calibrated parameter and gain that a fit takes far from its prior.
+
+    What an implausible nuisance explains leaves no residual. The absolute gate judges all gains
+    together, and all parameters.
+    """
+    names = [f"The parameter {parameter.name!r}" for parameter in problem.model.parameters]
+    names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
+    values = fit.point.shared.tolist()  # in prior standard deviations
+    precisions = problem.shared.precision.tolist()
+    remarks = []
+    for subject, value, precision in zip(names, values, precisions, strict=True):
+        if precision > 0.0 and abs(value) > IMPLAUSIBLE:
+            remarks.append(
+                f"{subject} lies {abs(value):.1f} of its stated deviations off in the hypothesis "
+                "of the verdict, which rests on that deviation: check it."
+            )
+    return remarks
+
+
+def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
+    """Return the remark on effects that were not tested because the model has no port.
+
+    Else nothing.
+    """
+    names = [effect.name for effect in effects if NO_PORT in (effect.unavailable(setting) or "")]
+    if not names:
+        return []
+    example = ""
+    model = setting.model
+    if isinstance(model, LumpedModel) and model.description.input:
+        load = model.description.input[0]
+        vector = ", ".join(f"{value:g}" for value in load.vector)
+        example = f", such as vector = [{vector}] between the ground and {load.name!r}"
+    return [
+        f"Not tested for lack of a port: {listing(names)}; declare a [[port]] in the model's "
+        f"file{example} where such a force may act."
+    ]
+
+
+def not_fitted(
+    setting: Setting, effects: Sequence[Effect], search: Search
+) -> tuple[NotFitted, ...]:
+    """Return the effects of a catalogue that were not fitted, each with the reason.
+
+    Parameters
+    ----------
+    setting : Setting
+        Campaign and model.
+    effects : sequence of Effect
+        The catalogue.
+    search : Search
+        The search, with all its fits.
+    """
+    along_force: set[str] = set()  # fitted along the missing force
+    for fitted_force in search.force_hypotheses:
+        along_force.update(term.effect.identifier for term in fitted_force.candidate.terms)
+    fitted = search.fitted_effects() | along_force
+    rows = []
+    for effect in effects:
+        identifier = effect.identifier
+        unavailable = effect.unavailable(setting)
+        if unavailable is not None:
+            rows.append(NotFitted(identifier, unavailable))
+        elif identifier not in fitted:
+            gain = search.screened_gains.get(identifier, nan)
+            refusal = search.problem.refusals.get(identifier)
+            if refusal is not None and not 0.0 < gain < SEARCH.worth_fitting:
+                reason = f"could not be fitted: {refusal}"
+            elif isnan(gain):
+                where = "along the missing force" if along_force else "at first sight"
+                reason = f"less promising than others {where}"
+            else:
+                reason = f"screened out: {gain:.1f} nat at most beside the model as it is"
+            rows.append(NotFitted(identifier, reason, gain))
+    return tuple(rows)
