@@ -29,14 +29,18 @@ _POINTS_PER_INCH = 72.0
 _MOST_CELLS = 5000
 """Largest map whose values a page holds, in cells."""
 _FEW_COLOURS = 20
-"""Colour maps with fewer colours stand for names, such as those of controls, and not for values."""
+"""Number of colours below which a colour map is taken to stand for names, such as those of
+controls, and not for values."""
 _SAME_POSITION = 1e-6  # of two panels, as a fraction of the figure
 
 JsonObject = dict[str, Any]
 
 
 class _LineLook(NamedTuple):
-    """Colour, line style and marker, by which lines of several panels are recognised as equal."""
+    """The appearance of a line: colour, line style and marker.
+
+    Lines of equal appearance in several panels are taken to show the same quantity.
+    """
 
     colour: str
     style: str
@@ -44,7 +48,10 @@ class _LineLook(NamedTuple):
 
 
 class _Annotation(NamedTuple):
-    """An attribute that an artist gets in the SVG; that of a panel is made after drawing."""
+    """An attribute that the element of an artist gets in the SVG.
+
+    The value for a panel is not set here: its limits are known only after drawing.
+    """
 
     artist: Artist
     attribute: str
@@ -53,13 +60,13 @@ class _Annotation(NamedTuple):
 
 @contextmanager
 def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
-    """Mark the parts of a figure while it is drawn as SVG, so that a page can show their values.
+    """Mark the artists of a figure while it is drawn as SVG, so that a page can show their values.
 
-    Inside of the context the figure is drawn. The function that the context yields then takes the
-    text of the SVG, and returns it with the attributes that the script of the page reads.
+    Draw the figure inside the context. Then call the function that the context yields with the text
+    of the SVG: it returns the text with the attributes that the script of the page reads.
 
-    Panels get ``data-axes`` (box in units of the SVG; limits, scale, name and texts of either
-    axis), lines and scatters ``data-series`` (name, colour), bands and error bars ``data-spread``
+    Panels get ``data-axes`` (box in units of the SVG; limits, scale, name and tick texts of both
+    axes), lines and scatters ``data-series`` (name, colour), bands and error bars ``data-spread``
     (colour).
 
     Parameters
@@ -89,23 +96,24 @@ def annotated(figure: Figure) -> Iterator[Callable[[str], str]]:
 
 
 def _annotations(figure: Figure) -> list[_Annotation]:
-    """Return the annotations of all panels with lines, points or maps.
+    """Return the annotations of all panels that show lines, points or heat maps.
 
-    Artists that have a group id already get none.
+    An artist that already has a group id keeps it and gets no annotation.
     """
     line_names = _line_names(figure)
     annotations: list[_Annotation] = []
     for axes in figure.axes:
         if not {axes.get_xscale(), axes.get_yscale()} <= {"linear", "log"}:
             continue
-        of_panel = [*_error_bar_annotations(axes), *_data_annotations(axes, line_names)]
-        has_series = any(annotation.attribute == "data-series" for annotation in of_panel)
+        panel_annotations = [*_error_bar_annotations(axes), *_data_annotations(axes, line_names)]
+        has_series = any(annotation.attribute == "data-series" for annotation in panel_annotations)
         if has_series or _map_records(axes):
-            annotations += [*of_panel, _Annotation(axes, "data-axes")]
+            annotations += [*panel_annotations, _Annotation(axes, "data-axes")]
     return [annotation for annotation in annotations if annotation.artist.get_gid() is None]
 
 
 def _error_bar_annotations(axes: Axes) -> Iterator[_Annotation]:
+    """Yield the annotations of the bars of all error bars in a panel, with their colours."""
     for container in axes.containers:
         if isinstance(container, ErrorbarContainer):
             _, _, bars = container.lines
@@ -114,20 +122,30 @@ def _error_bar_annotations(axes: Axes) -> Iterator[_Annotation]:
 
 
 def _data_annotations(axes: Axes, line_names: dict[_LineLook, str]) -> Iterator[_Annotation]:
-    """Yield the annotations of bands, lines and scatters in the coordinates of the data."""
-    caps: list[Artist] = []  # of error bars
+    """Yield the annotations of the bands, lines and scatters of a panel.
+
+    Lines whose coordinates are not both data, such as limits across a panel, are left out.
+
+    Parameters
+    ----------
+    axes : Axes
+        The panel.
+    line_names : dict of _LineLook to str
+        The names of lines without a label of their own, by their appearance.
+    """
+    error_bar_caps: list[Artist] = []  # of error bars
     error_bar_names: dict[Artist, str] = {}
     for container in axes.containers:
         if isinstance(container, ErrorbarContainer):
             data_line, cap_lines, _ = container.lines
-            caps += cap_lines
+            error_bar_caps += cap_lines
             if data_line is not None:
                 error_bar_names[data_line] = str(container.get_label())
     for artist in (*axes.lines, *axes.collections):
         if isinstance(artist, FillBetweenPolyCollection):
             colour = to_hex(np.asarray(artist.get_facecolor())[0])
             yield _Annotation(artist, "data-spread", colour)
-        elif isinstance(artist, Line2D | PathCollection) and artist not in caps:
+        elif isinstance(artist, Line2D | PathCollection) and artist not in error_bar_caps:
             if not _is_in_data_coordinates(artist, axes):
                 continue
             look = _look_of(artist)
@@ -138,14 +156,20 @@ def _data_annotations(axes: Axes, line_names: dict[_LineLook, str]) -> Iterator[
 
 
 def _is_in_data_coordinates(artist: Line2D | PathCollection, axes: Axes) -> bool:
-    """Return whether both coordinates are data; a line that marks a limit has only one such."""
+    """Return whether both coordinates of an artist are data.
+
+    A line that marks a limit (`axvline`, `axhline`) has one coordinate as a fraction of the panel.
+    """
     if isinstance(artist, Line2D):
         return artist.get_transform() == axes.transData
     return artist.get_offset_transform() == axes.transData
 
 
 def _line_names(figure: Figure) -> dict[_LineLook, str]:
-    """Return the names of lines in legends, and else in other panels where lines look the same."""
+    """Return the names of lines by their appearance.
+
+    A name comes from a legend, or from a labelled line of any panel that looks the same.
+    """
     names: dict[_LineLook, str] = {}
     for legend in (*figure.legends, *(axes.get_legend() for axes in figure.axes)):
         if legend is None:
@@ -162,11 +186,15 @@ def _line_names(figure: Figure) -> dict[_LineLook, str]:
 
 
 def _public_label(label: str) -> str:
-    """Return a label, or "" for the labels with underscore that matplotlib gives itself."""
+    """Return a label, or "" for a label that matplotlib has generated, which starts with "_"."""
     return "" if label.startswith("_") else label
 
 
 def _look_of(artist: Line2D | PathCollection) -> _LineLook:
+    """Return the appearance of a line.
+
+    All scatters have the same empty appearance, so none of them gets the name of a line.
+    """
     if isinstance(artist, PathCollection):
         return _LineLook("", "", "")
     style = artist.get_linestyle()
@@ -175,25 +203,29 @@ def _look_of(artist: Line2D | PathCollection) -> _LineLook:
 
 
 def _panel_record(axes: Axes) -> JsonObject:
-    """Return the box of a drawn panel in the SVG, and the meaning of its axes."""
+    """Return a drawn panel's position in the SVG, its heat maps and the meaning of its axes."""
     figure = axes.get_figure(root=True)
     assert figure is not None
     width, height = (_POINTS_PER_INCH * inches for inches in figure.get_size_inches())
     box = axes.get_position()
-    corners = [box.x0 * width, box.x1 * width, (1.0 - box.y0) * height, (1.0 - box.y1) * height]
+    # Left, right, bottom, top; the vertical axis of an SVG points down.
+    box_ends = [box.x0 * width, box.x1 * width, (1.0 - box.y0) * height, (1.0 - box.y1) * height]
     x_name = _shared_x_label(axes, figure.axes)
     y_name = _shared_y_label(axes, figure.axes)
     return {
         "title": axes.get_title(loc="left") or axes.get_title(),
         "maps": _map_records(axes),
-        "box": [round(value, 3) for value in corners],
+        "box": [round(value, 3) for value in box_ends],
         "x": _axis_record(axes.xaxis, axes.get_xlim(), axes.get_xscale(), x_name),
         "y": _axis_record(axes.yaxis, axes.get_ylim(), axes.get_yscale(), y_name),
     }
 
 
 def _shared_x_label(axes: Axes, panels: Iterable[Axes]) -> str:
-    """Return the label of the horizontal axis, which one panel of a column may carry for all."""
+    """Return the label of the horizontal axis of a panel.
+
+    If the panel has none, it is the label of another panel in the same column with equal limits.
+    """
     for panel in (axes, *panels):
         has_same_limits = panel.get_xlim() == axes.get_xlim()
         offset = abs(panel.get_position().x0 - axes.get_position().x0)
@@ -203,7 +235,10 @@ def _shared_x_label(axes: Axes, panels: Iterable[Axes]) -> str:
 
 
 def _shared_y_label(axes: Axes, panels: Iterable[Axes]) -> str:
-    """Return the label of the vertical axis, which one panel of a row may carry for all."""
+    """Return the label of the vertical axis of a panel.
+
+    If the panel has none, it is the label of another panel in the same row with equal limits.
+    """
     for panel in (axes, *panels):
         has_same_limits = panel.get_ylim() == axes.get_ylim()
         offset = abs(panel.get_position().y0 - axes.get_position().y0)
@@ -213,14 +248,23 @@ def _shared_y_label(axes: Axes, panels: Iterable[Axes]) -> str:
 
 
 def _map_records(axes: Axes) -> list[JsonObject]:
-    """Return the maps of a panel: edges of columns x and of rows y, and values, null for none."""
+    """Return the heat maps of a panel with linear axes, as the script of the page reads them.
+
+    Returns
+    -------
+    list of dict
+        For each map the edges of its columns ("x") and of its rows ("y"), its values row by row
+        ("values", null if a cell has no finite value), and the quantity ("name"). Maps with few
+        colours or too many cells are left out.
+    """
     figure = axes.get_figure(root=True)
     if figure is None or _is_color_bar(axes):
         return []
     if {axes.get_xscale(), axes.get_yscale()} != {"linear"}:
         return []
+    # All heat maps of a figure of the project show one quantity: that of its first colour bar.
     color_bar_labels = [panel.get_ylabel() for panel in figure.axes if _is_color_bar(panel)]
-    name = color_bar_labels[0] if color_bar_labels else ""
+    quantity = color_bar_labels[0] if color_bar_labels else ""
     records: list[JsonObject] = []
     for artist in (*axes.collections, *axes.images):
         if not isinstance(artist, QuadMesh | AxesImage) or artist.get_cmap().N < _FEW_COLOURS:
@@ -229,13 +273,23 @@ def _map_records(axes: Axes) -> list[JsonObject]:
         if values.ndim != 2 or values.size > _MOST_CELLS:
             continue
         x, y = _cell_edges(artist, values.shape)
-        rows = [_rounded_cells(row) for row in values.tolist()]
-        records.append({"x": x.tolist(), "y": y.tolist(), "values": rows, "name": name or "value"})
+        value_rows = [_rounded_cells(row) for row in values.tolist()]
+        records.append(
+            {"x": x.tolist(), "y": y.tolist(), "values": value_rows, "name": quantity or "value"}
+        )
     return records
 
 
 def _cell_edges(artist: QuadMesh | AxesImage, shape: tuple[int, int]) -> tuple[Float, Float]:
-    """Return the edges of the columns and of the rows of a map."""
+    """Return the edges of the columns (C + 1,) and of the rows (R + 1,) of a heat map.
+
+    Parameters
+    ----------
+    artist : QuadMesh or AxesImage
+        The map.
+    shape : (int, int)
+        The numbers of rows R and columns C.
+    """
     if isinstance(artist, QuadMesh):
         corners = np.asarray(artist.get_coordinates())
         return corners[0, :, 0], corners[:, 0, 1]
@@ -246,16 +300,32 @@ def _cell_edges(artist: QuadMesh | AxesImage, shape: tuple[int, int]) -> tuple[F
 
 
 def _rounded_cells(row: Sequence[float | None]) -> list[float | None]:
+    """Return values with three significant digits, which keeps the page small."""
     return [None if value is None else float(f"{value:.3g}") for value in row]
 
 
 def _is_color_bar(axes: Axes) -> bool:
-    """Return whether a panel is the scale of colours beside a map."""
+    """Return whether a panel is a colour bar."""
     return hasattr(axes, "_colorbar")
 
 
 def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str) -> JsonObject:
-    """Return limits and name of an axis, and the texts of its ticks where they are no numbers."""
+    """Return the name, limits and scale of an axis.
+
+    If ticks have words instead of numbers, their texts are included. An axis without a name and
+    without tick texts is marked as "unsaid": the page shows no value along it.
+
+    Parameters
+    ----------
+    axis : Axis
+        The axis.
+    limits : (float, float)
+        The values at its ends.
+    scale : str
+        "linear" or "log".
+    name : str
+        The label of the axis.
+    """
     record: JsonObject = {
         "name": " ".join(name.split()),
         "limits": [float(f"{end:.9g}") for end in limits],
@@ -274,4 +344,5 @@ def _axis_record(axis: Axis, limits: tuple[float, float], scale: str, name: str)
 
 
 def _is_word(tick_text: str) -> bool:
+    """Return whether the text of a tick is neither empty nor a number."""
     return bool(tick_text) and not is_number(tick_text.replace("\N{MINUS SIGN}", "-"))

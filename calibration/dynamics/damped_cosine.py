@@ -27,7 +27,7 @@ class RingDownMode(NamedTuple):
 
     The natural angular frequency is |s|, so f = |s| / 2 pi and zeta = -Re s / |s|. Standard errors
     are propagated to first order with the full covariance of Re s and Im s, for independent
-    residuals of equal variance. If the frequency was not fitted, its variance is zero.
+    residuals of equal variance. If the frequency was not fitted, the variance of Im s is zero.
 
     Attributes
     ----------
@@ -73,6 +73,7 @@ class RingDownMode(NamedTuple):
         }
 
     def _standard_error_along(self, gradient: Float) -> float:
+        """Return the standard error of a modal value with a gradient (2,) on Re s and Im s."""
         variance = float(gradient @ self.covariance @ gradient)
         return math.sqrt(max(variance, 0.0))
 
@@ -142,10 +143,11 @@ class DampedCosineFit(NamedTuple):
 
 
 class DampedCosines:
-    """A model of one record: damped cosines and a line in one or more signals.
+    """A model of one record: the sum of damped cosines and a line, in one or more signals.
 
-    Each signal has noise with a variance of its own. The average of a wave over an interval of
-    width w is the wave times g(s) = sinh(s w / 2) / (s w / 2).
+    Each signal has its own noise variance. If a value of the record is an average over an interval
+    of width w, the model is averaged too: the average of a wave is the wave times g(s) = sinh(s w /
+    2) / (s w / 2).
 
     Parameters
     ----------
@@ -172,7 +174,7 @@ class DampedCosines:
             self._line = offset[:, None]
 
     def residual(self, pole: ComplexArray) -> Float:
-        """Return the residuals with the best amplitudes and line at given poles.
+        """Return the residuals at given poles, with the best amplitudes and the best line.
 
         Parameters
         ----------
@@ -184,7 +186,8 @@ class DampedCosines:
         (N C,) array
             The residuals of all signals [V].
         """
-        # Variable projection: the linear unknowns are eliminated by an orthogonal projection.
+        # Variable projection (Golub and Pereyra 1973): the linear unknowns are eliminated by an
+        # orthogonal projection on the columns of the basis.
         orthogonal_basis = np.linalg.qr(self._basis(self._waves(pole)))[0]
         fitted = orthogonal_basis @ (orthogonal_basis.T @ self._signal)
         return np.asarray(self._signal - fitted).ravel()
@@ -192,7 +195,7 @@ class DampedCosines:
     def fit(
         self, start: NDArray[np.complexfloating], *, frequencies_fitted: bool = True
     ) -> DampedCosineFit:
-        """Return the least-squares fit to the record.
+        """Return the least-squares fit to the record, with the poles as unknowns.
 
         Parameters
         ----------
@@ -207,13 +210,13 @@ class DampedCosines:
         else:
             scale = np.concatenate([start.real])
 
-        def pole_of(unknown: Float) -> ComplexArray:
-            scaled = unknown * scale
+        def pole_of(relative_values: Float) -> ComplexArray:
+            scaled = relative_values * scale
             imaginary = scaled[count:] if frequencies_fitted else start.imag
             return np.asarray(scaled[:count] + 1j * imaginary)
 
         optimum = least_squares(
-            lambda unknown: self.residual(pole_of(unknown)),
+            lambda relative_values: self.residual(pole_of(relative_values)),
             np.ones(scale.size),
             method="lm",
             xtol=1e-12,
@@ -224,7 +227,7 @@ class DampedCosines:
         return self.solve(pole_of(optimum.x), frequencies_fitted=frequencies_fitted)
 
     def solve(self, pole: ComplexArray, *, frequencies_fitted: bool = True) -> DampedCosineFit:
-        """Return amplitudes, fitted signals and covariance at given poles.
+        """Return the fit with the best amplitudes at given poles, and its covariance.
 
         Parameters
         ----------
@@ -236,6 +239,7 @@ class DampedCosines:
         wave = self._waves(pole)
         basis = self._basis(wave)
         solution = np.linalg.lstsq(basis, self._signal, rcond=None)[0]
+        # Rows of the solution: K Re A, K Im A, and the coefficients of the line
         coefficient = np.asarray(solution, dtype=np.float64)
         count = pole.size
         amplitude = coefficient[:count] + 1j * coefficient[count : 2 * count]
@@ -288,8 +292,10 @@ class DampedCosines:
         degrees_of_freedom = max(self._signal.size - fitted_unknowns.size, 1)
         variance = np.maximum(sum_of_squares * channels / degrees_of_freedom, _LEAST_VARIANCE)
 
-        # Information matrix. The derivative of an average with respect to its pole has a further
-        # term in proportion to the wave, which a change of the amplitude can replace.
+        # Information matrix, the sum of J.T @ J / variance over the signals. A wave has the
+        # derivative t exp(s t) A with respect to its pole. That of an averaged wave has a further
+        # term proportional to the wave; a change of the amplitude has the same effect, so the
+        # covariance of the poles is the same without it.
         wave_derivative = self._time[:, None] * wave
         information = np.zeros((unknown_count, unknown_count))
         for channel in range(channels):
@@ -312,20 +318,36 @@ class DampedCosines:
         return variance, covariance
 
     def _waves(self, pole: ComplexArray) -> ComplexArray:
-        """Return the waves of unit amplitude (N, K), averaged over the intervals of the record."""
+        """Return the waves of unit amplitude (N, K), averaged over the intervals of the record.
+
+        Growth is limited, so that an iteration that passes through it does not overflow.
+        """
         decay = np.minimum(pole.real, _GREATEST_GROWTH / self._time[-1])
         s = decay + 1j * pole.imag
-        half = 0.5 * s * self._averaging_width
-        averaging_factor = np.sinh(half) / half if self._averaging_width else 1.0
+        half_exponent = 0.5 * s * self._averaging_width
+        averaging_factor = np.sinh(half_exponent) / half_exponent if self._averaging_width else 1.0
         return np.asarray(averaging_factor * np.exp(np.multiply.outer(self._time, s)))
 
     def _basis(self, wave: ComplexArray) -> Float:
-        """Return the columns that multiply Re A, Im A and the coefficients of the line."""
+        """Return the basis of the linear unknowns of a signal.
+
+        Its columns multiply K Re A, K Im A and the coefficients of the line.
+
+        Parameters
+        ----------
+        wave : (N, K) array
+            The waves of unit amplitude.
+
+        Returns
+        -------
+        (N, 2 K + 1) or (N, 2 K + 2) array
+        """
+        # Re(A w) = Re A Re w - Im A Im w
         return np.hstack([wave.real, -wave.imag, self._line])
 
 
 def _wave_chi_square(count: int, basis: Float, coefficient: Float, sum_of_squares: Float) -> Float:
-    """Return the squared amplitudes of each wave over their covariance, summed over the signals.
+    """Return the chi-square of each wave: its squared amplitudes over their covariance.
 
     Parameters
     ----------
@@ -337,16 +359,26 @@ def _wave_chi_square(count: int, basis: Float, coefficient: Float, sum_of_square
         The coefficients of each signal.
     sum_of_squares : (C,) array
         The sum of squared residuals of each signal.
+
+    Returns
+    -------
+    (K,) array
+        Sums over the signals.
     """
     channels = coefficient.shape[1]
     # Covariance of Re A and Im A of each wave at unit variance, (K, 2, 2), and its inverse
     unit_covariance = np.linalg.pinv(basis.T @ basis)[: 2 * count, : 2 * count]
-    blocks = unit_covariance.reshape(2, count, 2, count)
-    weight = np.linalg.pinv(np.einsum("ikjk->kij", blocks))
+    blocks_of_unit_covariance = unit_covariance.reshape(2, count, 2, count)
+    inverse_covariance = np.linalg.pinv(np.einsum("ikjk->kij", blocks_of_unit_covariance))
     real_and_imaginary = coefficient[: 2 * count].reshape(2, count, channels)
     degrees_of_freedom = max(len(basis) - basis.shape[1], 1)
     variance = np.maximum(sum_of_squares / degrees_of_freedom, _LEAST_VARIANCE)
+    # For each wave k: sum over the signals c of a' W a / variance with a = (Re A, Im A)
     chi_square: Float = np.einsum(
-        "ikc,kij,jkc,c->k", real_and_imaginary, weight, real_and_imaginary, 1.0 / variance
+        "ikc,kij,jkc,c->k",
+        real_and_imaginary,
+        inverse_covariance,
+        real_and_imaginary,
+        1.0 / variance,
     )
     return chi_square

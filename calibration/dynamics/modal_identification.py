@@ -25,22 +25,22 @@ from .subspace import IdentifiedPoles, Subspace
 RecordKind = Literal["ambient", "decay"]
 
 LARGEST_ORDER = 24
-"""Largest number of states of the identified system. The smallest number is taken whose
-correlations are those of the record within their scatter: with more, poles of noise come to lie
-beside those of modes and spoil them."""
+"""Largest number of states of the identified system. The smallest number is used that reproduces
+the correlations of the record within their scatter: with more states, poles of noise appear next to
+those of modes and disturb them."""
 BLOCKS = 50
 """Number of blocks of a record, from whose differences the covariance follows."""
 _FEWEST_BLOCKS = 10
 _DIFFERENCE_STEP = 1e-4
-"""Fraction of a block's difference by which correlations are changed in a numerical derivative. It
-is small, so that changed poles can be assigned to the original ones."""
+"""Step of the numerical derivative of poles, as a fraction of a block's difference from the mean
+correlations. It is small, so that changed poles can be assigned to the original ones."""
 _MOST_LAGS = 40
 _SMALLEST_RELATIVE_SIZE = 1e-2  # of a mode that is fitted to a free decay, over the strongest mode
 
 
 @dataclass(frozen=True)
 class IdentifiedModes:
-    """M modes at A accelerometers; NaN where a band shows no mode beyond noise.
+    """M modes at A accelerometers; the values of a mode are NaN if its band shows none.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class IdentifiedModes:
         The natural frequency [Hz], the damping ratio [1], and the shape at the accelerometers after
         the first, divided by that at the first [1].
     covariance : (M, 1 + A, 1 + A) array
-        The covariance of the values of each mode; different modes are taken as independent.
+        The covariance of the values of each mode. Different modes are treated as independent.
     """
 
     value: Float
@@ -154,6 +154,7 @@ def _check_bands(limits: Float, sampling_rate: float) -> None:
 
 
 def _refuse_dead_accelerometers(record: Float) -> None:
+    """Refuse a record (N, A) in which an accelerometer shows a constant value."""
     dead = np.flatnonzero(np.ptp(record, axis=0) == 0.0)
     if dead.size:
         raise ExperimentDataError(
@@ -163,13 +164,29 @@ def _refuse_dead_accelerometers(record: Float) -> None:
 
 
 def _number_of_lags(limits: Float, sampling_rate: float, channels: int) -> int:
-    """Return the number of lags, which last two periods of the lowest mode if that is possible."""
-    fewest = LARGEST_ORDER // channels + 2
+    """Return half the number of lags of the correlations.
+
+    They should last two periods of the lowest mode. The Hankel matrix must have at least as many
+    rows as the largest system has states.
+
+    Parameters
+    ----------
+    limits : (M, 2) array
+        The frequency bands of the modes [Hz].
+    sampling_rate : float
+        The sampling rate [Hz].
+    channels : int
+        The number of accelerometers.
+    """
+    smallest_number = LARGEST_ORDER // channels + 2
     samples_of_two_periods = np.ceil(2.0 * sampling_rate / limits.min())
-    return int(np.clip(samples_of_two_periods, fewest, _MOST_LAGS))
+    return int(np.clip(samples_of_two_periods, smallest_number, _MOST_LAGS))
 
 
 def _refuse_short_record(record: Float, lags: int, kind: RecordKind) -> None:
+    """Refuse a record (N, A) that has too few samples for the lags of its correlations."""
+    # The correlations of a block have 2 `lags` lags. A decay is not divided into blocks, but must
+    # be longer than its correlations.
     blocks = BLOCKS if kind == "ambient" else 4
     needed = blocks * 2 * lags
     if len(record) < needed:
@@ -191,7 +208,17 @@ class _Identification(Protocol):
 def _modes_in_bands(
     identification: _Identification, limits: Float, values_per_mode: int
 ) -> IdentifiedModes:
-    """Return the strongest pole in each band as a mode."""
+    """Return the strongest pole in each frequency band as a mode.
+
+    Parameters
+    ----------
+    identification : _Identification
+        The poles of the record.
+    limits : (M, 2) array
+        The bands [Hz].
+    values_per_mode : int
+        The number of modal values, 1 + A.
+    """
     poles = identification.poles
     pole_of_mode: dict[int, int] = {}
     for mode, (low, high) in enumerate(limits):
@@ -209,7 +236,7 @@ def _modes_in_bands(
 
 
 class _AmbientIdentification:
-    """Identification of a record of ambient vibration.
+    """Poles of a record of ambient vibration, by stochastic subspace identification.
 
     Parameters
     ----------
@@ -220,7 +247,7 @@ class _AmbientIdentification:
     lags : int
         Half the number of lags of the correlations.
     mode_count : int
-        The number of modes that are asked for.
+        The number of modes that are wanted.
     """
 
     poles: IdentifiedPoles
@@ -230,8 +257,10 @@ class _AmbientIdentification:
         self._block_length = (len(record) - 2 * lags) // BLOCKS
         self._block_correlations = self._correlate_blocks(record, lags)
         self._correlation = self._block_correlations.mean(axis=0)
+        # Variance of the mean of the blocks
         variance = self._block_correlations.var(axis=0, ddof=1) / BLOCKS
         self._subspace = Subspace(self._correlation, sampling_rate)
+        # Two states for each mode; stop when the misfit is that of scatter alone.
         for order in range(2 * mode_count, LARGEST_ORDER + 1, 2):
             self._order = order
             self.poles, misfit = self._subspace.poles(order, variance)
@@ -250,49 +279,73 @@ class _AmbientIdentification:
         return np.stack(correlations, axis=1)
 
     def covariances(self, numbers: Sequence[int]) -> list[Float]:
-        """Return the covariances (1 + A, 1 + A) of the modal values of some poles.
+        """Return the covariances (1 + A, 1 + A) of the modal values of given poles.
+
+        Parameters
+        ----------
+        numbers : sequence of int
+            The numbers of the poles.
 
         Raises
         ------
         ExperimentDataError
-            If the record is too short compared with the memory of the modes.
+            If the record is too short compared with the decay times of the modes.
         """
         poles = self.poles.pole[numbers]
         correlations = self._correlate_long_blocks(poles)
-        count = len(correlations)
+        block_count = len(correlations)
 
-        # Derivative of the modal values along the difference of each block
+        # The derivative of the modal values along the difference of a block from the mean is the
+        # deviation of its values from their mean, to first order. The sum of squared deviations
+        # over n (n - 1) is the covariance of a mean of n blocks.
         changed_values = [
             self._subspace.modal_values_after_change(
-                _DIFFERENCE_STEP * (block - self._correlation), self._order, poles
+                _DIFFERENCE_STEP * (block_correlation - self._correlation), self._order, poles
             )
-            for block in correlations
+            for block_correlation in correlations
         ]
         covariances = []
-        for index, number in enumerate(numbers):
-            changed = np.array([values[index] for values in changed_values])
+        for position, number in enumerate(numbers):
+            changed = np.array([values_of_poles[position] for values_of_poles in changed_values])
             derivative = (changed - self.poles.modal_values(number)) / _DIFFERENCE_STEP
-            covariances.append(derivative.T @ derivative / (count * (count - 1)))
+            covariances.append(derivative.T @ derivative / (block_count * (block_count - 1)))
         return covariances
 
     def _correlate_long_blocks(self, poles: ComplexArray) -> Float:
-        """Return correlations (B', 2 L, A, A) of blocks that last as long as the modes remember."""
-        memory = float(np.max(-1.0 / poles.real))
-        joined_blocks = int(np.ceil(memory * self._sampling_rate / self._block_length))
-        count = BLOCKS // joined_blocks
-        if count < _FEWEST_BLOCKS:
+        """Return the correlations of long, nearly independent blocks.
+
+        Consecutive blocks are joined until they last as long as the slowest mode decays.
+
+        Parameters
+        ----------
+        poles : (P,) array
+            The poles of the modes [1/s].
+
+        Returns
+        -------
+        (B', 2 L, A, A) array
+
+        Raises
+        ------
+        ExperimentDataError
+            If there are too few such blocks.
+        """
+        decay_time = float(np.max(-1.0 / poles.real))
+        blocks_per_group = int(np.ceil(decay_time * self._sampling_rate / self._block_length))
+        group_count = BLOCKS // blocks_per_group
+        if group_count < _FEWEST_BLOCKS:
             duration = self._block_length * BLOCKS / self._sampling_rate
             raise ExperimentDataError(
-                f"a mode dies away in {memory:.3g} s, and the record of {duration:.3g} s holds "
+                f"a mode dies away in {decay_time:.3g} s, and the record of {duration:.3g} s holds "
                 f"that less than {_FEWEST_BLOCKS} times, too few for a covariance: record longer."
             )
-        joined = self._block_correlations[: count * joined_blocks]
-        groups = joined.reshape(count, joined_blocks, *self._correlation.shape)
+        used_correlations = self._block_correlations[: group_count * blocks_per_group]
+        groups = used_correlations.reshape(group_count, blocks_per_group, *self._correlation.shape)
         return np.asarray(groups.mean(axis=1))
 
 
 class _DecayIdentification:
-    """Identification of a record of free decay.
+    """Poles of a record of free decay, by least squares.
 
     Parameters
     ----------
@@ -301,7 +354,7 @@ class _DecayIdentification:
     sampling_rate : float
         The sampling rate [Hz].
     lags : int
-        Half the number of lags of the correlations.
+        Half the number of lags of the correlations, which give the starting poles.
     """
 
     poles: IdentifiedPoles
@@ -310,7 +363,8 @@ class _DecayIdentification:
         time = np.arange(len(record)) / sampling_rate
         model = DampedCosines(time, record, drift=False)
         start = _starting_poles(record, sampling_rate, lags)
-        # Most poles of noise are recognised here; the others would spoil the covariance.
+        # Most poles of noise are recognised before the fit. Those that remain are removed after it
+        # and the fit is repeated, since they would spoil the covariance.
         poles = start[_poles_of_fit(model.solve(start)).is_beyond_noise]
         while True:
             self._fit = model.fit(poles) if poles.size else model.solve(poles)
@@ -326,11 +380,24 @@ class _DecayIdentification:
 
 
 def _starting_poles(record: Float, sampling_rate: float, lags: int) -> ComplexArray:
-    """Return the poles of the correlations of a decay, without the weakest ones."""
+    """Return the structural poles (P,) [1/s] that the correlations of a decay show.
+
+    Poles whose contribution is below 1 % of the strongest one are left out.
+
+    Parameters
+    ----------
+    record : (N, A) array
+        The record, without its mean.
+    sampling_rate : float
+        The sampling rate [Hz].
+    lags : int
+        Half the number of lags of the correlations.
+    """
     sample_count = len(record) - 2 * lags
-    first = record[:sample_count]
+    earlier_samples = record[:sample_count]
     correlations = [
-        record[lag : lag + sample_count].T @ first / sample_count for lag in range(1, 2 * lags + 1)
+        record[lag : lag + sample_count].T @ earlier_samples / sample_count
+        for lag in range(1, 2 * lags + 1)
     ]
     poles, _ = Subspace(np.stack(correlations), sampling_rate).poles(LARGEST_ORDER)
     is_strong = poles.size > _SMALLEST_RELATIVE_SIZE * poles.size.max()
@@ -338,6 +405,7 @@ def _starting_poles(record: Float, sampling_rate: float, lags: int) -> ComplexAr
 
 
 def _poles_of_fit(fit: DampedCosineFit) -> IdentifiedPoles:
+    """Return the poles of a fit of damped cosines; the amplitudes are their shapes."""
     return IdentifiedPoles(
         pole=fit.pole,
         shape=fit.amplitude,
@@ -348,7 +416,19 @@ def _poles_of_fit(fit: DampedCosineFit) -> IdentifiedPoles:
 
 
 def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
-    """Return the covariance (1 + A, 1 + A) of the modal values of one wave, to first order."""
+    """Return the covariance of the modal values of one damped cosine, to first order.
+
+    Parameters
+    ----------
+    fit : DampedCosineFit
+        The fit.
+    number : int
+        The number of the damped cosine.
+
+    Returns
+    -------
+    (1 + A, 1 + A) array
+    """
     count, channels = fit.amplitude.shape
     first_amplitude, *other_amplitudes = fit.amplitude[number].tolist()
     gradient = np.zeros((1 + channels, len(fit.covariance)))
@@ -358,7 +438,8 @@ def _decay_covariance(fit: DampedCosineFit, number: int) -> Float:
         by_amplitude = 1.0 / first_amplitude
         by_first_amplitude = -amplitude / first_amplitude**2
         for of_channel, derivative in ((channel, by_amplitude), (0, by_first_amplitude)):
-            # After the poles follow, for each channel, K Re A, K Im A and the offset.
+            # Order of the unknowns: the poles (K Re s, K Im s), and then for each channel K Re A,
+            # K Im A and the offset. For an analytic w(A), dRe w = Re w' dRe A - Im w' dIm A.
             real = 2 * count + of_channel * (2 * count + 1) + number
             imaginary = real + count
             gradient[1 + channel, [real, imaginary]] = derivative.real, -derivative.imag

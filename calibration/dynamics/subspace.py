@@ -1,4 +1,8 @@
-"""Subspace identification: the poles of systems with given correlations (Ho-Kalman realisation)."""
+"""Subspace identification of the poles of a system from the correlations of its outputs.
+
+The correlations of the response to white noise decay like free vibration. A realisation as by Ho
+and Kalman (1966) therefore gives the poles from the block Hankel matrix of the correlations.
+"""
 
 from typing import NamedTuple
 
@@ -13,23 +17,23 @@ from .damped_cosine import ComplexArray
 LARGEST_RATIO = 0.3
 """Largest damping ratio of a mode of a structure."""
 _FALSE_MODE_PROBABILITY = 1e-3
-"""Probability that noise alone is taken for a mode, over all frequencies where that can happen."""
+"""Probability that a record of noise alone gives a mode at any of its frequencies."""
 
 
 class IdentifiedPoles(NamedTuple):
-    """P poles with positive frequency.
+    """P poles with positive frequency that were identified from the record of A accelerometers.
 
     Attributes
     ----------
     pole : (P,) array
         The poles s [1/s].
     shape : (P, A) array
-        The complex shapes.
+        The complex mode shapes.
     size : (P,) array
-        The size of the part of the record that belongs to each pole.
+        The norm of each pole's contribution to the record or to its correlations.
     chi_square : (P,) array
-        The reduction of the sum of squares by each pole over the scatter; chi-square distributed
-        where there is only noise.
+        The reduction of the sum of squares by each pole, divided by the variance; it has a
+        chi-square distribution if there is only noise.
     frequency_count : int
         The number of independent frequencies at which noise could have given a pole.
     """
@@ -42,25 +46,52 @@ class IdentifiedPoles(NamedTuple):
 
     @property
     def is_structural(self) -> NDArray[np.bool_]:
-        """Whether the damping of each pole is that of a structure (P,)."""
+        """Whether each pole (P,) is damped as a mode of a structure is."""
         ratio = -self.pole.real / np.abs(self.pole)
         return np.asarray((ratio > 0.0) & (ratio < LARGEST_RATIO))
 
     @property
     def is_beyond_noise(self) -> NDArray[np.bool_]:
-        """Whether noise alone would hardly give each pole, at any frequency (P,)."""
+        """Whether each pole (P,) is larger than poles of noise alone are."""
+        # Bonferroni: the probability of a false mode is divided among the independent
+        # frequencies. Unknowns of a pole: Re s and Im s, and for each channel two complex
+        # factors.
         degrees_of_freedom = 2 + 4 * self.shape.shape[1]
         probability = _FALSE_MODE_PROBABILITY / self.frequency_count
         return np.asarray(self.chi_square > chdtri(degrees_of_freedom, probability))
 
     def modal_values(self, number: int) -> Float:
-        """Return frequency [Hz], damping ratio [1] and relative shape of a pole, (1 + A,)."""
+        """Return the modal values of a pole: its frequency, damping ratio and relative shape.
+
+        Parameters
+        ----------
+        number : int
+            The number of the pole.
+
+        Returns
+        -------
+        (1 + A,) array
+            Natural frequency [Hz], damping ratio [1], and the real part of the shape at the
+            accelerometers after the first, divided by that at the first [1].
+        """
+        # s = -zeta omega +- i omega sqrt(1 - zeta^2) with |s| = omega
         s = self.pole[number]
         relative_shape = (self.shape[number, 1:] / self.shape[number, 0]).real
         return np.array([abs(s) / (2.0 * np.pi), -s.real / abs(s), *relative_shape])
 
     def strongest(self, low: float, high: float) -> int | None:
-        """Return the number of the strongest pole in a band [Hz]; None if it may be noise."""
+        """Return the number of the largest structural pole in a frequency band.
+
+        Parameters
+        ----------
+        low, high : float
+            The ends of the band [Hz].
+
+        Returns
+        -------
+        int or None
+            None if there is no such pole, or if noise may have given it.
+        """
         frequency = np.abs(self.pole) / (2.0 * np.pi)
         is_inside = (frequency >= low) & (frequency <= high) & self.is_structural
         if not is_inside.any():
@@ -71,6 +102,8 @@ class IdentifiedPoles(NamedTuple):
 
 def _hankel(correlation: Float) -> Float:
     """Return the block Hankel matrix of the correlations of C channels.
+
+    Block (i, j) is the correlation at the lag i + j + 1.
 
     Parameters
     ----------
@@ -89,7 +122,7 @@ def _hankel(correlation: Float) -> Float:
 
 
 class _Realisation(NamedTuple):
-    """The modal form of a system of order n with C channels.
+    """The modal form of a system with n states and C channels.
 
     Attributes
     ----------
@@ -98,7 +131,7 @@ class _Realisation(NamedTuple):
     eigenvector : (n, n) array
         The eigenvectors of the transition matrix (columns).
     shape : (C, n) array
-        The shapes of the poles in the channels.
+        The mode shapes at the channels (columns).
     """
 
     pole: ComplexArray
@@ -107,7 +140,7 @@ class _Realisation(NamedTuple):
 
 
 class Subspace:
-    """Systems of any order with the correlations of a record (Ho-Kalman realisation).
+    """Realisations of any order of the system whose outputs have given correlations.
 
     Parameters
     ----------
@@ -123,7 +156,16 @@ class Subspace:
         _, self._singular_values, self._right_vectors = np.linalg.svd(_hankel(correlation))
 
     def _realisation(self, correlation: Float, basis: Float) -> _Realisation:
-        """Return the system of given correlations, whose states are those of a basis (L C, n)."""
+        """Return the modal form of the system with given correlations.
+
+        Parameters
+        ----------
+        correlation : (2 L, C, C) array
+            The correlations at the lags 1 to 2 L.
+        basis : (L C, n) array
+            The matrix that projects the Hankel matrix on n states: its product is the observability
+            matrix.
+        """
         channels = correlation.shape[1]
         observability = _hankel(correlation) @ basis
         # The observability matrix, shifted by one lag, is itself times the transition matrix.
@@ -135,49 +177,54 @@ class Subspace:
         return _Realisation(pole, eigenvector, observability[:channels] @ eigenvector)
 
     def _basis(self, order: int) -> Float:
-        """Return right singular vectors over the roots of their singular values, (L C, order)."""
+        """Return the basis (L C, order) of a balanced realisation.
+
+        It holds the first right singular vectors of the Hankel matrix U S V', divided by the roots
+        of their singular values, so that the observability matrix is U S^(1/2).
+        """
         vectors = self._right_vectors[:order].T
         return np.asarray(vectors / np.sqrt(self._singular_values[:order]))
 
     def poles(self, order: int, variance: Float | float = 1.0) -> tuple[IdentifiedPoles, float]:
-        """Return the poles of the system of an order, and its misfit.
+        """Return the poles of the system of a given order, and how well it fits the correlations.
 
         Parameters
         ----------
         order : int
             The number of states.
         variance : (2 L, C, C) array or float
-            The variance of the correlations; without it the values of chi-square have no meaning.
+            The variance of the correlations. Without it, `chi_square` of the poles has no meaning.
 
         Returns
         -------
         poles : IdentifiedPoles
             The poles with positive frequency.
         misfit : float
-            The mean squared misfit of the correlations over their variance [1].
+            The mean squared residual of the correlations, divided by their variance [1].
         """
         basis = self._basis(order)
         lags, channels, _ = self._correlation.shape
-        system = self._realisation(self._correlation, basis)
+        realisation = self._realisation(self._correlation, basis)
 
-        # Correlations of each pole
+        # Contribution of each pole to the correlations. The input matrix is the first block column
+        # of the controllability matrix S^(1/2) V', which is S times that of the basis.
         input_matrix = (basis[:channels] * self._singular_values[:order]).T
-        participation = np.linalg.solve(system.eigenvector, input_matrix.astype(np.complex128))
+        participation = np.linalg.solve(realisation.eigenvector, input_matrix.astype(np.complex128))
         time = np.arange(lags) / self._sampling_rate
-        decay = np.exp(np.multiply.outer(time, system.pole))
-        correlation_of_pole = np.einsum("cn,ln,nd->nlcd", system.shape, decay, participation)
+        decay = np.exp(np.multiply.outer(time, realisation.pole))
+        correlation_of_pole = np.einsum("cn,ln,nd->nlcd", realisation.shape, decay, participation)
 
-        # Misfit with all poles, and without each pair of conjugate poles
-        is_positive = system.pole.imag > 0.0
+        # Increase of the squared residuals if a pair of conjugate poles is left out
+        is_positive = realisation.pole.imag > 0.0
         residual = self._correlation - correlation_of_pole.sum(axis=0).real
         correlation_of_pair = 2.0 * correlation_of_pole[is_positive].real
-        increase = (residual + correlation_of_pair) ** 2 - residual**2
+        increase_without_pole = (residual + correlation_of_pair) ** 2 - residual**2
         squared_size = np.abs(correlation_of_pole[is_positive]) ** 2
         poles = IdentifiedPoles(
-            pole=system.pole[is_positive],
-            shape=system.shape.T[is_positive],
+            pole=realisation.pole[is_positive],
+            shape=realisation.shape.T[is_positive],
             size=np.sqrt(np.sum(squared_size, axis=(1, 2, 3))),
-            chi_square=np.sum(increase / variance, axis=(1, 2, 3)),
+            chi_square=np.sum(increase_without_pole / variance, axis=(1, 2, 3)),
             frequency_count=lags,
         )
         return poles, float(np.mean(residual**2 / variance))
@@ -190,20 +237,25 @@ class Subspace:
         Parameters
         ----------
         change : (2 L, C, C) array
-            The change.
+            The change of the correlations.
         order : int
             The number of states.
         poles : (P,) array
-            The poles before the change [1/s].
+            The poles before the change [1/s]. Each is assigned the nearest pole after the change.
+
+        Returns
+        -------
+        list of P (1 + A,) arrays
+            See `IdentifiedPoles.modal_values`.
         """
-        system = self._realisation(self._correlation + change, self._basis(order))
-        nearest = np.argmin(np.abs(system.pole - poles[:, None]), axis=1)
+        realisation = self._realisation(self._correlation + change, self._basis(order))
+        nearest_pole = np.argmin(np.abs(realisation.pole - poles[:, None]), axis=1)
         not_needed = np.ones(len(poles))
-        changed = IdentifiedPoles(
-            pole=system.pole[nearest],
-            shape=system.shape.T[nearest],
+        changed_poles = IdentifiedPoles(
+            pole=realisation.pole[nearest_pole],
+            shape=realisation.shape.T[nearest_pole],
             size=not_needed,
             chi_square=not_needed,
             frequency_count=1,
         )
-        return [changed.modal_values(number) for number in range(len(poles))]
+        return [changed_poles.modal_values(number) for number in range(len(poles))]

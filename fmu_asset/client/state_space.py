@@ -1,7 +1,8 @@
-"""The linear system that the answers of an FMU show, if the FMU is linear.
+"""Identification of a linear state-space model from the responses of an FMU.
 
-An FMU hides its equations. Where its outputs after unit forces and releases are those of a linear
-system of few states, that system is realised from them, and can then be solved instead of the FMU.
+An FMU hides its equations. If its responses to unit forces and to releases from a unit displacement
+are those of a linear system of few states, that system is identified here, and can then be solved
+instead of the FMU.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,8 @@ from fe.runtime.arrays import FloatArray, IntArray
 ComplexArray = NDArray[np.complex128]
 
 SPEED_JUMP = 1e-2
-"""Share of a port's speed that may come at once with a force: coarse solver steps show a little."""
+"""Largest fraction of a port's speed that may appear at once with a force. It is not zero, since
+coarse solver steps of an FMU give a little of such a jump."""
 MOST_STATES = 40
 """Largest order of a linear system that is realised from records."""
 HANKEL_ROWS = 64
@@ -27,24 +29,26 @@ HANKEL_ROWS = 64
 HANKEL_COLUMNS = 160
 """Block columns of the Hankel matrix: samples of one row."""
 MIXTURES = 3
-"""Random mixtures of all outputs that stand in the Hankel matrix in the place of the outputs."""
+"""Number of random linear combinations of all outputs that replace the outputs in the Hankel
+matrix. They see every mode that some output sees, and keep the matrix small."""
 LARGEST_CONDITION = 1e5
 """Condition up to which eigenvectors give a matrix logarithm, 20 times faster than `logm`."""
 THRESHOLDS = 10.0 ** np.arange(-12, -6)
-"""Shares of the largest singular value below which one counts as rounding; tried in this order."""
+"""Fractions of the largest singular value below which a singular value is taken for rounding. They
+are tried in this order, which begins with the largest model."""
 FIT = 1e-7
 """Largest error of a linear system against its record, as a share of the record."""
 
 
 class VibratingMode(NamedTuple):
-    """A mode between one force and one output.
+    """A vibration mode, as one force excites it and one output shows it.
 
     Attributes
     ----------
     angular_frequency : float
-        Angular frequency [rad/s].
+        The angular frequency [rad/s].
     flexibility : float
-        Displacement of the output at rest under a unit force, by this mode alone [m/N].
+        The displacement of the output at rest under a unit force, by this mode alone [m/N].
     """
 
     angular_frequency: float
@@ -68,10 +72,10 @@ class PortStiffnesses(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FmuStateSpace:
-    """How E forces f and R releases move n states s and C outputs y of a linear FMU.
+    """The linear system of an FMU with n states s, E forces f, C outputs y and R releases.
 
-    s' = A s + B f and y = C s + D f. Outputs are those beyond the undisturbed FMU; where a force
-    jumps, f is its value just before.
+    s' = A s + B f and y = C s + D f. Outputs are differences from those of the undisturbed FMU. At
+    an instant at which a force jumps, f is its value just before the jump.
 
     Attributes
     ----------
@@ -84,7 +88,7 @@ class FmuStateSpace:
     feedthrough : (C, E) ndarray
         D.
     release_states : (n, R) ndarray
-        State just after a unit of each release.
+        The state just after a unit of each release.
     """
 
     state_matrix: FloatArray
@@ -94,16 +98,24 @@ class FmuStateSpace:
     release_states: FloatArray
 
     def in_coordinates_of(self, reference: "FmuStateSpace") -> "FmuStateSpace":
-        """Return the same system with the states of another system of its order.
+        """Return the same system in the state coordinates of another system of its order.
 
-        A realised state has no meaning of its own, so two systems of one FMU with different
-        parameters cannot be compared by their states. Outputs and their rates can: the new
-        coordinates are those in which both systems show them alike (least squares).
+        The coordinates of an identified state are arbitrary, so the states of two systems of one
+        FMU with different parameters cannot be compared. Their outputs and rates of outputs can:
+        the new coordinates T are those in which the rows [C; C A] of both systems agree best (least
+        squares).
+
+        Parameters
+        ----------
+        reference : FmuStateSpace
+            The system that has the wanted coordinates.
         """
         own_rows = _outputs_and_rates(self)
         reference_rows = _outputs_and_rates(reference)
-        scale = _nonzero(np.linalg.norm(reference_rows, axis=1, keepdims=True))
-        to_own = np.linalg.lstsq(own_rows / scale, reference_rows / scale, rcond=None)[0]
+        # Rows of outputs in different units count alike.
+        row_scale = _nonzero(np.linalg.norm(reference_rows, axis=1, keepdims=True))
+        # own state = to_own @ new state
+        to_own = np.linalg.lstsq(own_rows / row_scale, reference_rows / row_scale, rcond=None)[0]
         from_own = np.linalg.inv(to_own)
         return FmuStateSpace(
             state_matrix=from_own @ self.state_matrix @ to_own,
@@ -116,17 +128,26 @@ class FmuStateSpace:
     def output_rows(
         self, columns: Sequence[int], orders: Sequence[int] | int = 0
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the rows (K, n) on the state and (K, E) on the forces of outputs or their rates.
+        """Return the matrices that give outputs, or their derivatives, from state and forces.
 
         Parameters
         ----------
         columns : (K,) sequence of int
-            The outputs.
+            The numbers of the outputs.
         orders : int or (K,) sequence of int
-            Order of each one's derivative in time: 0, 1 or 2.
+            The order of the derivative in time of each output: 0, 1 or 2.
+
+        Returns
+        -------
+        on_state : (K, n) ndarray
+            The rows that multiply the state.
+        on_forces : (K, E) ndarray
+            The rows that multiply the forces.
         """
         on_state = self.output_matrix[columns]
         on_forces = self.feedthrough[columns]
+        # y = C s + D f has the rate C A s + C B f if f is constant; its rate follows in the same
+        # way.
         for order in (0, 1):
             is_higher = np.broadcast_to(orders, len(columns))[:, None] > order
             on_forces = np.where(is_higher, on_state @ self.input_matrix, on_forces)
@@ -134,7 +155,7 @@ class FmuStateSpace:
         return on_state, on_forces
 
     def state_at_rest(self, forces: FloatArray) -> FloatArray:
-        """Return the state (n, ...) at rest under constant forces (E, ...)."""
+        """Return the state (n, ...) at rest under constant forces (E, ...): -A^-1 B f."""
         return np.asarray(np.linalg.solve(self.state_matrix, -self.input_matrix @ forces))
 
     @property
@@ -150,70 +171,85 @@ class FmuStateSpace:
         return rates, shapes
 
     def _residues(self, output: int, force: int) -> ComplexArray:
-        """Return the residue (n,) of each mode in the answer of one output to one force."""
+        """Return each mode's residue (n,) in the transfer function from a force to an output."""
         _, shapes = self.modes
+        # Partial fractions: C (z - A)^-1 B = sum of residue_k / (z - rate_k)
         participation = np.linalg.solve(shapes, self.input_matrix[:, force].astype(complex))
         return np.asarray((self.output_matrix[output] @ shapes) * participation)
 
     def most_flexible_mode(self, output: int, force: int) -> VibratingMode | None:
-        """Return the mode that moves an output most at rest under a force; None if none vibrates.
+        """Return the mode that contributes most to the static displacement of an output by a force.
 
         Parameters
         ----------
         output, force : int
-            Numbers of the output and of the force.
+            The numbers of the output and of the force.
+
+        Returns
+        -------
+        VibratingMode or None
+            None if no mode vibrates.
         """
         rates, _ = self.modes
         residues = self._residues(output, force)
-        frequency = np.abs(rates)
+        angular_frequency = np.abs(rates)
+        # One mode of each conjugate pair; real rates are modes that only decay.
         vibrates = rates.imag > 1e-9 * np.abs(rates)
         if not vibrates.any():
             return None
-        # a pair of conjugate modes: -2 Im(rate) Im(residue) / |rate|^2 at rest
-        flexibility = np.where(vibrates, np.abs(2.0 * rates.imag * residues) / frequency**2, 0.0)
-        best = int(np.argmax(flexibility))
-        return VibratingMode(float(frequency[best]), float(flexibility[best]))
+        # At rest a mode gives -residue / rate, and a conjugate pair -2 Re(residue / rate). Without
+        # damping rate and residue are imaginary, so this is -2 Im(rate) Im(residue) / |rate|^2.
+        flexibility = np.where(
+            vibrates, np.abs(2.0 * rates.imag * residues) / angular_frequency**2, 0.0
+        )
+        most_flexible = int(np.argmax(flexibility))
+        return VibratingMode(
+            float(angular_frequency[most_flexible]), float(flexibility[most_flexible])
+        )
 
     def stiffness(self, output: int, force: int) -> PortStiffnesses:
-        """Return the stiffness between an output and a force: of one mode, and at rest.
+        """Return the stiffness between an output and a force: of the main mode, and at rest.
 
         Parameters
         ----------
         output, force : int
-            Numbers of the output and of the force.
+            The numbers of the output and of the force.
         """
         static = 1.0 / float(self.gain[output, force])
         mode = self.most_flexible_mode(output, force)
+        # A mode without a noticeable part in the static flexibility is rounding.
         if mode is None or mode.flexibility * static < 1e-6:
             return PortStiffnesses(modal=static, static=static)
         return PortStiffnesses(modal=1.0 / mode.flexibility, static=static)
 
     def has_jumping_speed(self, outputs: IntArray, forces: IntArray) -> bool:
-        """Return whether the speed of an output jumps with its force.
+        """Return whether a force at any of some ports makes the speed there jump.
 
-        Laws at such a port find no mass that holds against them, and cannot be integrated.
+        At such a port no mass resists the force. A missing effect there that depends on the speed
+        could not be integrated in time.
 
         Parameters
         ----------
         outputs, forces : (P,) array of int
-            Displacement output and force of each port.
+            The numbers of the displacement output and of the force of each port.
         """
         for output, force in zip(outputs, forces, strict=True):
             residues = self._residues(output, force)
-            # the speed after an impulse starts at the sum of the residues
+            # The speed y' = C A s + C B f jumps with the force by C B, which is the sum of the
+            # residues. If a mass resists the force, they cancel.
             if abs(residues.sum()) > SPEED_JUMP * np.abs(residues).sum():
                 return True
         return False
 
 
 def _outputs_and_rates(system: FmuStateSpace) -> FloatArray:
-    """Return the rows (2 C, n) by which outputs and their rates follow from the state."""
+    """Return the matrix (2 C, n) that gives the outputs and their rates from the state."""
     rates = system.output_matrix @ system.state_matrix
     return np.vstack((system.output_matrix, rates))
 
 
 def _nonzero(scales: FloatArray) -> FloatArray:
-    """Return scales to divide by, with 1 in the place of 0."""
+    """Return scales with 1 instead of 0, so that they can be divided by."""
     return np.where(scales == 0.0, 1.0, scales)
 
 
@@ -221,14 +257,15 @@ def _nonzero(scales: FloatArray) -> FloatArray:
 
 
 class HankelMatrices(NamedTuple):
-    """Records as block Hankel matrices of Ho and Kalman.
+    """Two block Hankel matrices of recorded responses, as in the method of Ho and Kalman.
 
     Attributes
     ----------
     hankel : (h m, w k) ndarray
-        Block (i, j) is the sample i + j + 1 of m mixtures of outputs, for k forces and releases.
+        Block (i, j) is sample i + j + 1 of the records: m mixtures of outputs (rows) for k forces
+        and releases (columns).
     shifted : (h m, w k) ndarray
-        The same, one sample later.
+        The same matrix one sample later: block (i, j) is sample i + j + 2.
     """
 
     hankel: FloatArray
@@ -236,7 +273,10 @@ class HankelMatrices(NamedTuple):
 
 
 class SingularTriplets(NamedTuple):
-    """Singular value decomposition, left @ diag(values) @ right, perhaps of the largest values."""
+    """A singular value decomposition, left @ diag(values) @ right, in descending order.
+
+    It may be truncated to the largest singular values.
+    """
 
     left: FloatArray
     values: FloatArray
@@ -244,16 +284,19 @@ class SingularTriplets(NamedTuple):
 
 
 class DiscreteSystem(NamedTuple):
-    """A system in steps: s(k+1) = transition s(k), y(k) = output_rows s(k), k >= 1.
+    """A system in discrete time: s(k+1) = transition s(k), y(k) = output_rows s(k) for k >= 1.
+
+    Sample k is taken k + 1 steps after the start. The equation of y does not hold for k = 0, at the
+    end of the first step: the unit force still acts there, and has a feedthrough.
 
     Attributes
     ----------
     transition : (n, n) ndarray
-        State after a step.
+        The matrix that advances the state by one step.
     first_states : (n, E + R) ndarray
-        State at the end of the first step, for each unit force and release.
+        The states s(0) at the end of the first step, for each unit force and each release.
     output_rows : (C, n) ndarray
-        Outputs of a state.
+        The matrix that gives the outputs from the state.
     """
 
     transition: FloatArray
@@ -262,65 +305,74 @@ class DiscreteSystem(NamedTuple):
 
 
 def realise_state_space(records: FloatArray, forces: int, step: float) -> FmuStateSpace | None:
-    """Return the linear system that gives recorded answers to unit forces and releases.
+    """Identify a linear system from its recorded responses to unit forces and releases.
 
-    The eigensystem realisation of Ho and Kalman (1966) as by Juang and Pappa (1985), on random
-    mixtures of the outputs.
+    The method is the eigensystem realisation algorithm of Juang and Pappa (1985), which builds on
+    Ho and Kalman (1966). Random mixtures of the outputs replace the outputs in the Hankel matrix.
 
     Parameters
     ----------
     records : (K, C, E + R) ndarray
-        Outputs at the ends of K steps after a unit of each force, held over the first step only,
-        and then after a unit of each release.
+        Outputs at the ends of K steps. The first E responses are those to a unit of each force,
+        which acts during the first step only; the last R are those to a unit of each release.
     forces : int
-        Number of forces, E.
+        The number of forces, E.
     step : float
-        Length of a step [s].
+        The length of a step [s].
 
     Returns
     -------
     FmuStateSpace or None
-        None if no system of at most `MOST_STATES` states gives the records within `FIT`.
+        None if no system of at most `MOST_STATES` states reproduces the records within `FIT`.
     """
-    # scale outputs and inputs, so that units do not decide what is rounding
+    # scale outputs and inputs, so that the choice of units does not decide what is rounding
     output_scale = _nonzero(np.max(np.abs(records[1:]), axis=(0, 2)))
     input_scale = _nonzero(np.max(np.abs(records[1:]) / output_scale[:, None], axis=(0, 1)))
-    scaled = records / (output_scale[:, None] * input_scale)
-    # find the order and the system in steps
-    matrices = _hankel_matrices(scaled)
+    scaled_records = records / (output_scale[:, None] * input_scale)
+    # try the orders, the largest first, until a discrete-time system reproduces the records
+    matrices = _hankel_matrices(scaled_records)
     triplets = _sufficient_triplets(matrices.hankel)
-    significant = [
+    candidate_orders = [
         int(np.sum(triplets.values > least * triplets.values[0])) for least in THRESHOLDS
     ]
-    for order in dict.fromkeys(significant):
-        system = _system_of_order(order, matrices, triplets, scaled)
+    for order in dict.fromkeys(candidate_orders):
+        system = _system_of_order(order, matrices, triplets, scaled_records)
         if system is not None:
             # undo the scales
             system = system._replace(
                 first_states=system.first_states * input_scale,
                 output_rows=system.output_rows * output_scale[:, None],
             )
-            first_outputs = scaled[0, :, :forces] * output_scale[:, None] * input_scale[:forces]
+            first_outputs = (
+                scaled_records[0, :, :forces] * output_scale[:, None] * input_scale[:forces]
+            )
             return _in_continuous_time(system, first_outputs, step)
     return None
 
 
 def _hankel_matrices(records: FloatArray) -> HankelMatrices:
-    """Return the Hankel matrices of records (K, C, E + R), as long as the records allow."""
+    """Return the Hankel matrices of records (K, C, E + R).
+
+    They have `HANKEL_ROWS` by `HANKEL_COLUMNS` blocks, or fewer if the records are short.
+    """
     samples, outputs, inputs = records.shape
     mixing = np.random.default_rng(1).standard_normal((MIXTURES, outputs))
     mixtures = mixing @ records
     height = min(HANKEL_ROWS, (samples - 2) // 2)
     width = min(HANKEL_COLUMNS, samples - 2 - height)
+    # Sample 0 is left out, since it contains the feedthrough of the forces.
     # one block row more than needed: the two matrices are all but the last, and all but the first
-    numbers = 1 + np.arange(height + 1)[:, None] + np.arange(width)
-    blocks = mixtures[numbers].transpose(0, 2, 1, 3)
+    sample_of_block = 1 + np.arange(height + 1)[:, None] + np.arange(width)
+    blocks = mixtures[sample_of_block].transpose(0, 2, 1, 3)
     matrix = blocks.reshape((height + 1) * MIXTURES, width * inputs)
     return HankelMatrices(hankel=matrix[:-MIXTURES], shifted=matrix[MIXTURES:])
 
 
 def _sufficient_triplets(matrix: FloatArray) -> SingularTriplets:
-    """Return singular triplets of a matrix, enough of them to reach its rounding, if possible."""
+    """Return the largest singular triplets of a matrix, down to its rounding if possible.
+
+    A few are computed first, since that is fast and suffices for systems of few states.
+    """
     few = _largest_triplets(matrix, MOST_STATES // 4 + 16)
     if few.values[-1] <= 1e-13 * few.values[0]:
         return few
@@ -328,112 +380,151 @@ def _sufficient_triplets(matrix: FloatArray) -> SingularTriplets:
 
 
 def _largest_triplets(matrix: FloatArray, count: int) -> SingularTriplets:
-    """Return the singular triplets of a matrix, only the largest ones where there are more.
+    """Return the largest singular triplets of a matrix, by randomised SVD.
 
-    These follow from its image of random vectors (Halko, Martinsson and Tropp 2011). The caller
-    uses values far above the rounding of the first, so that the others change nothing but rounding.
+    The method is that of Halko, Martinsson and Tropp (2011): the matrix is projected on the range
+    of its product with random vectors. It is accurate for singular values far above the last one,
+    and the caller uses no others.
+
+    Parameters
+    ----------
+    matrix : (r, c) ndarray
+        The matrix.
+    count : int
+        The number of triplets; if the matrix has no more, all are computed exactly.
     """
     if min(matrix.shape) <= count:
         left, values, right = np.linalg.svd(matrix, full_matrices=False)
         return SingularTriplets(left, values, right)
-    random = np.random.default_rng(0).standard_normal((matrix.shape[1], count))
-    image = np.linalg.qr(matrix @ random)[0]
-    left, values, right = np.linalg.svd(image.T @ matrix, full_matrices=False)
-    return SingularTriplets(image @ left, values, right)
+    random_vectors = np.random.default_rng(0).standard_normal((matrix.shape[1], count))
+    range_basis = np.linalg.qr(matrix @ random_vectors)[0]
+    left, values, right = np.linalg.svd(range_basis.T @ matrix, full_matrices=False)
+    return SingularTriplets(range_basis @ left, values, right)
 
 
 def _system_of_order(
     order: int, matrices: HankelMatrices, triplets: SingularTriplets, records: FloatArray
 ) -> DiscreteSystem | None:
-    """Return the system of n states that gives the records, or None if it does not.
+    """Return the discrete-time system of n states that reproduces records.
 
     Parameters
     ----------
     order : int
-        n.
+        The number n of states.
     matrices : HankelMatrices
-        Hankel matrices of the records.
+        The Hankel matrices of the records.
     triplets : SingularTriplets
-        Decomposition of the first of them.
+        The singular value decomposition of `matrices.hankel`.
     records : (K, C, E + R) ndarray
-        Scaled outputs.
+        The scaled outputs, see `realise_state_space`.
+
+    Returns
+    -------
+    DiscreteSystem or None
+        None if the system is unstable, or does not reproduce the records within `FIT`.
     """
     if not 0 < order <= MOST_STATES:
         return None
     samples, outputs, inputs = records.shape
-    # balanced realisation from the largest n triplets
+    # Balanced realisation (Ho and Kalman): the Hankel matrix is the product of the observability
+    # matrix, left * root, and the controllability matrix, root * right. The shifted matrix has the
+    # transition matrix between the two, so their pseudoinverses on either side isolate it.
     root = np.sqrt(triplets.values[:order])
-    left = triplets.left[:, :order]
-    right = triplets.right[:order]
-    transition = (left / root).T @ matrices.shifted @ (right.T / root)
+    left_vectors = triplets.left[:, :order]
+    right_vectors = triplets.right[:order]
+    transition = (left_vectors / root).T @ matrices.shifted @ (right_vectors.T / root)
     if np.max(np.abs(np.linalg.eigvals(transition))) > 1.0 + 1e-9:
         return None
-    # first sample of the Hankel matrix is a step after the end of the first step
-    first_columns = (root[:, None] * right)[:, :inputs]
+    # The first block column of the controllability matrix is s(1) = transition s(0), since the
+    # Hankel matrix begins with sample 1.
+    first_columns = (root[:, None] * right_vectors)[:, :inputs]
     first_states = np.asarray(np.linalg.lstsq(transition, first_columns)[0], dtype=np.float64)
-    states = _states_in_time(transition, first_states, samples)
-    # outputs of the states, by least squares on the whole records
-    flat_states = states[1:].transpose(0, 2, 1).reshape(-1, order)
-    flat_records = records[1:].transpose(0, 2, 1).reshape(-1, outputs)
-    state_scale = np.max(np.abs(flat_states), axis=0)
-    scaled_rows = np.linalg.lstsq(flat_states / state_scale, flat_records, rcond=1e-14)[0]
+    state_history = _states_in_time(transition, first_states, samples)
+    # Output matrix by least squares of all outputs on the states. Sample 0 is left out as above.
+    state_samples = state_history[1:].transpose(0, 2, 1).reshape(-1, order)
+    output_samples = records[1:].transpose(0, 2, 1).reshape(-1, outputs)
+    state_scale = np.max(np.abs(state_samples), axis=0)
+    # Nearly dependent states: smaller singular values than this are treated as zero.
+    scaled_rows = np.linalg.lstsq(state_samples / state_scale, output_samples, rcond=1e-14)[0]
     output_rows = np.asarray(scaled_rows.T / state_scale, dtype=np.float64)
-    error = np.max(np.abs(flat_records - flat_states @ output_rows.T), axis=0)
-    if np.all(error <= FIT * np.max(np.abs(flat_records), axis=0) + 1e-300):
+    error = np.max(np.abs(output_samples - state_samples @ output_rows.T), axis=0)
+    # 1e-300 accepts an output that is zero throughout.
+    if np.all(error <= FIT * np.max(np.abs(output_samples), axis=0) + 1e-300):
         return DiscreteSystem(transition, first_states, output_rows)
     return None
 
 
 def _states_in_time(transition: FloatArray, first: FloatArray, samples: int) -> FloatArray:
-    """Return the states (samples, n, k) that follow first states (n, k), doubling each time."""
+    """Return the states that follow first states when there are no forces.
+
+    Parameters
+    ----------
+    transition : (n, n) ndarray
+        The matrix that advances a state by one step.
+    first : (n, k) ndarray
+        The first states of k responses.
+    samples : int
+        The number of samples K.
+
+    Returns
+    -------
+    (K, n, k) ndarray
+    """
     states = first[None]
-    power = transition
+    power_of_transition = transition
+    # Each pass appends as many states as there are: those, advanced by that many steps.
     while len(states) < samples:
-        states = np.concatenate((states, power @ states))
-        power = power @ power
+        states = np.concatenate((states, power_of_transition @ states))
+        power_of_transition = power_of_transition @ power_of_transition
     return states[:samples]
 
 
 def _in_continuous_time(
     system: DiscreteSystem, first_outputs: FloatArray, step: float
 ) -> FmuStateSpace:
-    """Return the continuous-time system that a system in steps samples, with forces held in a step.
+    """Return the continuous-time system whose samples are those of a discrete-time system.
+
+    Forces are constant during a step (zero-order hold).
 
     Parameters
     ----------
     system : DiscreteSystem
-        The system in steps, in the units of the FMU.
+        The discrete-time system, in the units of the FMU.
     first_outputs : (C, E) ndarray
-        Outputs at the end of the first step, in which each unit force acts.
+        The outputs at the end of the first step, during which each unit force acts.
     step : float
-        Length of a step [s].
+        The length of a step [s].
     """
     order = len(system.transition)
     forces = first_outputs.shape[1]
     after_force, after_release = np.split(system.first_states, [forces], axis=1)
-    # logarithm of [[transition, after_force], [0, 1]] (zero-order hold, Van Loan 1978)
+    # exp([[A, B], [0, 0]] step) = [[transition, after_force], [0, 1]] (Van Loan 1978), so the
+    # logarithm of the right-hand side gives A and B.
     augmented = np.block(
         [[system.transition, after_force], [np.zeros((forces, order)), np.eye(forces)]]
     )
-    rates = _logarithm(augmented)[:order] / step
-    state_matrix, input_matrix = np.split(rates, [order], axis=1)
+    continuous_matrices = _logarithm(augmented)[:order] / step
+    state_matrix, input_matrix = np.split(continuous_matrices, [order], axis=1)
     return FmuStateSpace(
         state_matrix=state_matrix,
         input_matrix=input_matrix,
         output_matrix=system.output_rows,
         feedthrough=first_outputs - system.output_rows @ after_force,
-        # the first recorded sample comes one step after the release
+        # the first sample is taken one step after the release, so go back by one step
         release_states=np.asarray(np.linalg.solve(system.transition, after_release)),
     )
 
 
 def _logarithm(matrix: FloatArray) -> FloatArray:
-    """Return the real logarithm of a matrix, by its eigenvectors where these are independent."""
-    values, shapes = np.linalg.eig(matrix)
-    if np.linalg.cond(shapes) < LARGEST_CONDITION:
-        scaled_shapes = shapes * np.log(values.astype(complex))
-        return np.asarray(np.real(scaled_shapes @ np.linalg.inv(shapes)))
+    """Return the real logarithm of a matrix.
+
+    Eigenvectors give it fast. If they are nearly dependent, scipy's `logm` computes it.
+    """
+    values, vectors = np.linalg.eig(matrix)
+    if np.linalg.cond(vectors) < LARGEST_CONDITION:
+        scaled_vectors = vectors * np.log(values.astype(complex))
+        return np.asarray(np.real(scaled_vectors @ np.linalg.inv(vectors)))
     with catch_warnings():
-        # it warns of rounding in what decays within a step
+        # logm warns of rounding errors in modes that decay within a step; these do not matter
         simplefilter("ignore", RuntimeWarning)
         return np.asarray(np.real(logm(matrix)))

@@ -72,36 +72,36 @@ class FMU1ModelExchange(FMU1Model):  # type: ignore[misc]
 
 
 class FMU3ModelExchange(FMU3Model):  # type: ignore[misc]
-    """FMI 3.0 model exchange with the methods of FMI 2.0."""
+    """FMI 3.0 model exchange under the names of methods of FMI 2.0."""
 
     getDerivatives = FMU3Model.getContinuousStateDerivatives
     newDiscreteStates = FMU3Model.updateDiscreteStates
 
 
 class MovingInputs(Protocol):
-    """The inputs of a model as the solver sees them."""
+    """The inputs of a model that change with time between two communication points."""
 
     def apply(self, time: float) -> None:
         """Set the inputs at a time [s]."""
 
 
 class CvodeSolver(CVodeSolver):  # type: ignore[misc]
-    """Backward differentiation with root finding for one model-exchange instance.
+    """The solver CVODE for one model-exchange instance: BDF with root finding at events.
 
     Parameters
     ----------
     fmu : fmpy model
         The FMU, with the methods of FMI 2.0.
     plan : Plan
-        Its numbers of states and event indicators, and the relative tolerance; absolute tolerances
-        are this times the nominal values.
+        The numbers of states and event indicators, and the relative tolerance. The absolute
+        tolerance of a state is the relative one times its nominal value.
     inputs : MovingInputs
-        The inputs; they are set before each evaluation.
+        The inputs; they are set before each evaluation of the model.
     start_time : float
-        Start of the integration [s].
+        The start of the integration [s].
     largest_step : float
-        Limit of internal steps [s], so that an event indicator that changes its sign twice is not
-        missed for long.
+        The limit of the solver's internal steps [s]. It bounds how long an event can stay unnoticed
+        whose indicator changes its sign twice within a step.
     """
 
     def __init__(
@@ -118,7 +118,7 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
         def get_nominals(values: MutableSequence[float], count: int) -> None:
             fmu.getNominalsOfContinuousStates(values, count)
             for index in range(count):
-                # zero is no nominal value, and CVODE takes no tolerance of zero for a state of zero
+                # FMI allows no nominal value of zero, and CVODE no zero tolerance of a zero state
                 values[index] = abs(values[index]) or 1.0
 
         super().__init__(
@@ -137,11 +137,15 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
             maxNumSteps=_MOST_INTERNAL_STEPS,
         )
 
-    # ctypes prints and forgets an exception that leaves a callback, and CVODE would go on with
-    # wrong values: the exception is kept, and CVODE gets a status.
+    # CVODE calls these methods through ctypes, which only prints an exception that leaves a
+    # callback; CVODE would go on with wrong values. So the exception is stored, CVODE gets an error
+    # status and stops, and `advance` raises the exception.
 
     def f(self, t: float, y: object, ydot: object, user_data: object) -> int:
-        """Compute the right-hand side for CVODE: 1 asks for a smaller step, -1 ends integration."""
+        """Compute the right-hand side for CVODE.
+
+        The status 1 asks CVODE to try a smaller step, and -1 ends the integration.
+        """
         return self._guarded(self._right_hand_side, t, y, ydot, user_data)
 
     def _right_hand_side(self, t: float, y: object, ydot: object, user_data: object) -> int:
@@ -155,7 +159,10 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
     def _guarded(
         self, function: Callable[..., int], t: float, y: object, result: object, user_data: object
     ) -> int:
-        """Return the status of a callback; keep its exception instead of raising it."""
+        """Call a callback of CVODE and return its status; store an exception instead of raising it.
+
+        If the FMU discards the evaluation, CVODE may try a smaller step.
+        """
         try:
             return function(t, y, result, user_data)
         except (FMICallException, FmuError) as error:
@@ -163,19 +170,19 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
             return 1 if getattr(error, "status", None) == DISCARD else -1
 
     def advance(self, begin: float, end: float) -> tuple[bool, float]:
-        """Integrate until a time [s] or an event.
+        """Integrate until a given time or the first event, whichever comes first.
 
         Parameters
         ----------
         begin, end : float
-            Interval of integration [s].
+            The interval of integration [s].
 
         Returns
         -------
         event : bool
-            Whether there was an event.
+            Whether an event indicator changed its sign.
         time : float
-            Time that was reached [s].
+            The time that was reached [s].
 
         Raises
         ------
@@ -194,10 +201,7 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
         return event, time
 
     def close(self) -> None:
-        """Free the solver, and what fmpy's wrapper does not free.
-
-        These are the vectors, the matrix, the linear solver and the context.
-        """
+        """Free the solver, and the parts of it that fmpy's wrapper never frees."""
         if not self._is_open:
             return
         super().__del__()
@@ -213,11 +217,11 @@ class CvodeSolver(CVodeSolver):  # type: ignore[misc]
 
 
 class ModelExchange(FmuInstance):
-    """A model-exchange instance with its solver.
+    """A model-exchange instance together with its solver.
 
-    Inputs are held over a communication step, or move in straight lines. Where they differ from the
-    last ones there is an event at the communication point, and the solver starts again there, as it
-    does where a line bends; without a change it keeps its step size and order.
+    Over a communication step an input is constant, or changes linearly if the binding says so. If
+    inputs jump at a communication point, this is an event, and the solver restarts. It also
+    restarts where the slope of a linear input changes. Otherwise it keeps its step size and order.
     """
 
     classes = {1: FMU1ModelExchange, 2: FMU2Model, 3: FMU3ModelExchange}  # noqa: RUF012
@@ -228,26 +232,27 @@ class ModelExchange(FmuInstance):
     def _go_to_start(
         self, start_time: float, parameters: InitialValues, *, with_inputs: bool
     ) -> None:
-        """Bring the instance to its first communication point, with its discrete states settled."""
+        """Initialise the FMU and settle its discrete states, as at an event."""
         self._close_solver()
         super()._go_to_start(start_time, parameters, with_inputs=with_inputs)
         self._settle_discrete_states(start_time)
         self._sent_inputs = self._inputs_now() if with_inputs else None
 
     def _inputs_now(self) -> bytes:
-        """Return the inputs of the block, after time and step size, to compare them to the bit."""
+        """Return the bytes of all present inputs, for an exact comparison."""
+        # The block begins with time and step size, 8 bytes each.
         return bytes(self._values)[16:]
 
     def _send_inputs(self) -> None:
-        """Set inputs that have changed, as an event."""
-        line_bends = False
+        """Set the inputs of a new step; a change of their values is an event."""
+        slope_changes = False
         if self._lines is not None:
-            slopes_before = bytes(self._lines.slopes)
+            previous_slopes = bytes(self._lines.slopes)
             self._lines.begin_step()
-            line_bends = bytes(self._lines.slopes) != slopes_before
+            slope_changes = bytes(self._lines.slopes) != previous_slopes
         inputs = self._inputs_now()
         has_changed = inputs != self._sent_inputs
-        if not has_changed and not line_bends:
+        if not has_changed and not slope_changes:
             return
         with self._fmpy_calls("setting inputs"):
             if has_changed:
@@ -259,21 +264,22 @@ class ModelExchange(FmuInstance):
                 self._solver.reset(self.request[0])
 
     def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
-        """Return the calls that set inputs that move, again at each evaluation of the model."""
-        moving = tuple(group for group in self._plan.inputs if group.linear)
-        return self._group_calls("Set", moving, self._values, 2)
+        """Return the calls that set the linear inputs; the solver makes them at each evaluation."""
+        linear_groups = tuple(group for group in self._plan.inputs if group.linear)
+        # Values begin behind time and step size in the block.
+        return self._group_calls("Set", linear_groups, self._values, 2)
 
     def _send_moved_inputs(self, lines: LinearInputs) -> None:
-        """Do nothing: inputs move with the solver's time."""
+        """Do nothing: `apply` already sets the linear inputs at every time of the solver."""
 
     def apply(self, time: float) -> None:
-        """Set the inputs that move at a time [s]; the solver calls this before each evaluation."""
+        """Set the linear inputs to their values at a time [s]; called before each evaluation."""
         if self._lines is not None:
             self._lines.move_to(time)
             self._make_calls(self._motion_calls)
 
     def _do_step(self) -> None:
-        """Integrate over one communication step, from event to event."""
+        """Integrate over one communication step, which may contain several events."""
         begin = self._step_begin.value
         size = self._step_size.value
         end = begin + size
@@ -295,24 +301,36 @@ class ModelExchange(FmuInstance):
     def _integrate_to_event(
         self, solver: CvodeSolver, time: float, end: float, resolution: float
     ) -> float:
-        """Integrate to the end or to the next event, and handle that; return the time reached [s].
+        """Integrate to the next event or to the end of the step, and handle the event.
+
+        There are three kinds of events: a state event, which the solver finds as a change of sign
+        of an event indicator; a step event, which the FMU asks for after a step of the solver; and
+        a time event, which the FMU has announced at the last event.
 
         Parameters
         ----------
         solver : CvodeSolver
             The solver.
         time, end : float
-            Present time, and end of the communication step [s].
+            The present time, and the end of the communication step [s].
         resolution : float
-            Times that differ by less are the same [s].
+            Times that differ by less than this count as equal [s].
+
+        Returns
+        -------
+        float
+            The time that was reached [s].
         """
-        # integrate
-        due = self._next_event_time
-        target = end if due is None or due >= end - resolution else max(due, time)
+        # Integrate to the announced time event if it lies inside the step, else to the end. A time
+        # event that is overdue is handled at once.
+        time_event = self._next_event_time
+        stop_time = (
+            end if time_event is None or time_event >= end - resolution else max(time_event, time)
+        )
         has_event = False
-        if target > time + resolution:
+        if stop_time > time + resolution:
             try:
-                has_event, time = solver.advance(time, target)
+                has_event, time = solver.advance(time, stop_time)
             except RuntimeError as error:
                 raise self._lost_error(
                     f"The solver could not integrate the FMU in the step from t = {time:g} s "
@@ -321,7 +339,7 @@ class ModelExchange(FmuInstance):
                 ) from error
         if not has_event and abs(time - end) <= resolution:
             time = end
-        # bring the FMU to the time reached
+        # bring the FMU to the time reached; it may ask for a step event there
         self._fmu.setTime(time)
         self.apply(time)
         if self._plan.fmu.completed_step:
@@ -329,8 +347,8 @@ class ModelExchange(FmuInstance):
             if terminated:
                 raise self._ended_error(time)
             has_event = has_event or bool(wants_event)
-        # handle an event
-        is_time_event = due is not None and time >= due - resolution
+        # handle the event: update the discrete states and restart the solver
+        is_time_event = time_event is not None and time >= time_event - resolution
         if has_event or is_time_event:
             self._fmu.enterEventMode()
             self._settle_discrete_states(time)
@@ -338,7 +356,15 @@ class ModelExchange(FmuInstance):
         return time
 
     def _settle_discrete_states(self, time: float) -> None:
-        """Update the discrete states until they do not change, and go on in continuous time."""
+        """Iterate an event until the discrete states are settled, and return to continuous time.
+
+        The FMU must be in event mode. Its next time event is kept for the integration.
+
+        Parameters
+        ----------
+        time : float
+            The time of the event [s], for messages.
+        """
         for _ in range(_MOST_EVENT_ITERATIONS):
             update = self._fmu.newDiscreteStates()
             needs_another, terminated, _, _, has_next_event, next_event_time = update
@@ -351,16 +377,17 @@ class ModelExchange(FmuInstance):
                 f"The FMU's discrete states do not settle at t = {time:g} s: "
                 f"{_MOST_EVENT_ITERATIONS} event iterations were made; the instance is lost."
             )
-        is_stated = has_next_event and math.isfinite(next_event_time)
-        self._next_event_time = next_event_time if is_stated else None
+        has_time_event = has_next_event and math.isfinite(next_event_time)
+        self._next_event_time = next_event_time if has_time_event else None
         self._fmu.enterContinuousTimeMode()
 
     def _lost_error(self, sentence: str) -> FmuCallError:
-        """Give the instance up, and return the error that says why."""
+        """Mark the instance as lost, and return the error that says why."""
         self.lost = True
         return FmuCallError(sentence, self._last_messages())
 
     def _close_solver(self) -> None:
+        """Free the solver and forget the pending time event and the inputs that were set."""
         if self._solver is not None:
             self._solver.close()
         self._solver = None

@@ -39,12 +39,12 @@ EffectRecord = Mapping[str, Any]
 
 
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
-    """Return name and quantity of the outputs that sensors read, in the behaviour's order.
+    """Return name and quantity of the wing's measured outputs, in the order of the FMU's behaviour.
 
     Parameters
     ----------
     gauge_count : int
-        Number of gauges of the wing.
+        The number of strain gauges of the wing.
     """
     strains = tuple((f"strain[{gauge}]", "strain") for gauge in range(1, gauge_count + 1))
     displacements = (
@@ -55,17 +55,18 @@ def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
 
 
 class PrimitiveNumber(NamedTuple):
-    """A number of an effect: the position of its primitive in the effect, and its key there."""
+    """Where a number of an effect stands: the position of its primitive, and its key in that."""
 
     primitive: int
     key: str
 
 
 def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
-    """Return the numbers of an effect by the names of their variables.
+    """Return the numbers of an effect by the names of their FMU variables.
 
-    A number is called `effect.<id>.<key>`; where several primitives of the effect have one of that
-    name, `effect.<id>.<key>[n]`, with the number n of the primitive from 1.
+    The variable of a number is called `effect.<id>.<key>`. If several primitives of the effect have
+    a number with this key, it is called `effect.<id>.<key>[n]`, with the number n of the primitive
+    from 1.
 
     Parameters
     ----------
@@ -77,19 +78,29 @@ def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
         for key, value in primitive.items():
             if isinstance(value, int | float):
                 numbers.append(PrimitiveNumber(position, key))
-    uses = Counter(number.key for number in numbers)
+    key_counts = Counter(number.key for number in numbers)
     by_name = {}
     for number in numbers:
         name = f"effect.{effect['id']}.{number.key}"
-        if uses[number.key] > 1:
+        if key_counts[number.key] > 1:
             name += f"[{number.primitive + 1}]"
         by_name[name] = number
     return by_name
 
 
 def _unit(primitive: Mapping[str, Any], key: str) -> str:
-    """Return the unit of a primitive's number in the spelling of FMI, "1" for none."""
+    """Return the unit of a number of a primitive, in the spelling of FMI; "1" if it has none.
+
+    Parameters
+    ----------
+    primitive : mapping
+        The primitive. The units of some of its numbers depend on its channel or its port.
+    key : str
+        The key of the number.
+    """
     unit = PRIMITIVES[str(primitive["kind"])].units.get(key, "1")
+    # A channel reads a displacement [m] or a strain [1]. PER_RELEASE is that unit divided by the
+    # release amplitude, the displacement [m] from which a ring-down starts.
     if unit in (CHANNEL_UNIT, PER_RELEASE):
         is_displacement = (
             str(primitive["channel"]).endswith("displacement")
@@ -98,11 +109,11 @@ def _unit(primitive: Mapping[str, Any], key: str) -> str:
         if unit == CHANNEL_UNIT:
             return "m" if is_displacement else "1"
         return "1" if is_displacement else "1/m"
-    # "N s / m or N m s / rad": for translation or rotation
-    of_translation, _, of_rotation = unit.partition(" or ")
-    if of_rotation and primitive.get("port") == ROTATING_PORT:
-        return of_rotation.replace(" ", ".")
-    return of_translation.replace(" ", ".")
+    # A unit such as "N s / m or N m s / rad" is that of a translating or of a rotating port.
+    translation_unit, _, rotation_unit = unit.partition(" or ")
+    if rotation_unit and primitive.get("port") == ROTATING_PORT:
+        return rotation_unit.replace(" ", ".")
+    return translation_unit.replace(" ", ".")
 
 
 def switch_name(effect: EffectRecord) -> str:
@@ -113,17 +124,17 @@ def switch_name(effect: EffectRecord) -> str:
 def effect_rows(
     effects: Sequence[EffectRecord], first: int, start: Mapping[str, float]
 ) -> tuple[FmuVariable, ...]:
-    """Return the rows that effects append to the table of variables.
+    """Return the variables that effects add to the FMU, as rows of its table of variables.
 
     Parameters
     ----------
     effects : sequence of mapping
         The effects, see `EffectRecord`.
     first : int
-        Value reference of the first row.
+        The value reference of the first row.
     start : mapping of str to float
-        Start values by variable name. A switch that is missing is off, and a number has its value
-        in the patch.
+        Start values by variable name. Without one, an effect is switched off, and a number has its
+        value in the patch.
     """
     table = VariableTable({}, first)
     for effect in effects:
@@ -131,6 +142,7 @@ def effect_rows(
         for name, number in numbers_of(effect).items():
             primitive = effect["primitives"][number.primitive]
             _add_number(table, name, primitive, number.key, start)
+    # Effects of temperature need the temperature as an input.
     kinds = {primitive["kind"] for effect in effects for primitive in effect["primitives"]}
     if kinds & {"thermal_strain", "modulus_temperature"}:
         table.add(
@@ -145,7 +157,7 @@ def effect_rows(
 
 
 def _add_switch(table: VariableTable, effect: EffectRecord, start: Mapping[str, float]) -> None:
-    """Add the switch of an effect to a table; `start` as in `effect_rows`."""
+    """Add the variable that switches an effect on to a table; `start` as in `effect_rows`."""
     kinds = dict.fromkeys(str(primitive["kind"]) for primitive in effect["primitives"])
     words = " and ".join(kinds).replace("_", " ")
     name = switch_name(effect)
@@ -167,31 +179,31 @@ def _add_number(
     key: str,
     start: Mapping[str, float],
 ) -> None:
-    """Add a number of a primitive to a table.
+    """Add the variable of a primitive's number to a table.
 
     Parameters
     ----------
     table : VariableTable
         The table.
     name : str
-        Name of the variable.
+        The name of the variable.
     primitive : mapping
         The primitive.
     key : str
-        Key of the number in it.
+        The key of the number in the primitive.
     start : mapping of str to float
-        Start values by variable name.
+        Start values by variable name; without one, the value in the primitive.
     """
     value = primitive[key]
-    place = primitive.get("port") or primitive.get("channel") or ""
-    where = "" if place in ("", "*") else f" at {place}"
+    location = primitive.get("port") or primitive.get("channel") or ""
+    location_text = "" if location in ("", "*") else f" at {location}"
     kind = str(primitive["kind"]).replace("_", " ")
-    text = f"{key.replace('_', ' ')} of {kind}{where}"
+    description = f"{key.replace('_', ' ')} of {kind}{location_text}"
     is_whole = isinstance(value, int)
     table.add(
         name,
         "parameter",
-        text[:1].upper() + text[1:],
+        description[:1].upper() + description[1:],
         kind="Integer" if is_whole else "Real",
         unit=None if is_whole else _unit(primitive, key),
         limits=RANGES[key] if is_whole else (None, None),
@@ -203,14 +215,14 @@ def _add_number(
 def active_primitives(
     effects: Sequence[EffectRecord], values: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Return the primitives of the effects that are on, with the values of their variables.
+    """Return the primitives of the effects that are switched on, with the present values.
 
     Parameters
     ----------
     effects : sequence of mapping
         The effects, see `EffectRecord`.
     values : mapping of str to float
-        Values by variable name; a switch is on above one half.
+        The values by variable name. An effect is on if its switch is above one half.
     """
     active: list[dict[str, Any]] = []
     for effect in effects:
@@ -219,6 +231,7 @@ def active_primitives(
         primitives = [dict(primitive) for primitive in effect["primitives"]]
         for name, number in numbers_of(effect).items():
             primitive = primitives[number.primitive]
+            # Variables are floats; a number that is whole in the patch stays whole.
             number_type = type(primitive[number.key])
             primitive[number.key] = number_type(values[name])
         active += primitives
@@ -226,20 +239,21 @@ def active_primitives(
 
 
 class ActiveEffects(NamedTuple):
-    """Effects with the values of their variables.
+    """The effects that are switched on, at the present values of all variables.
 
     Attributes
     ----------
     values : tuple of float
-        Values of the variables.
+        The values of all variables of the effects.
     patch : ModelPatch
         The effects that are on.
     temperature : float
-        Difference from the reference temperature [K].
+        The temperature of the wing less the reference temperature [K].
     changes_structure : bool
-        Whether more is on than changes of the sensors' readings.
+        Whether an effect is on that changes more than the readings of sensors.
     filters : list of (str, str, float)
-        Channel, quantity and order of each filter; the memory of filters stays while these do.
+        Channel, quantity and order of each filter. The memory of the filters is kept while these
+        stay the same.
     """
 
     values: tuple[float, ...]
@@ -250,14 +264,14 @@ class ActiveEffects(NamedTuple):
 
 
 class SensorReadings(NamedTuple):
-    """Readings of all channels at one moment.
+    """The readings of all channels at one instant.
 
     Attributes
     ----------
     values : list of float
         The readings.
     filter_memory : list of float
-        Memory of the sensors' filters for the next moment.
+        The memory of the sensors' filters, which the next readings need.
     """
 
     values: list[float]
@@ -301,12 +315,12 @@ class SwitchableEffects:
         return tuple(tuned[name] for name in self._names)
 
     def active(self, values: Sequence[float]) -> ActiveEffects:
-        """Return the effects for values of the variables, in their order.
+        """Return the effects that are on, for values of the variables in the order of the table.
 
         Raises
         ------
         InvalidPatchError
-            If a primitive cannot have its numbers.
+            If a primitive does not accept the values of its numbers.
         """
         by_name = dict(zip(self._names, values, strict=True))
         patch = ModelPatch.from_list(active_primitives(self._effects, by_name))
@@ -335,26 +349,27 @@ class SwitchableEffects:
         start: float,
         release: float,
     ) -> SensorReadings:
-        """Return the sensors' readings of the channels at the end of a step.
+        """Return what the sensors read at the end of a step, with the effects on sensors applied.
 
         Parameters
         ----------
         active : ActiveEffects
             The effects.
         values : (C,) ndarray
-            True values of the channels.
+            The true values of the channels.
         strains_across : (2, C) ndarray, optional
-            Strains across the gauges and in shear; None if no sensor needs them.
+            The strains transverse to the gauges and in shear; None if no sensor needs them.
         filter_memory : sequence of float, optional
-            Memory of the filters from the last readings; None if the signals had settled.
+            The memory of the filters from the last readings; None if the filters are in steady
+            state.
         duration : float
-            Time since the last readings [s].
+            The time since the last readings [s].
         kind : {"flight", "forced", "ringdown"}
-            Kind of trial, see `SensorRecord`.
+            The kind of trial, see `SensorRecord`.
         time, start : float
-            Time of the readings, and of the start of the simulation [s].
+            The time of the readings, and of the start of the simulation [s].
         release : float
-            Displacement from which the structure was released [m].
+            The displacement from which the structure was released [m].
 
         Raises
         ------
@@ -389,14 +404,17 @@ class SwitchableEffects:
     def integrator(
         self, vector: FloatArray, damping: tuple[float, float], active: ActiveEffects
     ) -> ModalIntegrator:
-        """Return the wing for patches in time; the last one if nothing changed.
+        """Return the time integrator of the wing with the effects that are on.
+
+        If nothing has changed since the last call, the last integrator is returned.
 
         Parameters
         ----------
         vector : (V,) ndarray
-            Values of the model; the two last ones, the controls, do not matter.
+            The values of the model's parameters. The last two are controls, which do not affect the
+            integrator.
         damping : (float, float)
-            Rayleigh damping [1/s], [s].
+            The Rayleigh coefficients of mass [1/s] and stiffness [s].
         active : ActiveEffects
             The effects.
         """

@@ -47,7 +47,9 @@ _ALL_BITS = 0xFFFFFFFF
 
 
 class _ProcessorCalls(NamedTuple):
-    """Numbers of system calls on a processor, <asm/unistd.h>.
+    """Numbers of the system calls that the filter treats, on one kind of processor.
+
+    The numbers are those of <asm/unistd.h>.
 
     Attributes
     ----------
@@ -58,12 +60,13 @@ class _ProcessorCalls(NamedTuple):
     of_process : tuple of int
         Calls whose first argument is the process that they change.
     refused : tuple of int
-        Calls that are refused whatever their arguments: shared memory, semaphores, messages and
-        keys of the user's processes, notices of what is done to files, and io_uring, by which
-        sockets could be made all the same.
+        Calls that are refused whatever their arguments are. They serve shared memory, semaphores,
+        messages and keys of the user's processes, notices of changes to files, and io_uring, which
+        could make sockets without the call `socket`.
     ignored : tuple of int
-        Calls that return OK and do nothing: changes of the rights, owners, times and attributes of
-        files. Programs that copy files make them in vain.
+        Calls that do nothing and report success. They change the rights, owners, times and
+        attributes of files. Programs that copy files make such calls, and would fail if the calls
+        were refused.
     """
 
     architecture: int
@@ -152,7 +155,10 @@ _CALLS: dict[str, _ProcessorCalls] = {
 
 
 def refused_calls() -> tuple[int, ...]:
-    """Return the numbers of the system calls that are refused whatever their arguments are."""
+    """Return the numbers of the system calls that the filter always refuses.
+
+    The result is empty on a processor that the table `_CALLS` does not contain.
+    """
     machine = os.uname().machine
     return _CALLS[machine].refused if machine in _CALLS else ()
 
@@ -160,68 +166,81 @@ def refused_calls() -> tuple[int, ...]:
 def filter_calls(*, tcp: bool, truncates: bool) -> None:
     """Filter the system calls of this process and its children from now on.
 
-    Nothing is filtered on other processors than those of the table.
+    Nothing is filtered on processors that the table `_CALLS` does not contain.
 
     Parameters
     ----------
     tcp : bool
-        Whether sockets of the internet may be made: TCP, and UDP to look up the names of hosts.
+        Whether the process may open internet sockets: TCP, and UDP to look up the names of hosts.
     truncates : bool
-        Whether Landlock knows that truncate(2) empties a file; otherwise that is refused here.
+        Whether Landlock controls truncate(2), which empties a file. If it does not, the filter
+        refuses that call altogether.
 
     Raises
     ------
     OSError
-        If the system refuses.
+        If the system does not accept the filter.
     """
     is_32_bit = sys.maxsize < 2**32
     machine = os.uname().machine
     if machine not in _CALLS or is_32_bit:
         return
     calls = _CALLS[machine]
-    refused = calls.refused if truncates else (*calls.refused, calls.truncate)
-    program = _program(calls, refused, tcp=tcp)
+    always_refused = calls.refused if truncates else (*calls.refused, calls.truncate)
+    program = _program(calls, always_refused, tcp=tcp)
     instructions = ctypes.create_string_buffer(program, len(program))
     # struct sock_fprog: number and address of the instructions
-    count = len(program) // _INSTRUCTION.size
-    head = struct.pack("HxxxxxxQ", count, ctypes.addressof(instructions))
-    filter_program = ctypes.create_string_buffer(head)
+    instruction_count = len(program) // _INSTRUCTION.size
+    program_header = struct.pack("HxxxxxxQ", instruction_count, ctypes.addressof(instructions))
+    filter_program = ctypes.create_string_buffer(program_header)
     checked(libc().prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, filter_program, 0, 0))
 
 
 def _program(calls: _ProcessorCalls, refused: tuple[int, ...], *, tcp: bool) -> bytes:
     """Return the BPF program of the filter.
 
+    The kernel runs the program from its first instruction at every system call, until an
+    instruction returns grant, deny, or "do nothing and report success".
+
     Parameters
     ----------
     calls : _ProcessorCalls
-        Numbers of the calls.
+        The numbers of the calls on this processor.
     refused : tuple of int
-        Calls that are refused.
+        The calls that are refused whatever their arguments are.
     tcp : bool
-        Whether sockets of the internet may be made.
+        Whether the process may open internet sockets.
     """
+    # Each `_require` either denies the call or continues with the next instruction, so a sum of
+    # two means "both must hold".
     # Landlock does not watch other protocols, such as multipath TCP.
+    # Arguments of socket: family (0), type (1), protocol (2).
     internet_only = _require(0, (_IPV4, _IPV6)) + _require(2, (0, _TCP, _UDP))
     # Pairs of datagram sockets can send to anybody.
     local_streams_only = _require(0, (_UNIX,)) + _require(1, (_STREAM,), bits=_SOCKET_KIND)
-    # The number 0 means this process; in other places it means all processes of the user.
-    this_process_only = _require(0, (0, os.getpid()))
-    conditions = {
+    # As the target of these calls, 0 means this process.
+    own_process_only = _require(0, (0, os.getpid()))
+    # setpriority and ioprio_set: argument 0 says what kind of target argument 1 names; a process
+    # is PRIO_PROCESS = 0 and IOPRIO_WHO_PROCESS = 1. Process 0 is this process.
+    condition_of_call = {
         calls.socket: internet_only if tcp else _DENY,
         calls.socketpair: local_streams_only,
         calls.setpriority: _require(0, (0,)) + _require(1, (0,)),
         calls.ioprio_set: _require(0, (1,)) + _require(1, (0,)),
     }
     for number in calls.of_process:
-        conditions[number] = this_process_only
+        condition_of_call[number] = own_process_only
+    # The order matters only at the beginning: call numbers have no meaning on another
+    # architecture.
     program = _load(_ARCHITECTURE) + _unless_equal(calls.architecture, _DENY)
     program += _load(_CALL_NUMBER) + _if_at_least(_OTHER_ABI, _DENY)
     for number in refused:
         program += _if_equal(number, _DENY)
     for number in calls.ignored:
         program += _if_equal(number, _DO_NOTHING)
-    for number, condition in conditions.items():
+    # A condition loads an argument over the call number; it always ends with deny or grant, so no
+    # later comparison sees the argument.
+    for number, condition in condition_of_call.items():
         program += _if_equal(number, condition + _GRANT)
     return program + _GRANT
 
@@ -230,6 +249,7 @@ def _program(calls: _ProcessorCalls, refused: tuple[int, ...], *, tcp: bool) -> 
 
 
 def _return(value: int) -> bytes:
+    """Return the instruction that ends the program with a result for the kernel."""
     return _INSTRUCTION.pack(_RETURN, 0, 0, value)
 
 
@@ -239,46 +259,47 @@ _DO_NOTHING = _return(_RETURN_ERROR)
 
 
 def _load(offset: int) -> bytes:
-    """Load a word of `struct seccomp_data`, at an offset [bytes]."""
+    """Return the instruction that loads a word of `struct seccomp_data` at an offset [bytes]."""
     return _INSTRUCTION.pack(_LOAD_WORD, 0, 0, offset)
 
 
 def _if_equal(value: int, instructions: bytes) -> bytes:
-    """Run instructions if the loaded word has a value."""
-    skipped = len(instructions) // _INSTRUCTION.size
-    return _INSTRUCTION.pack(_JUMP_IF_EQUAL, 0, skipped, value) + instructions
+    """Return code that runs instructions only if the loaded word equals a value."""
+    instruction_count = len(instructions) // _INSTRUCTION.size
+    return _INSTRUCTION.pack(_JUMP_IF_EQUAL, 0, instruction_count, value) + instructions
 
 
 def _if_at_least(value: int, instructions: bytes) -> bytes:
-    """Run instructions if the loaded word is at least a value."""
-    skipped = len(instructions) // _INSTRUCTION.size
-    return _INSTRUCTION.pack(_JUMP_IF_AT_LEAST, 0, skipped, value) + instructions
+    """Return code that runs instructions only if the loaded word is at least a value."""
+    instruction_count = len(instructions) // _INSTRUCTION.size
+    return _INSTRUCTION.pack(_JUMP_IF_AT_LEAST, 0, instruction_count, value) + instructions
 
 
 def _unless_equal(value: int, instructions: bytes) -> bytes:
-    """Run instructions unless the loaded word has a value."""
-    skipped = len(instructions) // _INSTRUCTION.size
-    return _INSTRUCTION.pack(_JUMP_IF_EQUAL, skipped, 0, value) + instructions
+    """Return code that runs instructions unless the loaded word equals a value."""
+    instruction_count = len(instructions) // _INSTRUCTION.size
+    return _INSTRUCTION.pack(_JUMP_IF_EQUAL, instruction_count, 0, value) + instructions
 
 
 def _require(argument: int, values: tuple[int, ...], bits: int = _ALL_BITS) -> bytes:
-    """Deny a call unless an argument is one of some values.
+    """Return code that denies a call unless one argument has an allowed value.
 
-    The upper half of the argument has no meaning for these calls.
+    If the value is allowed, the program continues behind this code. Only the lower 32 bits of the
+    argument are compared: the upper half has no meaning for the calls that are filtered here.
 
     Parameters
     ----------
     argument : int
-        Number of the argument, from 0.
+        The number of the argument, from 0.
     values : tuple of int
-        The values.
+        The allowed values.
     bits : int
-        Bits of the argument that count.
+        The mask of the bits that are compared.
     """
     code = _load(_FIRST_ARGUMENT + _ARGUMENT_SIZE * argument)
     code += _INSTRUCTION.pack(_AND, 0, 0, bits)
-    for number, value in enumerate(values):
-        # jump behind the other comparisons and the denial
-        distance = len(values) - number
-        code += _INSTRUCTION.pack(_JUMP_IF_EQUAL, distance, 0, value)
+    for position, value in enumerate(values):
+        # if equal, jump behind the remaining comparisons and the denial
+        instructions_to_skip = len(values) - position
+        code += _INSTRUCTION.pack(_JUMP_IF_EQUAL, instructions_to_skip, 0, value)
     return code + _DENY

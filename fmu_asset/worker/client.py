@@ -102,7 +102,7 @@ class WorkerLimits(Section):
 
 
 class _AnswerHead(NamedTuple):
-    """Kind and length [bytes] of an answer."""
+    """The header of an answer: its kind, and the length of its payload [bytes]."""
 
     kind: int
     length: int
@@ -167,30 +167,44 @@ class WorkerInstance(Instance):
         self._call("initialise", start_time, parameters, with_inputs)
 
     def step(self) -> None:
-        """Make the step that the request block describes."""
+        """Make the step that the request block describes, and fill the reply block."""
         self._ask(Question.STEP, "step", self._request)
-        head = self._wait_for_answer(len(self._reply))
-        if head.length != len(self._reply):
+        header = self._wait_for_answer(len(self._reply))
+        if header.length != len(self._reply):
             raise self._death_error()
         self._read_into(self._reply)
         self.lost = False
 
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
-        """Make many steps; each may take the time of a step."""
+        """Make many steps in one call; each of them may take the time limit of a step.
+
+        The worker sends the replies in parts, so that the time limit holds for each part, and the
+        progress can be reported.
+
+        Parameters
+        ----------
+        requests : (N, 2 + n_inputs) array
+            The request block of each step.
+        replies : (N, n_outputs) array
+            The reply block of each step; filled in place.
+        report : callable
+            Called with the number of finished steps whenever a part has arrived.
+        """
         self._ask(Question.CALL, "run", self._pickled("run", requests))
-        target = replies.data.cast("B")
+        reply_bytes = replies.data.cast("B")
         bytes_per_step = replies[0].nbytes
-        filled = 0
+        filled_bytes = 0
         has_more = True
         while has_more:
-            head = self._wait_for_answer(len(target) - filled, may_be_part=True)
-            if head.length % bytes_per_step:
+            header = self._wait_for_answer(len(reply_bytes) - filled_bytes, may_be_part=True)
+            if header.length % bytes_per_step:
                 raise self._death_error()
-            self._read_into(target[filled : filled + head.length])
-            filled += head.length
-            has_more = head.kind == Answer.PART
+            self._read_into(reply_bytes[filled_bytes : filled_bytes + header.length])
+            filled_bytes += header.length
+            has_more = header.kind == Answer.PART
+            # Until the last part has arrived, no other question may be asked.
             self.lost = has_more
-            report(filled // bytes_per_step)
+            report(filled_bytes // bytes_per_step)
 
     def read(self) -> None:
         """Read the outputs of this moment."""
@@ -216,7 +230,10 @@ class WorkerInstance(Instance):
         self._call("open", self._plan)
 
     def take_log(self) -> list[tuple[int, str]]:
-        """Return and forget the messages that the FMU has logged: status and text."""
+        """Return the messages that the FMU has logged since the last call: status and text.
+
+        The worker is asked only if the header of an answer has said that there are messages.
+        """
         if not self._has_log or self.lost:
             return []
         self._has_log = False
@@ -263,7 +280,7 @@ class WorkerInstance(Instance):
     # ------------------------------------------------------------------ questions and answers
 
     def _pickled(self, name: str, *arguments: object) -> bytes:
-        """Return a call with the request block as bytes."""
+        """Return a question as bytes: name of the call, request block and arguments."""
         return pickle.dumps((name, bytes(self._request), arguments))
 
     def _ask(self, kind: Question, name: str, content: bytes | memoryview) -> None:
@@ -272,16 +289,22 @@ class WorkerInstance(Instance):
         Parameters
         ----------
         kind : Question
-            Kind of the message.
+            The kind of the message.
         name : str
-            Name of the call in `_CALL_KINDS`.
+            The name of the call in `_CALL_KINDS`, which has its time limit.
         content : bytes-like
-            Payload.
+            The payload.
+
+        Raises
+        ------
+        FmuWorkerError
+            If the worker is gone, or if an earlier question was not answered.
         """
         if self.lost:
             raise FmuWorkerError(
                 "The FMU's worker is gone or was interrupted; reset the asset to go on."
             )
+        # The instance counts as lost until the answer has been read: see the attribute `lost`.
         self.lost = True
         self._call_kind = _CALL_KINDS[name]
         self._question_number = (self._question_number + 1) % 2**32
@@ -292,37 +315,47 @@ class WorkerInstance(Instance):
             raise self._death_error() from None
 
     def _call(self, name: str, *arguments: object) -> bytes:
-        """Call a method of the instance in the worker and return its answer.
+        """Call a method of the instance in the worker, and return the bytes of its answer.
 
-        Only what the twin says is pickled, and never what comes back.
+        Questions are pickled, but answers never are: unpickling runs code, and the twin does not
+        trust a process in which an FMU runs.
         """
         self._ask(Question.CALL, name, self._pickled(name, *arguments))
-        largest = LARGEST_MESSAGE
+        longest_answer = LARGEST_MESSAGE
+        # Only a saved state may be as large as the memory of the worker.
         if name == "save":
-            largest = int(self._limits.memory * _MEBIBYTE)
-        head = self._wait_for_answer(largest)
-        answer = bytearray(head.length)
+            longest_answer = int(self._limits.memory * _MEBIBYTE)
+        header = self._wait_for_answer(longest_answer)
+        answer = bytearray(header.length)
+        # Check the memory at the end of every such call, whenever the last check was.
         self._next_memory_check = 0.0
         self._read_into(memoryview(answer))
         self.lost = False
         return bytes(answer)
 
     def _wait_for_answer(self, largest: int, *, may_be_part: bool = False) -> _AnswerHead:
-        """Return the head of the answer to the last question; the error of a failure is raised.
+        """Return the header of the answer to the last question.
 
         Parameters
         ----------
         largest : int
-            Largest length that can be right [bytes].
+            The longest payload that this answer can have [bytes].
         may_be_part : bool
-            Whether the answer may come in parts.
+            Whether the answer may come in parts, the last of which is a result.
+
+        Raises
+        ------
+        FmuError
+            The error that the worker reports, if the call failed there.
+        FmuWorkerError
+            If the header is none that the worker sends, so that it must have been overwritten.
         """
         poll_for_message(self._poll)
         self._read_into(self._header, grace=REPORT_PERIOD if may_be_part else 0.0)
-        kind, has_log, number, length = HEADER.unpack(self._header)
+        kind, has_log, question_number, length = HEADER.unpack(self._header)
         is_known = kind in (Answer.RESULT, Answer.FAILURE) or (may_be_part and kind == Answer.PART)
         longest = LARGEST_MESSAGE if kind == Answer.FAILURE else largest
-        if not is_known or number != self._question_number or length > longest:
+        if not is_known or question_number != self._question_number or length > longest:
             raise self._death_error()
         self._has_log = self._has_log or has_log != 0
         if kind == Answer.FAILURE:
@@ -330,7 +363,7 @@ class WorkerInstance(Instance):
         return _AnswerHead(kind, length)
 
     def _raise_failure(self, length: int) -> None:
-        """Raise the error in the payload of a failure, which has a length [bytes]."""
+        """Read the payload of a failure, which has a length [bytes], and raise the error in it."""
         content = bytearray(length)
         self._read_into(memoryview(content))
         try:
@@ -346,41 +379,61 @@ class WorkerInstance(Instance):
         raise error_class(sentence, messages, time_of_end)
 
     def _read_into(self, target: memoryview, grace: float = 0.0) -> None:
-        """Fill a buffer from the worker, within the limits of the present call.
+        """Fill a buffer with bytes from the worker, within the time limit of the present call.
 
         Parameters
         ----------
         target : memoryview of bytes
-            The buffer.
+            The buffer; it is filled to its end.
         grace : float
-            Time added to the limit of the call [s].
+            The time that is added to the limit of the call [s].
         """
         filled = 0
         deadline = 0.0
         while filled < len(target):
             try:
-                count = os.readv(self._incoming, [target[filled:]])
+                byte_count = os.readv(self._incoming, [target[filled:]])
             except BlockingIOError:
+                # The deadline starts when a read would block first: most answers are there at
+                # once, and then the clock is not asked.
                 if not deadline:
                     deadline = time.monotonic() + self._time_limit() + grace
                 self._wait_until(deadline)
                 continue
-            if count == 0:
+            # A pipe without bytes whose other side is closed: the worker is dead.
+            if byte_count == 0:
                 raise self._death_error()
-            filled += count
+            filled += byte_count
         if time.monotonic() > self._next_memory_check:
             self._check_memory()
 
     def _time_limit(self) -> float:
-        """Return the limit of the present call [s]."""
+        """Return the time limit of the present call [s]."""
         limit: float = getattr(self._limits, self._call_kind.limit)
         return limit
 
     def _wait_until(self, deadline: float) -> None:
-        """Wait a moment for something to read; kill the worker if the deadline has passed."""
+        """Wait at most a moment for bytes from the worker; kill it if the deadline has passed.
+
+        The wait ends after `_MEMORY_CHECK_PERIOD` at the latest, so that the memory of the worker
+        is checked meanwhile. The caller tries to read again, and calls this method until it
+        succeeds.
+
+        Parameters
+        ----------
+        deadline : float
+            The time on the monotonic clock by which the answer must have come [s].
+
+        Raises
+        ------
+        FmuTimeoutError
+            If the deadline has passed.
+        FmuMemoryError
+            If the worker uses more memory than its limit.
+        """
         remaining = deadline - time.monotonic()
-        timeout = 1000.0 * max(min(remaining, _MEMORY_CHECK_PERIOD), 0.0)
-        if self._poll.poll(timeout):
+        timeout_in_milliseconds = 1000.0 * max(min(remaining, _MEMORY_CHECK_PERIOD), 0.0)
+        if self._poll.poll(timeout_in_milliseconds):
             return
         self._check_memory()
         if remaining <= 0.0:
@@ -393,7 +446,13 @@ class WorkerInstance(Instance):
             )
 
     def _check_memory(self) -> None:
-        """Kill a worker that has taken more memory than its limit."""
+        """Kill the worker if it uses more memory than its limit.
+
+        Raises
+        ------
+        FmuMemoryError
+            If it does.
+        """
         self._next_memory_check = time.monotonic() + 5.0 * _MEMORY_CHECK_PERIOD
         used = self.memory
         if used > self._limits.memory * _MEBIBYTE:
@@ -406,6 +465,6 @@ class WorkerInstance(Instance):
             )
 
     def _death_error(self) -> FmuWorkerError:
-        """Give the worker up, and return the error that says how it died."""
+        """Mark the worker as lost, and return the error that says how it died."""
         self.lost = True
         return self._process.death_error(self._call_kind.action)

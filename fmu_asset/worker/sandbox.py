@@ -100,17 +100,18 @@ _OUR_PACKAGES = ("fmu_asset", "fe", "reporting")
 
 @dataclass(frozen=True)
 class Grants:
-    """Rights of an FMU beyond those of every FMU.
+    """Rights that the binding grants an FMU in addition to those that every FMU has.
 
     Attributes
     ----------
     read, write : tuple of str
-        Files, and folders with everything in them: absolute, of a home (`~`), or in the FMU's own
-        folder.
+        Files, and folders with everything in them. A path is absolute, begins with a home folder
+        (`~`), or is relative to the FMU's own folder.
     ports : tuple of int
-        TCP ports to which it may connect, on any host; names of hosts are looked up then, too.
+        TCP ports to which the FMU may connect, on any host. If there are any, the FMU may also
+        look up the names of hosts.
     programs : bool
-        Whether it may start the programs that it can read; they are confined as it is.
+        Whether the FMU may start the programs that it can read. They are confined as the FMU is.
     """
 
     read: tuple[str, ...] = ()
@@ -127,26 +128,27 @@ def landlock_version() -> int:
 
 
 def confine(grants: Grants, own: str, shared: str) -> bool:
-    """Take from this process, for good, the rights that an FMU does not need.
+    """Take from this process, irrevocably, all rights that an FMU does not need.
 
     Parameters
     ----------
     grants : Grants
-        Rights that it keeps.
+        The rights that this FMU keeps in addition to those of every FMU.
     own : str
-        The one folder in which it may write.
+        The only folder in which the FMU may always write: the worker's scratch folder.
     shared : str
-        Folder or file of the FMU, which it may read.
+        The folder or file of the FMU, which it may read.
 
     Returns
     -------
     bool
-        False if there is no Landlock, and nothing was done.
+        Whether the process is confined. It is not if the kernel has no Landlock.
 
     Raises
     ------
     OSError
-        If the system refuses; the process is not to go on then.
+        If the system refuses a step. The process may then be confined in part, so the caller must
+        end it without running the FMU.
     """
     version = landlock_version()
     if not version:
@@ -155,15 +157,17 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
         raise OSError(
             "the sandbox: another thread runs in this process already, and would not be confined"
         )
-    # Landlock refuses rights that its version does not know: they are left out
+    # An older Landlock refuses a rule with a right that it does not know. Rights are consecutive
+    # bits, so the mask of the known rights has as many ones as there are rights.
     all_rights = (1 << _RIGHT_COUNTS.get(version, _RIGHT_COUNT)) - 1
     rules = _ruleset(version, all_rights)
     _grant_paths(rules, grants, own, shared, all_rights)
+    # Landlock controls TCP connections from its version 4, and truncate(2) from its version 3.
     if version > 3:
         for port in grants.ports:
             rule = struct.pack("QQ", _CONNECT_TCP, port)
             checked(libc().syscall(_ADD_RULE, rules, _NET_PORT, rule, 0))
-    # put the rules in force
+    # put the rules in force; without NO_NEW_PRIVS a program with set-user-ID could escape them
     checked(libc().prctl(_PR_SET_NO_NEW_PRIVS, 1, 0, 0, 0))
     checked(libc().syscall(_RESTRICT_SELF, rules, 0))
     os.close(rules)
@@ -172,15 +176,17 @@ def confine(grants: Grants, own: str, shared: str) -> bool:
 
 
 def _ruleset(version: int, all_rights: int) -> int:
-    """Return the file descriptor of rules that take all rights away, and grant none yet.
+    """Return the file descriptor of a set of rules that so far grants nothing.
 
     Parameters
     ----------
     version : int
-        Version of Landlock.
+        The version of the kernel's Landlock.
     all_rights : int
-        Rights to files that it knows.
+        The mask of all rights to files that this version knows; all of them are withdrawn unless a
+        later rule grants them for a path.
     """
+    # TCP ports are controlled from version 4; abstract sockets and signals from version 6
     network = _BIND_TCP | _CONNECT_TCP if version > 3 else 0
     scopes = _ABSTRACT_SOCKETS | _SIGNALS if version > 5 else 0
     attributes = struct.pack("QQQ", all_rights, network, scopes)
@@ -188,7 +194,17 @@ def _ruleset(version: int, all_rights: int) -> int:
 
 
 def _grant_paths(rules: int, grants: Grants, own: str, shared: str, all_rights: int) -> None:
-    """Add the rights to files to rules; other arguments as for `confine`."""
+    """Add rules that grant rights to files and folders.
+
+    Parameters
+    ----------
+    rules : int
+        The file descriptor of the set of rules.
+    grants, own, shared
+        As in `confine`.
+    all_rights : int
+        The mask of all rights to files that the kernel's Landlock knows.
+    """
     programs = _EXECUTE if grants.programs else 0
     read_rights = (_READ | programs) & all_rights
     write_rights = (all_rights & ~_EXECUTE | programs) & all_rights
@@ -199,7 +215,17 @@ def _grant_paths(rules: int, grants: Grants, own: str, shared: str, all_rights: 
 
 
 def _allow(rules: int, paths: Iterable[str], rights: int) -> None:
-    """Add rights to paths that exist to rules."""
+    """Add rules that grant rights to the paths that exist.
+
+    Parameters
+    ----------
+    rules : int
+        The file descriptor of the set of rules.
+    paths : iterable of str
+        Files and folders; a folder stands for everything in it.
+    rights : int
+        The mask of rights. Those that only folders can have are left out for a file.
+    """
     for path in filter(os.path.exists, paths):
         descriptor = os.open(path, os.O_PATH | os.O_CLOEXEC)
         is_folder = stat.S_ISDIR(os.fstat(descriptor).st_mode)
@@ -209,14 +235,14 @@ def _allow(rules: int, paths: Iterable[str], rights: int) -> None:
 
 
 def missing_path(grants: Grants, shared: str) -> str:
-    """Return the first path that is granted and does not exist; an empty text if all exist.
+    """Return the first granted path that does not exist, or an empty text if all exist.
 
     Parameters
     ----------
     grants : Grants
-        The grants.
+        The grants of the binding.
     shared : str
-        Folder of the FMU, where relative paths begin.
+        The folder of the FMU, to which relative paths refer.
     """
     for path in _located(grants.read + grants.write, shared):
         if not os.path.exists(path):  # noqa: PTH110
@@ -225,7 +251,7 @@ def missing_path(grants: Grants, shared: str) -> str:
 
 
 def _located(paths: tuple[str, ...], shared: str) -> list[str]:
-    """Return granted paths as absolute ones; relative ones begin in the FMU's folder."""
+    """Return granted paths with `~` expanded; relative paths are taken from the FMU's folder."""
     return [
         os.path.join(shared, os.path.expanduser(path))  # noqa: PTH111, PTH118 - light
         for path in paths
@@ -233,9 +259,11 @@ def _located(paths: tuple[str, ...], shared: str) -> list[str]:
 
 
 def _paths_of_python() -> Iterator[str]:
-    """Yield the folders in which Python finds modules and libraries.
+    """Yield the folders in which Python finds its modules and libraries.
 
-    A folder that contains the user's home is never among them.
+    A folder that contains the user's home is left out, since it would open all of the user's files.
+    If our packages run from a checkout of the repository, only the packages that a worker imports
+    are readable there.
     """
     home = os.path.realpath(os.path.expanduser("~"))  # noqa: PTH111
     libraries = os.environ.get("LD_LIBRARY_PATH", "").split(":")
