@@ -153,7 +153,7 @@ class VirtualWing:
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
-        """Return the strain signal after a release of the tip: the exact decays of all modes.
+        """Return the strain signal after a release of the tip, as the sum of all modes' decays.
 
         Parameters
         ----------
@@ -168,27 +168,47 @@ class VirtualWing:
         truth = self.truth
         vector = self.model.vector(truth.values, truth.stiffness_loss)
         modes = self.model.modes(vector)
-        held = self.model.static_response(vector, load=np.array((0.0, 1.0)))
+        static_response = self.model.static_response(vector, load=np.array((0.0, 1.0)))
 
-        # Modal coordinates at the release, for a unit displacement of the tip
-        omega = 2.0 * math.pi * modes.frequency
-        initial_coordinate = modes.participation[1] / omega**2 / held.displacement[0]
+        # Modal coordinates at the release, for a unit displacement of the tip. A unit load gives
+        # the coordinate participation / omega^2, and the static response's tip displacement.
+        angular_frequency = 2.0 * math.pi * modes.frequency
+        initial_coordinate = (
+            modes.participation[1] / angular_frequency**2 / static_response.displacement[0]
+        )
         initial_strain = modes.output[RECORDED_GAUGE - 1] * initial_coordinate
 
         for mode, error in zip(modes.followed, self.frequency_error, strict=True):
-            omega[mode] *= 1.0 + error
-        zeta = rayleigh_damping_ratio(truth.damping_alpha, truth.damping_beta, modes.frequency)
+            angular_frequency[mode] *= 1.0 + error
+        damping_ratio = rayleigh_damping_ratio(
+            truth.damping_alpha, truth.damping_beta, modes.frequency
+        )
         strain = np.zeros_like(time)
         for mode, amplitude in enumerate(initial_strain):
-            strain += amplitude * _free_decay(float(omega[mode]), float(zeta[mode]), time)
+            strain += amplitude * _free_decay(
+                float(angular_frequency[mode]), float(damping_ratio[mode]), time
+            )
         return time, SENSITIVITY * initial_tip_displacement * strain
 
 
 def _free_decay(omega: float, zeta: float, time: Float) -> Float:
-    """Return q(t) of q'' + 2 zeta omega q' + omega^2 q = 0 with q(0) = 1, q'(0) = 0."""
+    """Return the free decay of an oscillator from a displacement of 1.
+
+    It solves q'' + 2 zeta omega q' + omega^2 q = 0 with q(0) = 1, q'(0) = 0.
+
+    Parameters
+    ----------
+    omega : float
+        The natural angular frequency [rad/s].
+    zeta : float
+        The damping ratio [1], which may exceed 1.
+    time : (N,) array
+        The instants [s].
+    """
     root = np.sqrt(complex(zeta**2 - 1.0))
     if abs(root) < 1e-8:  # critical damping, where both poles are equal
         return np.asarray((1.0 + omega * time) * np.exp(-omega * time))
+    # Poles s1, s2 of the oscillator: q = (s2 exp(s1 t) - s1 exp(s2 t)) / (s2 - s1)
     slow_pole = omega * (-zeta + root)
     fast_pole = omega * (-zeta - root)
     slow_term = fast_pole * np.exp(slow_pole * time)
@@ -267,8 +287,8 @@ def measure_ring_down(
     records = []
     for trial in range(1, trials + 1):
         relative_error = _RELEASE_DEVIATION * float(generator.standard_normal())
-        released_at = initial_tip_displacement * (1.0 + relative_error)
-        time, signal = bench.ring_down(released_at, duration, sampling_rate)
+        tip_displacement = initial_tip_displacement * (1.0 + relative_error)
+        time, signal = bench.ring_down(tip_displacement, duration, sampling_rate)
         signal = signal + generator.normal(0.0, noise, signal.size)
         if quantisation is not None:
             signal = quantisation * np.round(signal / quantisation)

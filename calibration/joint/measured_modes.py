@@ -78,13 +78,13 @@ def measured_modes(trials: Fits) -> tuple[Reading, ...]:
     *Systematic*, added in quadrature. Each term counts only where it exceeds twice its own standard
     error, so that a linear wing gets none by chance:
 
-    - the first mode over the amplitude: frequency and damping ratio of sliding windows against the
-      logarithm of the amplitude, the slope times the standard deviation of that logarithm. The
-      linear model stands for a wing that softens, and no single amplitude is the right one;
-    - the second mode over the choice of the fit: both modes fitted again with free frequencies,
-    from
-      where the record was cropped (only if the frequencies had been taken from the spectrum) and
-      from 40 and 80 ms later; root mean square of the differences.
+    - the first mode over the amplitude: frequency and damping ratio of sliding windows are fitted
+      by a line over the logarithm of the amplitude; the term is the slope times the standard
+      deviation of that logarithm. A real wing softens with the amplitude, and no single amplitude
+      is the right one for the linear model;
+    - the second mode over the choice of the fit: both modes are fitted again with free frequencies,
+      from the start of the cropped record (only if the frequencies had been taken from the
+      spectrum) and from 40 and 80 ms later; the term is the root mean square of the differences.
 
     Parameters
     ----------
@@ -116,12 +116,14 @@ def measured_modes(trials: Fits) -> tuple[Reading, ...]:
 
 
 def _mean_frequency(modes: Sequence[RingDownMode]) -> _Estimate:
+    """Return the mean natural frequency [Hz] of a mode over trials, with its standard error."""
     return _mean(
         [mode.frequency for mode in modes], [mode.standard_error["frequency"] for mode in modes]
     )
 
 
 def _mean_damping_ratio(modes: Sequence[RingDownMode]) -> _Estimate:
+    """Return the mean damping ratio [1] of a mode over trials, with its standard error."""
     return _mean(
         [mode.damping_ratio for mode in modes],
         [mode.standard_error["damping_ratio"] for mode in modes],
@@ -129,28 +131,37 @@ def _mean_damping_ratio(modes: Sequence[RingDownMode]) -> _Estimate:
 
 
 def _mean(values: Sequence[float], errors: Sequence[float]) -> _Estimate:
-    """Return the mean of trials, given their values and standard errors.
+    """Return the mean over trials and its standard error.
 
-    The standard error of the mean follows from the errors, or from the scatter of the values where
-    that is significantly larger.
+    The standard error follows from the errors of the values. If the values scatter significantly
+    more than these errors explain, it follows from the scatter.
+
+    Parameters
+    ----------
+    values, errors : sequence of float
+        The value of each trial and its standard error.
     """
     count = len(values)
     mean = math.fsum(values) / count
     expected_variance = math.fsum(error**2 for error in errors) / count
     sum_of_squares = math.fsum((value - mean) ** 2 for value in values)
     if count > 1:
+        # Under the null hypothesis the ratio of the two has a chi-square distribution.
         quantile = float(chdtri(count - 1, 1.0 - _SIGNIFICANT_SCATTER))
         if sum_of_squares > expected_variance * quantile:
-            # The variance of Student's t with n - 1 degrees of freedom over that of a Gaussian. It
-            # is infinite for up to three trials; twice the value for four trials is taken for
-            # these.
+            # Ratio of the variance of Student's t with n - 1 degrees of freedom to that of a
+            # Gaussian. It is infinite for up to three trials; 4 is taken then, while four trials
+            # have 3.
             widening = (count - 1) / (count - 3) if count > 3 else 4.0
             return _Estimate(mean, math.sqrt(widening * sum_of_squares / (count - 1) / count))
     return _Estimate(mean, math.sqrt(expected_variance / count))
 
 
 def _terms_of_amplitude(trials: Fits) -> _SystematicTerms:
-    """Return the changes of the first mode over the amplitudes of a ring-down."""
+    """Return the systematic uncertainty of the first mode from its change with the amplitude.
+
+    It is zero if there are too few windows with different amplitudes.
+    """
     windows = [window for fit in trials for window in amplitude_dependence(fit)]
     if len(windows) < _FEWEST_WINDOWS:
         return _SystematicTerms(0.0, 0.0)
@@ -167,10 +178,11 @@ def _terms_of_amplitude(trials: Fits) -> _SystematicTerms:
 
 
 def _term_of_slope(logarithm: Float, value: Float) -> float:
-    """Return how much a modal value changes systematically with the amplitude.
+    """Return the systematic change of a modal value with the amplitude.
 
-    A line is fitted to the value over the logarithm of the amplitude. The change is that of the
-    line over one standard deviation of the logarithm, without what chance could have made.
+    A line is fitted to the value over the logarithm of the amplitude. The result is the change of
+    the line over one standard deviation of the logarithm, less its standard error (see
+    `_beyond_chance`).
 
     Parameters
     ----------
@@ -182,14 +194,14 @@ def _term_of_slope(logarithm: Float, value: Float) -> float:
     deviation = float(logarithm.std())
     slope = float(logarithm @ value / (logarithm @ logarithm))
     residual = value - value.mean() - slope * logarithm
-    # Windows overlap by half, so two of them count as one.
+    # Windows overlap by half, so two count as one, which doubles the variance.
     variance = 2.0 * float(residual @ residual) / (len(value) - 2)
     error = math.sqrt(variance / float(logarithm @ logarithm))
     return _beyond_chance(slope * deviation, error * deviation)
 
 
 def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTerms:
-    """Return the changes of the second mode by the choice of the fit.
+    """Return the systematic uncertainty of the second mode from the choice of the fit.
 
     Parameters
     ----------
@@ -220,21 +232,29 @@ def _terms_of_fit(trials: Fits, frequency: float, ratio: float) -> _SystematicTe
 
 
 def _beyond_chance(difference: float, error: float) -> float:
-    """Return a difference minus its standard error in quadrature; 0 if it is not significant."""
+    """Return the part of a difference that its standard error does not explain.
+
+    That is the difference minus its standard error in quadrature, or 0 if it is not significant.
+    """
     if abs(difference) <= _SIGNIFICANT_DIFFERENCE * error:
         return 0.0
     return math.sqrt(difference**2 - error**2)
 
 
 def _refit_second_mode(fit: RingDownFit, delay: float) -> RingDownMode | None:
-    """Return the second mode of a record begun later; None where it has died away by then.
+    """Return the second mode of a record, fitted from a later start.
 
     Parameters
     ----------
     fit : RingDownFit
         A fitted record.
     delay : float
-        The time by which the record begins later [s].
+        The time by which the start is later [s].
+
+    Returns
+    -------
+    RingDownMode or None
+        None if the second mode has died away by then.
     """
     record = fit.record
     is_after_start = record.time >= record.time[0] + delay

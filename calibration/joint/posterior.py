@@ -67,9 +67,10 @@ def infer(
 ) -> Float:
     """Return equally weighted samples of the posterior given all readings, by importance sampling.
 
-    Proposals are Student-t densities in whitened coordinates, in which the posterior at its optimum
-    has the covariance 1. So parameters that the readings determine only in one combination are
-    sampled as well as others. A pilot run gives mean and covariance of the final proposal.
+    The proposal is Student's t in whitened coordinates, in which the posterior near its maximum has
+    unit covariance. Parameters that the readings determine only in combination are thus sampled as
+    well as others. The mean and the covariance of the proposal are those of the draws of a pilot
+    run.
 
     Parameters
     ----------
@@ -95,11 +96,12 @@ def infer(
     generator = np.random.default_rng(child_seed(seed, _PURPOSE))
     posterior = _WhitenedPosterior(priors, compare)
     dimension = len(priors)
-    pilot = posterior.draw(np.zeros(dimension), np.eye(dimension), _PILOT_COUNT, generator)
-    covariance = _INFLATION * np.cov(pilot.points.T, aweights=pilot.weight)
+    pilot_draws = posterior.draw(np.zeros(dimension), np.eye(dimension), _PILOT_COUNT, generator)
+    covariance = _INFLATION * np.cov(pilot_draws.points.T, aweights=pilot_draws.weight)
     proposal_count = max(_FEWEST_PROPOSALS, _PROPOSALS_PER_SAMPLE * count)
-    mean = pilot.weight @ pilot.points
+    mean = pilot_draws.weight @ pilot_draws.points
     draws = posterior.draw(mean, covariance, proposal_count, generator)
+    # Effective sample size of weighted draws (Kish): 1 / sum of squared weights
     effective = 1.0 / float(np.sum(draws.weight**2))
     if not effective >= LEAST_EFFECTIVE_SAMPLE_SIZE:
         raise PosteriorError(
@@ -107,9 +109,10 @@ def infer(
             "contradict each other within the model's range; check them, or allow the model a "
             "larger error."
         )
-    # Systematic resampling, in random order
-    levels = (np.arange(count) + generator.random()) / count
-    indices = np.searchsorted(np.cumsum(draws.weight), levels)
+    # Systematic resampling (Kitagawa 1996): equally spaced levels of the cumulative weight, with
+    # one random offset. The samples are shuffled.
+    probability_levels = (np.arange(count) + generator.random()) / count
+    indices = np.searchsorted(np.cumsum(draws.weight), probability_levels)
     indices = np.minimum(indices, proposal_count - 1)  # rounding of the cumulative sum
     return posterior.states(draws.points[generator.permutation(indices)])
 
@@ -122,10 +125,11 @@ class _WeightedDraws(NamedTuple):
 
 
 class _WhitenedPosterior:
-    """A posterior in coordinates in which it is about a standard Gaussian at its optimum.
+    """A posterior density in coordinates in which it is roughly a standard Gaussian.
 
-    A state is mean + deviation * u by its prior, with u = optimum + v @ whitening for the whitened
-    coordinates v.
+    There are three kinds of coordinates: the state x in the units of the parameters; u, with
+    x = prior mean + prior standard deviation * u; and the whitened points v, with
+    u = optimum + v @ whitening, where the optimum is the maximum of the posterior.
 
     Parameters
     ----------
@@ -154,6 +158,8 @@ class _WhitenedPosterior:
             x_scale="jac",
         )
         self._optimum_u = optimum.x
+        # Gauss-Newton: the posterior of u has the covariance (J.T @ J)^-1 = W.T @ W with J = U S
+        # V.T and the whitening W = S^-1 V.T.
         _, singular_values, right_vectors = np.linalg.svd(optimum.jac, full_matrices=False)
         self._whitening = right_vectors / singular_values[:, None]
 
@@ -163,10 +169,20 @@ class _WhitenedPosterior:
 
     def _states(self, u: Float) -> Float:
         # Rounding must not put a state outside its range.
+        """Return the states (N, P) of coordinates u (N, P), limited to their ranges."""
         return np.asarray(np.clip(self._mean + self._deviation * u, self._low, self._high))
 
     def _residuals(self, u: Float) -> tuple[Float, Float]:
-        """Return standardised residuals of readings and priors (N, R + P), and log scales (N,)."""
+        """Return the terms of the negative log posterior at coordinates u (N, P).
+
+        Returns
+        -------
+        residuals : (N, R + P) array
+            The standardised residuals of the R readings, and u itself: the residuals of the priors.
+        log_scale : (N,) array
+            The sum of the logarithms of the readings' standard deviations, which depend on the
+            state.
+        """
         difference, deviation = self._compare(self._states(u))
         log_scale = np.log(deviation).sum(axis=1)
         return np.hstack([difference / deviation, u]), log_scale
@@ -174,7 +190,7 @@ class _WhitenedPosterior:
     def draw(
         self, mean: Float, covariance: Float, size: int, generator: np.random.Generator
     ) -> _WeightedDraws:
-        """Return draws from Student's t, with the importance weights of the posterior.
+        """Draw from Student's t, and weight the draws by the posterior.
 
         Parameters
         ----------
@@ -192,6 +208,7 @@ class _WhitenedPosterior:
         u = self._optimum_u + points @ self._whitening
         residual, log_scale = self._residuals(u)
         log_posterior = -0.5 * np.sum(residual**2, axis=1) - log_scale
+        # Importance weight: posterior over proposal, zero outside the ranges of the parameters
         log_weight = log_posterior - proposal.logpdf(points)
         is_inside: NDArray[np.bool_] = np.all((u >= self._lower_u) & (u <= self._upper_u), axis=1)
         weight = softmax(np.where(is_inside, log_weight, -np.inf))
@@ -265,7 +282,7 @@ def joint_posterior(
 
 
 def _readings_of_outputs(readings: Sequence[Reading]) -> dict[str, Reading]:
-    """Return the readings of outputs of a wing, other than its stiffness, by name."""
+    """Return, by name, the readings of a wing's outputs other than its stiffness."""
     names = {quantity.name for quantity in QUANTITIES[1:]}
     return {reading.name: reading for reading in readings if reading.name in names}
 
@@ -276,7 +293,24 @@ def _comparison_with_wing(
     readings: Sequence[Reading],
     model_error: tuple[float, float],
 ) -> Callable[[Float], Comparison]:
-    """Return the function that compares load test and readings with a wing at states (N, 5)."""
+    """Return the function that compares the load test and other readings with a wing.
+
+    Parameters
+    ----------
+    wing : WingTable
+        The wing.
+    static : LoadDisplacementData
+        The load test.
+    readings : sequence of Reading
+        The weighed mass and the readings of the modes.
+    model_error : (float, float)
+        The relative standard deviations of the model's two frequencies.
+
+    Returns
+    -------
+    callable
+        Takes states (N, 5) and returns a `Comparison`.
+    """
     output_names = [quantity.name for quantity in QUANTITIES]
     columns = [output_names.index(reading.name) for reading in readings]
     relative_errors = {"frequency_1": model_error[0], "frequency_2": model_error[1]}
@@ -288,6 +322,8 @@ def _comparison_with_wing(
         outputs = wing.outputs(states)
         stiffness = outputs[:, :1]
         predicted = outputs[:, columns]
+        # A load differs from k x by R_f + k^2 R_x, see `residual_variance`; a frequency by the
+        # reading's error and the model's.
         load_difference = static.load - stiffness * static.displacement
         load_deviation = np.sqrt(residual_variance(static, stiffness))
         reading_deviation = np.hypot(deviation, relative_error * predicted)
@@ -302,7 +338,7 @@ def _comparison_with_wing(
 
 
 def _refuse_samples_at_limits(e: Float, prior: ParameterPrior) -> None:
-    """Refuse samples of e (N,) that are pressed against an end of its range."""
+    """Refuse samples of e (N,) that accumulate at an end of its range."""
     margin = _LIMIT_MARGIN * (prior.high - prior.low)
     for limit in (prior.low, prior.high):
         fraction = float(np.mean(np.abs(e - limit) < margin))
@@ -315,13 +351,14 @@ def _refuse_samples_at_limits(e: Float, prior: ParameterPrior) -> None:
 
 
 def _refuse_negative_damping(readings: Mapping[str, Reading]) -> None:
-    """Refuse damping ratios that are improbable without a negative Rayleigh coefficient."""
+    """Refuse damping ratios that almost certainly need a negative Rayleigh coefficient."""
     omega = 2.0 * math.pi * np.array([readings[f"frequency_{mode}"].value for mode in (1, 2)])
     # Ratios zeta_i = (alpha / omega_i + beta omega_i) / 2, solved for alpha and beta
     inverse = np.linalg.inv(0.5 * np.column_stack([1.0 / omega, omega]))
     ratio_1 = readings["damping_ratio_1"]
     ratio_2 = readings["damping_ratio_2"]
     coefficients = inverse @ [ratio_1.value, ratio_2.value]
+    # Variances add with squared factors, for independent errors of the two ratios.
     deviations = np.sqrt(inverse**2 @ [ratio_1.deviation**2, ratio_2.deviation**2])
     if np.any(coefficients + _IMPROBABLE * deviations < 0.0):
         raise ExperimentDataError(
@@ -333,7 +370,7 @@ def _refuse_negative_damping(readings: Mapping[str, Reading]) -> None:
 def servo_range(
     validity: Mapping[str, tuple[float, float]], total_mass: float
 ) -> tuple[float, float]:
-    """Return the range of servo masses with which a model has the weighed total [kg].
+    """Return the range of servo masses for which the model can have the weighed total mass [kg].
 
     Parameters
     ----------

@@ -87,17 +87,17 @@ def wing_priors(
 
     The prior of e is the paper's N(1, (0.05 / 1.96)^2). The others are weak. Each mass has a mean
     of a third of the weighed total and a standard deviation of 50 g (servo) or 100 g (pitot tube);
-    given the weighed total, that leaves 30 g of uncertainty to a servo. The damping coefficients
-    have half Gaussians from zero, of scales 3 1/s and 1.5e-3 s; each alone would damp mode 1 by 4 %
-    and mode 2 by 14 %, twice the measured ratios. e and the masses are confined to the range of the
-    model.
+    given the weighed total, a servo's mass then has a standard deviation of 30 g. The damping
+    coefficients have half Gaussians from zero with scales 3 1/s and 1.5e-3 s; at these values each
+    coefficient alone would damp mode 1 by 4 % and mode 2 by 14 %, twice the measured ratios. e and
+    the masses are confined to the range of the model.
 
     Parameters
     ----------
     validity : mapping of str to (float, float)
         The ranges of e and the masses in the model.
     **stated : (float, float)
-        Means and standard deviations by name, instead of these.
+        Means and standard deviations that replace these, by name.
     """
     ranges = {**validity, **_DAMPING_RANGES}
     priors = []
@@ -220,6 +220,7 @@ class WingTable:
             If a state lies outside the range of the model or is not finite.
         """
         frequency = self.frequency(states)
+        # Each array is (N, 1), so that it is combined with the two columns of frequencies.
         factor, servo, pitot, alpha, beta = states[:, :5].T[:, :, None]  # each (N, 1)
         ratio = rayleigh_damping_ratio(alpha, beta, frequency)
         total_mass = 2.0 * servo + pitot
@@ -227,13 +228,21 @@ class WingTable:
 
 
 def _evaluate(scaled: Float, coefficient: Float) -> Float:
-    """Return the frequencies (N, 2) [Hz] of parameters (N, 3) that are scaled to [-1, 1]."""
+    """Return the frequencies (N, 2) [Hz] of a table at scaled parameters.
+
+    Parameters
+    ----------
+    scaled : (N, 3) array
+        The parameters, scaled to [-1, 1].
+    coefficient : (I, J, K, 2) array
+        The Chebyshev coefficients of ln f1 and ln f2.
+    """
     x, y, z = scaled.T
     return np.asarray(np.exp(chebval3d(x, y, z, coefficient)).T)
 
 
 def _interpolate(scaled: Float, frequency: Float, degrees: tuple[int, int, int]) -> Float:
-    """Return the coefficients of polynomials through frequencies at nodes.
+    """Return the polynomials of ln f1 and ln f2 that pass through frequencies at nodes.
 
     Parameters
     ----------
@@ -242,7 +251,12 @@ def _interpolate(scaled: Float, frequency: Float, degrees: tuple[int, int, int])
     frequency : (N, 2) array
         The frequencies there [Hz].
     degrees : (int, int, int)
-        The degrees of the polynomials in each parameter.
+        The degrees I - 1, J - 1, K - 1 of the polynomials in the parameters, with N = I J K.
+
+    Returns
+    -------
+    (I, J, K, 2) array
+        The Chebyshev coefficients.
     """
     x, y, z = scaled.T
     coefficient = np.linalg.solve(chebvander3d(x, y, z, degrees), np.log(frequency))
@@ -259,14 +273,15 @@ def _chebyshev_grid(degrees: tuple[int, int, int]) -> Float:
 
 
 def tabulate_wing(model: ReducedModel, tolerance: float = TOLERANCE) -> WingTable:
-    """Return the table of a healthy model, checked between its nodes.
+    """Return polynomials of a wing's frequencies and stiffness, checked between their nodes.
 
-    The flapwise modes are followed by their shapes.
+    The flapwise modes are identified by their shapes, so that a crossing of frequencies does not
+    exchange them.
 
     Parameters
     ----------
     model : ReducedModel
-        The wing.
+        The wing without damage.
     tolerance : float
         The largest relative error of a frequency at 128 points that fill the range evenly [1].
 

@@ -24,38 +24,58 @@ WING_FIELDS = "wing.vtu"
 MODE_FIELDS = "modes.vtu"
 
 _DRAWN = (REPORT_NAME, WING_FIELDS, MODE_FIELDS, f"{FIGURES}/*.svg", f"{FIGURES}/*.png")
-"""Drawings of an older calibration, which would not belong to a newer file."""
+"""Files that are drawn from a calibration; those of an older one must not stay beside a newer
+`calibration.nc`."""
 
 
 @contextmanager
 def calibration_folder(result: Calibration, folder: Path) -> Iterator[Path]:
-    """Return a context with an empty folder; its files and `calibration.nc` are moved to `folder`.
+    """Return a context in which the files of a calibration are written, all or none of them.
 
-    A full disk leaves `folder` as it was. Older files of the same names are replaced,
-    `calibration.nc` last. Drawings of an older calibration are removed unless they are replaced.
+    The context yields an empty temporary folder, into which the caller writes the report and the
+    other files. At the end of the context they are moved to `folder`, followed by `calibration.nc`,
+    which this function writes. Older files of the same names are replaced, and other drawings of an
+    older calibration are removed.
+
+    Parameters
+    ----------
+    result : Calibration
+        The calibration.
+    folder : Path
+        The folder that gets the files; it is made if it is missing.
 
     Raises
     ------
     FileNotWrittenError
-        If a file cannot be written; the folder is then as it was.
+        If a file cannot be written, such as on a full disk; `folder` is then unchanged.
     """
     content = result_bytes(result)
     with explained_write_errors(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(prefix=f".{folder.name}.", dir=folder.parent) as scratch:
-            fresh = Path(scratch)
-            yield fresh
-            files = sorted(path.relative_to(fresh) for path in fresh.rglob("*") if path.is_file())
-            atomic_write_bytes(fresh / FILE_NAME, content)
+            new_folder = Path(scratch)
+            yield new_folder
+            new_files = sorted(
+                path.relative_to(new_folder) for path in new_folder.rglob("*") if path.is_file()
+            )
+            atomic_write_bytes(new_folder / FILE_NAME, content)
             if (folder / FILE_NAME).exists():
-                _remove_older_drawings(folder, files)
-            for file in (*files, Path(FILE_NAME)):
+                _remove_older_drawings(folder, new_files)
+            for file in (*new_files, Path(FILE_NAME)):
                 (folder / file).parent.mkdir(parents=True, exist_ok=True)
-                (fresh / file).replace(folder / file)
+                (new_folder / file).replace(folder / file)
 
 
 def _remove_older_drawings(folder: Path, new_files: Sequence[Path]) -> None:
-    """Remove the drawings of an older calibration that no new file (relative path) replaces."""
+    """Remove the drawings of an older calibration that no new file replaces.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the calibration.
+    new_files : sequence of Path
+        The paths of the new files, relative to the folder.
+    """
     for pattern in _DRAWN:
         for drawing in list(folder.glob(pattern)):
             if drawing.relative_to(folder) not in new_files:
@@ -65,7 +85,7 @@ def _remove_older_drawings(folder: Path, new_files: Sequence[Path]) -> None:
 
 
 def write_calibration_folder(result: Calibration, folder: Path, *, report: bool = True) -> Path:
-    """Write the folder of a calibration, and return the path of its `calibration.nc`.
+    """Write a calibration and perhaps its report to a folder, and return its `calibration.nc`.
 
     Parameters
     ----------
@@ -74,17 +94,17 @@ def write_calibration_folder(result: Calibration, folder: Path, *, report: bool 
     folder : Path
         The folder.
     report : bool
-        Whether to write a page and its figures, too.
+        Whether to write a page with its figures, too.
 
     Raises
     ------
     FileNotWrittenError
-        If a file cannot be written; the folder is then as it was.
+        If a file cannot be written; the folder is then unchanged.
     """
-    with calibration_folder(result, folder) as fresh:
+    with calibration_folder(result, folder) as new_folder:
         if report:
             with stage("Drawing the report"):
-                end_page(begun_page(result, fresh), result, fresh)
+                end_page(begun_page(result, new_folder), result, new_folder)
     return folder / FILE_NAME
 
 
@@ -95,7 +115,15 @@ def add_figure(page: Page, figure: ReportFigure, folder: Path) -> None:
 
 
 def begun_page(result: Calibration, folder: Path) -> Page:
-    """Return a page with the sections of any calibration, and write its figures to a folder."""
+    """Return a page with the sections that every calibration has; write their figures.
+
+    Parameters
+    ----------
+    result : Calibration
+        The calibration.
+    folder : Path
+        The folder of the page, in which the figures are written.
+    """
     page = Page(
         title=WORDS.say("title", result=result),
         subtitle=WORDS.say("subtitle", result=result),
@@ -115,9 +143,9 @@ def begun_page(result: Calibration, folder: Path) -> Page:
     WORDS.add_table(page, "parameters", result.priors, result=result, procedure=procedure)
     for line in correlation_lines(result):
         page.add_paragraph(f"{line}.")
-    columns, titles = drawn_parameters(result)
-    posterior_set = ("posterior", result.samples[:, columns])
-    prior_set = ("prior", result.prior_samples[:, columns])
+    parameter_columns, titles = drawn_parameters(result)
+    posterior_set = ("posterior", result.samples[:, parameter_columns])
+    prior_set = ("prior", result.prior_samples[:, parameter_columns])
     posterior_figure = corner_figure(titles, [posterior_set])
     add_figure(page, WORDS.figure("posterior", posterior_figure), folder)
     both_figure = corner_figure(titles, [posterior_set, prior_set])
@@ -131,6 +159,6 @@ def begun_page(result: Calibration, folder: Path) -> Page:
 
 
 def end_page(page: Page, result: Calibration, folder: Path) -> None:
-    """Add the origin of the calibration at the end of its page, and write the page."""
+    """Add the last section, the origin of the calibration, to its page, and write the page."""
     WORDS.add_table(page, "origin", result=result)
     atomic_write_text(folder / REPORT_NAME, page.render())

@@ -43,9 +43,9 @@ TABLE_NAME = "table_1.csv"
 
 
 def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: bool = True) -> Path:
-    """Write the folder of a calibrated wing, and return the path of its `calibration.nc`.
+    """Write a calibrated wing to a folder: `calibration.nc`, Table 1, and perhaps a report.
 
-    It holds a page with its figures, a table, and the wing for ParaView.
+    The report is a page with figures, and the wing and its modes as files for ParaView.
 
     Parameters
     ----------
@@ -54,35 +54,52 @@ def write_wing_folder(calibration: WingCalibration, folder: Path, *, report: boo
     folder : Path
         The folder of the files.
     report : bool
-        Whether to write all files; otherwise only the table and `calibration.nc`.
+        Whether to write the report.
+
+    Returns
+    -------
+    Path
+        The path of `calibration.nc`, which `calibration_folder` writes.
 
     Raises
     ------
     FileNotWrittenError
-        If a file cannot be written; the folder is then as it was.
+        If a file cannot be written; the folder is then unchanged.
     """
     result = calibration.result
     fields = wing_fields(result.design) if report else None
-    with calibration_folder(result, folder) as fresh:
-        write_table_1(calibration.table_1, fresh / TABLE_NAME)
+    with calibration_folder(result, folder) as new_folder:
+        write_table_1(calibration.table_1, new_folder / TABLE_NAME)
         if fields is not None:
             state = result.mean_state()
-            vector = fields.model.vector(
+            model_vector = fields.model.vector(
                 state.values, state.stiffness_loss, load_factor=LOAD_FACTOR
             )
-            write_wing_vtu(fresh / WING_FIELDS, fields, vector)
-            write_modes_vtu(fresh / MODE_FIELDS, fields, vector)
+            write_wing_vtu(new_folder / WING_FIELDS, fields, model_vector)
+            write_modes_vtu(new_folder / MODE_FIELDS, fields, model_vector)
             with stage("Drawing the report"):
-                page = begun_page(result, fresh)
-                _add_sections(page, calibration, fields, fresh)
-                end_page(page, result, fresh)
+                page = begun_page(result, new_folder)
+                _add_sections(page, calibration, fields, new_folder)
+                end_page(page, result, new_folder)
     return folder / FILE_NAME
 
 
 def _add_sections(
     page: Page, calibration: WingCalibration, fields: WingFields, folder: Path
 ) -> None:
-    """Add the sections of a wing to its page, and write their figures to a folder."""
+    """Add the sections about a wing to the page of its calibration; write their figures.
+
+    Parameters
+    ----------
+    page : Page
+        The page, with the sections that every calibration has.
+    calibration : WingCalibration
+        The calibration.
+    fields : WingFields
+        The displacement fields of the wing on its mesh.
+    folder : Path
+        The folder of the page.
+    """
     _add_origins(page, calibration.lab.origins)
     page.add_section("Beside the paper")
     _add_comparison_with_paper(page, calibration, folder)
@@ -100,7 +117,10 @@ def _add_sections(
 
 
 def _add_origins(page: Page, origins: Sequence[StepOrigin]) -> None:
-    """Add the origin of each step; published values beside measured ones are a notice."""
+    """Add to a page where the measurements of each step come from.
+
+    If some steps use measurements of this wing and others published values, the latter are notices.
+    """
     has_measurements = any(origin.read for origin in origins)
     for origin in origins:
         text = WORDS.say("origin", origin=origin)
@@ -111,6 +131,7 @@ def _add_origins(page: Page, origins: Sequence[StepOrigin]) -> None:
 
 
 def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder: Path) -> None:
+    """Add Table 1, the load test, and the posteriors next to those of the paper to a page."""
     TABLE_1.add_table(page, "table_1", calibration.table_1)
     load_test_figure = calibration_figure(calibration.static)
     add_figure(page, WORDS.figure("load_test", load_test_figure), folder)
@@ -133,7 +154,7 @@ def _add_comparison_with_paper(page: Page, calibration: WingCalibration, folder:
 
 
 def _posterior_rows(model: str, static: StaticCalibration) -> list[tuple[str, str, str, str]]:
-    """Return model, posterior, e and k for each posterior of a load test."""
+    """Return the table rows of a load test: model, posterior, e and tip stiffness."""
     posteriors = {"exact": static.exact}
     for name, alternative in static.alternatives.items():
         posteriors[f"exact, {name}"] = alternative
@@ -156,6 +177,7 @@ class _HasMoments(Protocol):
 
 
 def _moments(density: _HasMoments) -> str:
+    """Return the mean and the standard deviation of a density as a text."""
     return plus_minus(density.mean, density.standard_deviation)
 
 
@@ -185,18 +207,26 @@ def modes_figure(fields: WingFields, modes: ReducedModes, titles: Sequence[str])
         The title of each mode.
     """
     # The skin with its damage regions, see `fe.reduction.model_cache.WingFields`
-    skin = fields.cells[fields.region <= len(fields.regions)][:, :8]
-    height = fields.points[skin][:, :, 2].mean(axis=1)
-    upper_nodes = np.unique(skin[height > 0.0])
+    skin_cells = fields.cells[fields.region <= len(fields.regions)][:, :8]
+    height = fields.points[skin_cells][:, :, 2].mean(axis=1)
+    upper_nodes = np.unique(skin_cells[height > 0.0])
     points = fields.points[upper_nodes]
     # Nodes are connected as seen from above. Triangles at the trailing edge, in front, come last.
     triangles = Triangulation(points[:, 1], points[:, 0]).triangles
     triangles = triangles[np.argsort(points[triangles, 0].mean(axis=1))]
     span = float(np.ptp(points[:, 1]))
     shapes = (fields.modal_displacement @ modes.shape)[upper_nodes]
-    rows = (len(titles) + 1) // 2
+    row_count = (len(titles) + 1) // 2
     figure, grid = style.panels(
-        rows, 2, 1.5 * rows, 0.015 * rows, 0.0, wspace=0.06, hspace=0.04, left=0.01, right=0.99
+        row_count,
+        2,
+        1.5 * row_count,
+        0.015 * row_count,
+        0.0,
+        wspace=0.06,
+        hspace=0.04,
+        left=0.01,
+        right=0.99,
     )
     panels = style.keep_first_panels(grid, len(titles))
     for axes, shape, title in zip(panels, np.moveaxis(shapes, -1, 0), titles, strict=False):

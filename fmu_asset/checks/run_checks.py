@@ -24,27 +24,28 @@ RUN_STEPS = 6
 """Steps of a run."""
 _STEPS_BEFORE_SAVING = 2
 _EQUAL = 1e-9
-"""Change of the outputs with half the step, as a share of the largest, that counts as none."""
+"""Largest change of the outputs with half the step that counts as none, as a fraction of the
+largest output."""
 _CLOSE = 0.02
 """Change above which a smaller step is advised."""
 _FAR = 0.5
 """Change above which the FMU probably counts steps instead of time."""
 _LARGEST_TRIED_LIMIT = 1e9
-"""Limits of ranges are tried if they are smaller."""
+"""Magnitude from which a limit of a range is taken for no limit, and not tried."""
 _KIBIBYTE = 1024
 _SMALL_GROWTH = 1.0
-"""Growth of memory by an instance that is no leak [KiB]; allocators keep some memory."""
+"""Largest growth of memory for each instance that is no leak [KiB]; allocators keep some memory."""
 _LARGE_GROWTH = 16.0
-"""Growth of memory by an instance that is a leak [KiB]."""
+"""Growth of memory for each instance above which the leak is a problem [KiB]."""
 _MEMORY_NOISE = 1024 * _KIBIBYTE
-"""Growth of memory in all that is no leak [bytes]."""
+"""Total growth of memory below which no leak is reported [bytes]."""
 
 RunInputs = dict[str, dict[str, Value]]
 """Inputs by role and name."""
 
 
 class RunChecks:
-    """Checks of an FMU that run it with one binding, each run in a worker of its own.
+    """Checks that run an FMU with a binding, each time in a new worker.
 
     Parameters
     ----------
@@ -126,23 +127,27 @@ class RunChecks:
         )
 
     def _inputs_without_start_values(self) -> RunInputs:
-        """Return zeros for arrays that were resized and have no start values that fit."""
-        base: RunInputs = {role: {} for role in INPUT_ROLES}
+        """Return zeros for resized arrays whose start values no longer fit, by role and name.
+
+        Structural parameters of the binding change the sizes of arrays, but not their start values.
+        """
+        zeros: RunInputs = {role: {} for role in INPUT_ROLES}
         if not self._binding.binding.structural_parameters:
-            return base
+            return zeros
         for role in INPUT_ROLES:
             for name, input_binding in self._binding.inputs(role).items():
                 selection = self._find_input(role, name, input_binding)
                 start_count = len((selection.variable.start or "0").split())
                 if start_count not in (1, selection.variable.size):
-                    base[role][name] = [0.0] * len(selection.elements)
-        return base
+                    zeros[role][name] = [0.0] * len(selection.elements)
+        return zeros
 
     def _find_input(self, role: str, name: str, input_binding: InputBinding) -> VariableElements:
+        """Return the FMU's variable that an input of the binding names."""
         return find_variable(self._description, input_binding.variable, f"{role}.{name}", "input")
 
     def _run(self) -> Float:
-        """Return the outputs (N, n) of a run in a new worker, from start values."""
+        """Return the outputs (N, n) of a run from the start values, in a new worker."""
         with closing(self._asset()) as asset:
             return self._run_from_start(asset)
 
@@ -154,7 +159,10 @@ class RunChecks:
     # ------------------------------------------------------------------ checks
 
     def _check_sandbox(self) -> CheckResult:
-        """Run once more, and count what the sandbox refuses until the run ends or fails."""
+        """Run once more, and count the system calls that the sandbox refuses.
+
+        A run that fails is counted up to its failure.
+        """
         if not (self._binding.limits.sandbox and landlock_version()):
             text = "There is no sandbox: the binding turns it off, or the kernel has none."
             return CheckResult("skipped", text)
@@ -164,7 +172,7 @@ class RunChecks:
             return CheckResult(report.verdict(), report.sentence())
 
     def _check_determinism(self) -> CheckResult:
-        """Compare two runs in two processes."""
+        """Check that two runs in two processes give equal outputs, bit by bit."""
         outputs = self._run()
         if outputs.tobytes() == self._first_outputs.tobytes():
             return CheckResult("ok", "Two flights in two processes are equal to the bit.")
@@ -176,7 +184,7 @@ class RunChecks:
         return CheckResult("problem", text)
 
     def _check_state(self) -> CheckResult:
-        """Compare a run with one that goes on from a saved state in a new process."""
+        """Check that a run can be resumed from a saved state in a new process."""
         steps_after = RUN_STEPS - _STEPS_BEFORE_SAVING
         with closing(self._asset()) as asset:
             asset.reset(**self._base_inputs)
@@ -206,15 +214,16 @@ class RunChecks:
         return CheckResult("warning", text)
 
     def _check_step_size(self) -> CheckResult:
-        """Compare a run with one of half the step size."""
+        """Check how much the outputs change with half the step size."""
         header = self._binding.binding
-        half = header.step_size / 2.0
-        binding = self._binding.with_header(step_size=half, decimation=2 * header.decimation)
+        half_step = header.step_size / 2.0
+        # Twice the decimation keeps the times of the outputs.
+        binding = self._binding.with_header(step_size=half_step, decimation=2 * header.decimation)
         with closing(self._asset(binding)) as asset:
             try:
                 outputs = self._run_from_start(asset)
             except FmuCallError as error:
-                return self._refused_step(half, error)
+                return self._refused_step(half_step, error)
         largest = max(float(np.abs(self._first_outputs).max(initial=0.0)), 1e-300)
         change = float(np.abs(outputs - self._first_outputs).max(initial=0.0)) / largest
         if change <= _EQUAL:
@@ -231,7 +240,15 @@ class RunChecks:
         return CheckResult("warning" if advice else "ok", text)
 
     def _refused_step(self, step: float, error: FmuCallError) -> CheckResult:
-        """Return the result for an FMU that refuses a step size [s] with an error."""
+        """Return the result for an FMU that refuses half the step size.
+
+        Parameters
+        ----------
+        step : float
+            The step size that it refuses [s].
+        error : FmuCallError
+            Its error.
+        """
         if self._description.can_vary_step:
             text = f"It declares that it takes any step size, but not {step:g} s: {one_line(error)}"
             return CheckResult("problem", text)
@@ -242,8 +259,8 @@ class RunChecks:
         return CheckResult("warning", text)
 
     def _check_range_edges(self) -> CheckResult:
-        """Make one step at each limit of the range of each input."""
-        tried = 0
+        """Check that the FMU takes each limit of the range of each scalar input, in one step."""
+        limit_count = 0
         failures = []
         with closing(self._asset()) as asset:
             for role in INPUT_ROLES:
@@ -253,27 +270,27 @@ class RunChecks:
                     for value in asset.input_range(role, name):
                         if abs(value) >= _LARGEST_TRIED_LIMIT:
                             continue
-                        tried += 1
+                        limit_count += 1
                         try:
                             self._step_with(asset, role, name, value)
                         except FmuError as error:
                             limit = f"{input_binding.variable} = {value:g} {input_binding.unit}"
                             failures.append(f"{limit}: {one_line(error)}")
         if failures:
-            text = f"{len(failures)} of {tried} ends of ranges fail, such as {failures[0]}"
+            text = f"{len(failures)} of {limit_count} ends of ranges fail, such as {failures[0]}"
             return CheckResult("warning", text)
-        if tried:
-            return CheckResult("ok", f"{tried} ends of ranges give finite outputs.")
+        if limit_count:
+            return CheckResult("ok", f"{limit_count} ends of ranges give finite outputs.")
         return CheckResult("skipped", "No input has a range.")
 
     def _step_with(self, asset: FmiAsset, role: str, name: str, value: float) -> None:
-        """Make the first step with a value of one input."""
+        """Make the first step of a run with a given value of one input."""
         inputs = self._base_inputs | {role: self._base_inputs[role] | {name: value}}
         asset.reset(**self._base_inputs)
         asset.step(**inputs)
 
     def _check_reset(self) -> CheckResult:
-        """Compare a run with one after a reset."""
+        """Check that a run after a reset equals the first one, and that the reset works."""
         with closing(self._asset()) as asset:
             outputs = self._run_from_start(asset)
             outputs_again = self._run_from_start(asset)
@@ -286,8 +303,16 @@ class RunChecks:
         return CheckResult("ok", "After a reset it is as new.")
 
     def _check_instances(self, cycles: int, progress: Progress) -> CheckResult:
-        """Make, step and free instances in one process, and look at its memory."""
-        half_way = cycles // 2
+        """Make, step and free many instances in one process, and check the growth of its memory.
+
+        Parameters
+        ----------
+        cycles : int
+            The number of instances.
+        progress : Progress
+            Where progress is shown.
+        """
+        half_of_cycles = cycles // 2
         number = 0
         memory_half_way = 0
         try:
@@ -296,7 +321,7 @@ class RunChecks:
             with closing(asset), stage_of_progress as stage:
                 asset.reset(**self._base_inputs)
                 for number in range(cycles):
-                    if number == half_way:
+                    if number == half_of_cycles:
                         memory_half_way = asset.worker_memory or 0
                     asset.renew(**self._base_inputs)
                     asset.step()
@@ -305,9 +330,9 @@ class RunChecks:
         except FmuError as error:
             text = f"Instance {number + 1} of {cycles} in one process: {one_line(error)}"
             return CheckResult("problem", text)
-        # the second half only: the first may fill caches
+        # only the second half counts, since the first may fill caches
         growth = memory_at_end - memory_half_way
-        growth_of_each = growth / _KIBIBYTE / max(cycles - half_way, 1)
+        growth_of_each = growth / _KIBIBYTE / max(cycles - half_of_cycles, 1)
         text = (
             f"{cycles} made and freed in one process; it grows by {max(growth_of_each, 0.0):.2g} "
             "KiB with each"
@@ -320,7 +345,7 @@ class RunChecks:
 
 
 def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
-    """Return the outputs (N, n) of steps with the inputs as they are."""
+    """Return the outputs (N, n) of N further steps with unchanged inputs."""
     rows = []
     for _ in range(steps):
         observation = asset.step()
@@ -329,8 +354,8 @@ def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
 
 
 def _first_difference(first: Float, second: Float) -> str:
-    """Return the values where two arrays differ first, in words."""
-    # by their bits: 0.0 and -0.0 are equal numbers
+    """Return a text with the first values that differ between two arrays of equal shape."""
+    # compare bits, since 0.0 and -0.0 are equal numbers
     differs = first.ravel().view(np.uint64) != second.ravel().view(np.uint64)
     position = np.flatnonzero(differs)[0]
     return f"first ({float(first.flat[position])!r}), then ({float(second.flat[position])!r})"

@@ -53,16 +53,16 @@ def default_experiment(
     step_size: float | None = None,
     values: Mapping[str, PlainValue] | None = None,
 ) -> FmuExperiment:
-    """Return the default experiment of an FMU, with changes that the caller asks for.
+    """Return the default experiment of an FMU, with the changes that the caller asks for.
 
     Parameters
     ----------
     description : FmuDescription
         The FMU.
     stop_time : float, optional
-        End [s]; the FMU's own, or one second after its start.
+        The end [s]. By default it is the FMU's own, or one second after the start.
     step_size : float, optional
-        Communication step size [s]; the FMU's own, or a 500th of the time to the end.
+        The communication step size [s]. By default it is the FMU's own, or a 500th of the duration.
     values : mapping of str to float, str or list, optional
         Parameters (also structural ones) and inputs by the names of the FMU's variables, in its
         units. A text is read as `value_of_text` does.
@@ -84,9 +84,10 @@ def default_experiment(
     structural_names = [
         v.name for v in description.variables if v.causality == "structuralParameter"
     ]
-    settable = [*binding.parameter, *binding.load, *structural_names]
-    plain_values = _values_of_variables(description, values or {}, settable)
-    # The last step may lead beyond the end, where that is not a whole number of steps away.
+    settable_names = [*binding.parameter, *binding.load, *structural_names]
+    plain_values = _values_of_variables(description, values or {}, settable_names)
+    # The last step ends after the end if the duration is not a whole number of steps. The FMU is
+    # then told the later end.
     end_of_last_step = start + steps * size
     is_beyond = end_of_last_step > end + _ROUNDING * size
     binding = binding.with_header(
@@ -104,7 +105,24 @@ def default_experiment(
 def _values_of_variables(
     description: FmuDescription, values: Mapping[str, PlainValue], settable: Sequence[str]
 ) -> dict[str, PlainValue]:
-    """Return values by variable, with texts read; refuse what cannot be set."""
+    """Return the values by variable name, with texts converted.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    values : mapping of str to float, str or list
+        The values or their texts, by variable name.
+    settable : sequence of str
+        The names of the variables that can be set.
+
+    Raises
+    ------
+    BindingError
+        If a variable cannot be set.
+    FmuInputError
+        If a text is no value of its variable.
+    """
     plain_values: dict[str, PlainValue] = {}
     for name, value in values.items():
         variable = description.variable(name)
@@ -118,19 +136,20 @@ def _values_of_variables(
 
 
 def _selected(values: Mapping[str, PlainValue], names: Collection[str]) -> dict[str, PlainValue]:
+    """Return the values of some names."""
     return {name: value for name, value in values.items() if name in names}
 
 
 def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
-    """Return the value that a text, as somebody types it, means for a variable.
+    """Return the value that a text, such as one typed by a user, means for a variable.
 
     Parameters
     ----------
     variable : VariableInfo
-        The parameter or input. If it is a text parameter, the text is its value as it stands.
+        The parameter or input. If it is a text parameter, the text itself is its value.
     text : str
-        A number, true or false, or the name of an enumeration's item; for an array several of them
-        with commas.
+        A number, true or false, or the name of an enumeration's item; for an array several of them,
+        separated by commas.
 
     Raises
     ------
@@ -141,10 +160,10 @@ def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
         return text
     numbers = []
     for entry in text.split(","):
-        word = entry.strip()
-        word = {"true": "1", "false": "0"}.get(word, word)
+        number_text = entry.strip()
+        number_text = {"true": "1", "false": "0"}.get(number_text, number_text)
         try:
-            numbers.append(float(variable.items.get(word, word)))
+            numbers.append(float(variable.items.get(number_text, number_text)))
         except ValueError:
             wanted = f"one of {variable.item_list}" if variable.items else "a number"
             raise FmuInputError(f"{variable.name} must be {wanted}, but is {text!r}.") from None
@@ -152,25 +171,26 @@ def value_of_text(variable: VariableInfo, text: str) -> PlainValue:
 
 
 def whole_binding(description: FmuDescription, *, step_size: float | None = None) -> Binding:
-    """Return a binding of all numbers and text parameters of an FMU, by their names and units.
+    """Return a binding of all numbers and text parameters of an FMU, under their own names.
 
     Parameters
     ----------
     description : FmuDescription
         The FMU, or a system of several.
     step_size : float, optional
-        Communication step size [s]; that of the FMU's default experiment, or 1.
+        The communication step size [s]. By default it is that of the FMU's default experiment, or
+        1.
 
     Raises
     ------
     BindingError
         If the FMU has no number to observe.
     """
-    usable = [variable for variable in description.variables if bindable(variable)]
-    texts = [variable for variable in description.variables if variable.is_text_parameter]
-    settable = [v for v in [*usable, *texts] if v.variability != "constant"]
+    numeric_variables = [variable for variable in description.variables if bindable(variable)]
+    text_parameters = [variable for variable in description.variables if variable.is_text_parameter]
+    settable = [v for v in [*numeric_variables, *text_parameters] if v.variability != "constant"]
     observation = {}
-    for variable in observable(description, usable):
+    for variable in observable(description, numeric_variables):
         unit = variable.unit or "1"
         observation[variable.name] = VectorBinding(variables=(variable.name,), unit=unit)
     return Binding(
@@ -189,7 +209,7 @@ def whole_binding(description: FmuDescription, *, step_size: float | None = None
 def _bound_variables(
     variables: Sequence[VariableInfo], causality: str, kind: type[_Bound]
 ) -> dict[str, _Bound]:
-    """Return the variables of a causality, bound under their own names in their own units."""
+    """Return the variables of a causality, bound under their own names and units."""
     bound = {}
     for variable in variables:
         if variable.causality == causality:
@@ -198,14 +218,14 @@ def _bound_variables(
 
 
 def _steps_until(start: float, end: float, size: float | None) -> tuple[int, float]:
-    """Return number and size of the steps to an end; 500 of them if no size is stated.
+    """Return the number and the size of the steps from a start to an end.
 
     Parameters
     ----------
     start, end : float
-        Start and end [s].
+        The start and the end [s].
     size : float or None
-        Communication step size [s].
+        The communication step size [s]; None for 500 steps.
 
     Raises
     ------
@@ -230,16 +250,20 @@ def _steps_until(start: float, end: float, size: float | None) -> tuple[int, flo
 
 
 def ending_with_histories(binding: Binding, steps: int) -> Binding:
-    """Return a binding that ends with the histories of a file, unless it states its own end.
+    """Return a binding whose simulation ends with the input histories of a file.
+
+    A binding that states its own end is returned as it is.
 
     Parameters
     ----------
     binding : Binding
         The binding.
     steps : int
-        Number of rows of the file: each is a step, but for the first under linear interpolation.
+        The number of rows of the file.
     """
     header = binding.binding
+    # A row is constant over a step; under linear interpolation a step leads from one row to the
+    # next.
     steps_made = steps if header.interpolation == "zero-order" else steps - 1
     if header.stop_time is not None or steps_made < 1:
         return binding
@@ -247,25 +271,25 @@ def ending_with_histories(binding: Binding, steps: int) -> Binding:
 
 
 def run_histories(asset: FmiAsset, steps: int, histories: InputHistories) -> ObservationHistory:
-    """Return the outputs of an asset under the histories of a file.
+    """Return the outputs of an asset under the input histories of a file.
 
-    Each row holds over the step that begins at its time. Under linear interpolation the inputs move
-    in straight lines from row to row: the asset starts at the first, and there is an output for
-    each row.
+    Without interpolation, a row is constant over the step that begins at its time. Under linear
+    interpolation, the inputs change linearly from row to row: the asset is initialised with the
+    first row, and there is an output for each row.
 
     Parameters
     ----------
     asset : FmiAsset
         The asset.
     steps : int
-        Number of rows, N.
+        The number of rows, N.
     histories : dict of str to dict of str to (N,) or (N, n) ndarray
         Inputs as `read_histories` returns them.
 
     Raises
     ------
     FmuInputError
-        If there is one row only under linear interpolation.
+        If there is only one row under linear interpolation.
     FmuError
         As `FmiAsset.simulate`.
     """
@@ -308,13 +332,13 @@ def simulate_from_now(asset: FmiAsset, steps: int, histories: InputHistories) ->
     """
     present = asset.observe()
     later = asset.simulate(**histories, steps=steps, progress=None)
-    extra = {}
+    extra_histories = {}
     for name, values in later.extra.items():
-        extra[name] = np.concatenate(([present.extra[name]], values))
+        extra_histories[name] = np.concatenate(([present.extra[name]], values))
     return ObservationHistory(
         time=np.concatenate(([present.time], later.time)),
         values=np.vstack((present.values, later.values)),
-        extra=extra,
+        extra=extra_histories,
         ended=later.ended,
     )
 

@@ -18,16 +18,17 @@ from .values import InputsByRole
 
 
 class ConstantHealthRun(NamedTuple):
-    """Successive steps with the same health.
+    """Successive steps with constant health, so that they can be made without a new start.
 
     Attributes
     ----------
     first_inputs : dict of str to dict
-        Inputs of the first step by role and name, the health among them.
+        All inputs of the first step by role and name, including the health.
     histories : dict of str to dict
-        Inputs of all steps as `FmiAsset.simulate` takes them, without health set at the start.
+        Inputs of all steps as `FmiAsset.simulate` takes them, without health that is set at the
+        start.
     steps : int
-        Number of steps.
+        The number of steps.
     """
 
     first_inputs: dict[str, dict[str, npt.ArrayLike]]
@@ -36,20 +37,20 @@ class ConstantHealthRun(NamedTuple):
 
 
 class _CheckedHistory(NamedTuple):
-    """The history of one input.
+    """The checked history of one input.
 
     Attributes
     ----------
     role, name : str
-        Role and name in the binding.
+        The role and the name in the binding.
     values : array_like
-        Values as the caller gave them.
+        The values as the caller gave them.
     slot : InputSlot
-        Where the input goes.
+        The place of the input in the request block.
     numbers : (n,) or (N, n) ndarray
-        Checked values in the FMU's unit.
+        The checked values in the FMU's unit.
     is_at_start : bool
-        Whether the FMU takes the input at its start only.
+        Whether the FMU accepts the input only before its initialisation.
     """
 
     role: str
@@ -79,7 +80,10 @@ class _CheckedHistory(NamedTuple):
 def split_where_health_changes(
     exchange: Exchange, inputs: InputsByRole, steps: int | None
 ) -> list[ConstantHealthRun]:
-    """Return the runs of constant health that histories of inputs consist of.
+    """Split histories of inputs into runs of constant health.
+
+    Health that is a parameter of the FMU can only be set before its initialisation, so each run
+    needs a new start.
 
     Parameters
     ----------
@@ -88,7 +92,7 @@ def split_where_health_changes(
     inputs : mapping of str to mapping
         Inputs by role and name: one value for all steps, or one for each.
     steps : int, optional
-        Number of steps; that of the histories if absent.
+        The number of steps; by default that of the histories.
 
     Raises
     ------
@@ -98,21 +102,22 @@ def split_where_health_changes(
         If a value is wrong, or the histories have different lengths.
     """
     histories = _checked_histories(exchange, inputs)
-    count = exchange.step_count([(entry.slot, entry.numbers) for entry in histories], steps)
-    begins = _first_steps(histories, count)
+    step_count = exchange.step_count([(entry.slot, entry.numbers) for entry in histories], steps)
+    first_steps = _first_steps(histories, step_count)
     runs = []
-    for begin, end in zip(begins, [*begins[1:], count], strict=True):
+    for begin, end in zip(first_steps, [*first_steps[1:], step_count], strict=True):
         first_inputs: dict[str, dict[str, npt.ArrayLike]] = {}
-        sent: dict[str, dict[str, npt.ArrayLike]] = {}
+        step_histories: dict[str, dict[str, npt.ArrayLike]] = {}
         for history in histories:
             first_inputs.setdefault(history.role, {})[history.name] = history.first_value(begin)
             if not history.is_at_start:
-                sent.setdefault(history.role, {})[history.name] = history.part(begin, end)
-        runs.append(ConstantHealthRun(first_inputs, sent, end - begin))
+                step_histories.setdefault(history.role, {})[history.name] = history.part(begin, end)
+        runs.append(ConstantHealthRun(first_inputs, step_histories, end - begin))
     return runs
 
 
 def _checked_histories(exchange: Exchange, inputs: InputsByRole) -> list[_CheckedHistory]:
+    """Return the histories of all inputs, with their values checked and converted."""
     histories = []
     for role, by_name in inputs.items():
         table: Mapping[str, npt.ArrayLike] = by_name or {}
@@ -125,14 +130,24 @@ def _checked_histories(exchange: Exchange, inputs: InputsByRole) -> list[_Checke
 
 
 def _first_steps(histories: list[_CheckedHistory], count: int) -> list[int]:
-    """Return the first step, and every step whose health differs from that of the step before."""
-    columns = []
+    """Return the numbers of the first step, and of each step at which the health changes.
+
+    Parameters
+    ----------
+    histories : list of _CheckedHistory
+        The histories of all inputs.
+    count : int
+        The number of steps.
+    """
+    health_columns = []
     for history in histories:
         if history.is_at_start:
             width = len(history.slot.positions)
-            columns.append(np.broadcast_to(history.numbers.reshape(-1, width), (count, width)))
-    if not columns:
+            health_columns.append(
+                np.broadcast_to(history.numbers.reshape(-1, width), (count, width))
+            )
+    if not health_columns:
         return [0]
-    health = np.hstack(columns)
-    differs = (health[1:] != health[:-1]).any(axis=1)
-    return [0, *(np.flatnonzero(differs) + 1).tolist()]
+    health = np.hstack(health_columns)
+    has_changed = (health[1:] != health[:-1]).any(axis=1)
+    return [0, *(np.flatnonzero(has_changed) + 1).tolist()]

@@ -30,7 +30,7 @@ _logged_warnings: set[str] = set()
 
 
 class ExtractedFmu:
-    """The folder of an extracted FMU; it is removed when nothing refers to this any more.
+    """The folder of an extracted FMU, which is removed when this object is no longer used.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class ExtractedFmu:
     folder : Path
         The folder.
     users : int
-        Number of instances that run from it.
+        The number of instances that run from it.
 
     Raises
     ------
@@ -57,7 +57,7 @@ class ExtractedFmu:
 
 
 class InstanceHost:
-    """The one instance of an asset: made, brought to its start again and again, and freed.
+    """The owner of an asset's only instance, which makes, restarts and frees it.
 
     Parameters
     ----------
@@ -73,9 +73,9 @@ class InstanceHost:
     Attributes
     ----------
     instance : FmuInstance, WorkerInstance or None
-        The instance, while there is one.
+        The instance, if there is one.
     reset_trial : ResetTrial
-        Findings about the restart of the FMU.
+        What is known about restarts of the FMU.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class InstanceHost:
         self._extracted: ExtractedFmu | None = None
         self._release: Callable[[], object] = lambda: None
         self.instance: Instance | None = None
-        # Where a process can make one instance only, there is nothing to compare a reset with.
+        # If only one instance can be made, there is no new one to compare a reset one with.
         can_make_another = isolated or not description.once_per_process
         self.reset_trial = ResetTrial(comparable=can_make_another)
         self._method = RestartMethod.LOADING
@@ -97,15 +97,15 @@ class InstanceHost:
     def sibling(self) -> "InstanceHost":
         """Return a host of another instance of the same extracted FMU.
 
-        The folder stays until every sibling is closed or collected, used or not.
+        The folder of the FMU is kept until all siblings are closed or garbage-collected.
         """
-        other = InstanceHost(self._description, self._plan, self._limits, isolated=self._isolated)
-        other._extracted = self._extracted
-        other.reset_trial = self.reset_trial
-        return other
+        sibling = InstanceHost(self._description, self._plan, self._limits, isolated=self._isolated)
+        sibling._extracted = self._extracted
+        sibling.reset_trial = self.reset_trial
+        return sibling
 
     def start(self, start: InstanceStart, *, renewed: bool = False) -> Instance:
-        """Return the instance at its start; never one that was lost to a fatal error.
+        """Return the instance, initialised at its start; a lost one is replaced.
 
         Parameters
         ----------
@@ -132,21 +132,27 @@ class InstanceHost:
         return instance
 
     def replace_if_contradicted(self, request: bytes, reply: Float) -> Instance | None:
-        """Return another instance at its start if the first step shows that this one was not.
+        """Return a new instance if the first step proves that the restart of this one did not work.
 
-        The first step of the first instance is recorded; None is returned if all is well.
+        A restart has worked if the same start and the same first step give the same outputs as in
+        the first instance, whose first step is recorded here.
 
         Parameters
         ----------
         request : bytes
-            Request block of the first step after a start.
+            The request block of the first step after a start.
         reply : (n,) ndarray
-            Outputs after it.
+            The outputs after it.
+
+        Returns
+        -------
+        Instance or None
+            None if the restart worked, or if nothing can be compared.
 
         Raises
         ------
         FmuError
-            If the other instance cannot be started.
+            If the new instance cannot be started.
         """
         trial = self.reset_trial
         start = self._start
@@ -163,7 +169,7 @@ class InstanceHost:
         return self.start(start)
 
     def renew(self) -> Instance:
-        """Free the instance and return another one, in the same process.
+        """Free the instance and return a new one in the same process.
 
         Raises
         ------
@@ -184,7 +190,11 @@ class InstanceHost:
     # ------------------------------------------------------------------ restarts
 
     def _restarted_instance(self) -> Instance:
-        """Return an instance as after its instantiation, by the fastest method that works."""
+        """Return an instance in its state after instantiation, by the fastest method that works.
+
+        The methods are tried in this order: the FMU's own reset, a new instance in the same
+        process, and a new process. A method with a known fault is not tried again.
+        """
         methods: list[tuple[RestartMethod, Callable[[], Instance]]] = [
             (RestartMethod.RESET, self._reset_instance)
         ]
@@ -194,7 +204,7 @@ class InstanceHost:
             self._method = method
             if not self._is_worth_trying(method):
                 continue
-            # a worker that does not survive it is replaced
+            # if the worker does not survive this method, the next one makes a new worker
             with suppress(FmuError):
                 instance = self._instance_restarted_by(restart)
                 if instance is not None:
@@ -203,15 +213,24 @@ class InstanceHost:
         return self._make_instance()
 
     def _is_worth_trying(self, method: RestartMethod) -> bool:
-        """Return whether a method has shown no fault, and can be compared with the first step."""
+        """Return whether a restart method has no known fault and its result can be verified.
+
+        The FMU's reset is verified by comparison with the first step of the first instance.
+        """
         trial = self.reset_trial
-        is_unproved = (
+        cannot_be_verified = (
             method == RestartMethod.RESET and trial.first_step is None and trial.comparable
         )
-        return method >= trial.method and not is_unproved
+        return method >= trial.method and not cannot_be_verified
 
     def _instance_restarted_by(self, restart: Callable[[], Instance]) -> Instance | None:
-        """Return an instance restarted by a method; None if its first step shows a difference."""
+        """Return the instance after a restart, or None if its first step shows that this failed.
+
+        Parameters
+        ----------
+        restart : callable
+            Restarts the instance by one method, and returns it.
+        """
         instance = restart()
         first_step = self.reset_trial.first_step
         if first_step is None:
@@ -219,11 +238,12 @@ class InstanceHost:
         reply = first_step.repeat(instance)
         label = self._description.label
         if self.reset_trial.accepts(label, self._method, first_step, reply):
-            # the comparison has made a step
+            # restart again, since the comparison has made a step
             return restart()
         return None
 
     def _reset_instance(self) -> Instance:
+        """Reset the instance by the FMU's own function; record it if the FMU refuses."""
         assert self.instance is not None
         try:
             self.instance.reset()
@@ -235,9 +255,9 @@ class InstanceHost:
     # ------------------------------------------------------------------ making an instance
 
     def _make_instance(self) -> Instance:
-        """Return an instance made from the file, in a worker of its own if there are workers."""
+        """Return an instance that is loaded anew, in a new worker if this host uses workers."""
         extracted = self._extracted
-        # after a crash the files of the FMU are not trusted either
+        # after a crash the files of the FMU may be damaged, so they are extracted again
         has_crashed = self.instance is not None and self.instance.lost
         self.close()
         if extracted is None or has_crashed or not extracted.folder.is_dir():
@@ -250,7 +270,7 @@ class InstanceHost:
         extracted.users += 1
         self.instance = instance
         self._extracted = extracted
-        # also at the end of the interpreter, or when the asset is forgotten without being closed
+        # free it also at the end of the interpreter, or if the asset is collected but never closed
         self._release = weakref.finalize(self, _release, instance, extracted)
         return instance
 
@@ -271,7 +291,7 @@ class InstanceHost:
 
 
 def _release(instance: Instance, extracted: ExtractedFmu) -> None:
-    """Free an instance; after the last one, forget the modules of an FMU in Python."""
+    """Free an instance; after the last one, unload the Python modules of its FMU."""
     instance.close()
     extracted.users -= 1
     # others may still import what they need
@@ -321,7 +341,9 @@ def worker_limits(
     load_timeout: float | None,
     memory_limit: float | None,
 ) -> WorkerLimits:
-    """Return the limits of a worker: those of the caller, else of the binding, else the defaults.
+    """Return the limits of a worker.
+
+    A limit is that of the caller; without one that of the binding; without that the default.
 
     Parameters
     ----------
@@ -338,12 +360,12 @@ def worker_limits(
         If one is not positive.
     """
     limits = binding.limits.model_dump()
-    of_caller = {
+    limits_of_caller = {
         "step_time": step_timeout,
         "load_time": load_timeout,
         "memory": memory_limit,
     }
-    for key, value in of_caller.items():
+    for key, value in limits_of_caller.items():
         if value is not None:
             limits[key] = value
     return validate(

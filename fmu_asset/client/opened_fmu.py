@@ -58,14 +58,14 @@ class OpenedFmu:
         self._set_up(exchange, host, parameters or {})
 
     def _set_up(self, exchange: Exchange, host: InstanceHost, parameters: Values) -> None:
-        """Set the attributes of an asset that is not opened yet.
+        """Initialise the attributes of an asset whose FMU has not been started.
 
         Parameters
         ----------
         exchange : Exchange
             The binding, resolved against the FMU.
         host : InstanceHost
-            Host of its instance.
+            The host of its instance.
         parameters : mapping of str to float
             Parameters by the binding's names.
         """
@@ -82,17 +82,17 @@ class OpenedFmu:
         self._linear_count = exchange.plan.linear_count
         self._phase: Literal["new", "ready", "broken", "closed"] = "new"
         self.step_index = 0
-        # what the present start was made with
+        # step number, inputs and health of the last start
         self._first_index = 0
         self._start_inputs = b""
         self._health: dict[str, PlainValue] = {}
         self._set_parameters(parameters)
-        # inputs of the steps since then, to be replayed
+        # request blocks of the steps since that start; a state is restored by repeating them
         self._record: list[bytes] = []
         self._log: deque[tuple[str, str]] = deque(maxlen=_LOG_LENGTH)
 
     def _chosen_state_method(self) -> StateMethod:
-        """Return how states are kept: as the binding says, else as the FMU declares."""
+        """Return how states are saved: as the binding says, or else as the FMU is able to."""
         chosen = self.binding.binding.state
         if chosen != "auto":
             return chosen
@@ -112,7 +112,7 @@ class OpenedFmu:
 
     @property
     def log(self) -> tuple[tuple[str, str], ...]:
-        """Last messages of the FMU, oldest first: status and text."""
+        """Status and text of the last messages of the FMU, the oldest first."""
         instance = self._host.instance
         if instance is not None and not instance.lost:
             for status, text in instance.take_log():
@@ -120,7 +120,7 @@ class OpenedFmu:
         return tuple(self._log)
 
     def _worker(self) -> WorkerInstance | None:
-        """Return the instance if it runs in a worker process."""
+        """Return the instance if it runs in a worker process that is not lost, else None."""
         instance = self._host.instance
         return instance if isinstance(instance, WorkerInstance) and not instance.lost else None
 
@@ -137,12 +137,12 @@ class OpenedFmu:
         return None if worker is None else worker.memory
 
     def input_range(self, role: str, name: str) -> tuple[float, float]:
-        """Return the range of an input in the binding's unit, that of the FMU and of the binding.
+        """Return the range of an input in the binding's unit, within the limits of FMU and binding.
 
         Parameters
         ----------
         role, name : str
-            Role and name in the binding.
+            The role and the name in the binding.
 
         Raises
         ------
@@ -212,9 +212,10 @@ class OpenedFmu:
         self._restart(by_role)
 
     def renew(self, **inputs: Unpack[Inputs]) -> None:
-        """Free the FMU's instance, make another one in the same process, and go back to the start.
+        """Replace the FMU's instance by a new one in the same process, and start it.
 
-        `reset` uses the FMU's own reset; this is how a batch of runs starts again without it.
+        `reset` uses the FMU's own function to reset. This method does not, for runs in which that
+        function must have no part.
 
         Parameters
         ----------
@@ -236,12 +237,14 @@ class OpenedFmu:
         self._restart(by_role, renewed=True)
 
     def sibling(self, parameters: Values | None = None) -> Self:
-        """Return a new asset of the same FMU, binding and limits, without extracting the FMU again.
+        """Return an independent asset of the same FMU, binding and limits.
+
+        The FMU is not extracted again, and the new asset has not been started.
 
         Parameters
         ----------
         parameters : mapping of str to float, optional
-            Parameters in the binding's units; those of this asset if absent.
+            Parameters in the binding's units; by default those of this asset.
 
         Raises
         ------
@@ -267,11 +270,20 @@ class OpenedFmu:
     # ------------------------------------------------------------------ starts
 
     def _set_parameters(self, parameters: Values) -> None:
+        """Set the parameters of later starts, in the binding's units."""
         self._settings = self._exchange.settings(parameters, self._health)
         self._parameters = plain_values(parameters)
 
     def _restart(self, inputs: InputsByRole, *, renewed: bool = False) -> None:
-        """Go back to the start with inputs; `renewed` says that the instance is new already."""
+        """Start the FMU again with inputs.
+
+        Parameters
+        ----------
+        inputs : mapping of str to mapping
+            Inputs by role and name that hold during the initialisation.
+        renewed : bool
+            Whether the instance is new, so that it needs no reset.
+        """
         if self._exchange.health_slots:
             inputs, health = self._exchange.parameters.split_inputs(inputs)
             self._settings = self._exchange.settings(self._parameters, health)
@@ -281,27 +293,33 @@ class OpenedFmu:
         self._start_instance(request, with_inputs=with_inputs, renewed=renewed)
 
     def _restart_if_health_changes(self, inputs: InputsByRole) -> InputsByRole:
-        """Return inputs without health that needs a start, after a new start where it changes.
+        """Start the FMU again if inputs change its health; return the inputs without that health.
 
-        The new start is at the present moment and under the present inputs; the steps before it are
-        forgotten.
+        It concerns health that the FMU accepts only before its initialisation. The new start is
+        made at the present time with the present inputs. States before it can no longer be
+        replayed.
+
+        Parameters
+        ----------
+        inputs : mapping of str to mapping
+            Inputs of the next step by role and name.
         """
-        inputs, given_health = self._exchange.parameters.split_inputs(inputs)
-        health = self._health | plain_values(given_health)
+        inputs, changed_health = self._exchange.parameters.split_inputs(inputs)
+        health = self._health | plain_values(changed_health)
         if health == self._health:
             return inputs
         settings = self._exchange.settings(self._parameters, health)
         if self._phase == "ready":
-            request = list(self._request)
-            self._exchange.request.place(request, inputs)
+            start_request = list(self._request)
+            self._exchange.request.place(start_request, inputs)
             with_inputs = True
         else:
             self._refuse_closed()
-            request = self._exchange.request.start_values(inputs)
-            with_inputs = self._exchange.request.place(request, inputs)
+            start_request = self._exchange.request.start_values(inputs)
+            with_inputs = self._exchange.request.place(start_request, inputs)
         self._settings = settings
         self._health = health
-        self._start_instance(request, with_inputs=with_inputs, index=self.step_index)
+        self._start_instance(start_request, with_inputs=with_inputs, index=self.step_index)
         return inputs
 
     def _start_instance(
@@ -312,18 +330,18 @@ class OpenedFmu:
         renewed: bool = False,
         index: int = 0,
     ) -> None:
-        """Bring an instance to its start.
+        """Start an instance of the FMU, at the time of a given step.
 
         Parameters
         ----------
         request : list of float
-            Request block with the inputs of the start.
+            The request block with the inputs of the start.
         with_inputs : bool
-            Whether these hold already during the initialisation.
+            Whether these are set before the initialisation.
         renewed : bool
-            Whether the instance is new already.
+            Whether the instance is new, so that it needs no reset.
         index : int
-            Number of steps of the asset before this start.
+            The number of steps that the asset has made before this start.
         """
         time = self._start_time + index * self._interval
         start = InstanceStart(time, self._settings, request, with_inputs)
@@ -340,39 +358,46 @@ class OpenedFmu:
         self._phase = "ready"
 
     def _use_instance(self, instance: Instance) -> None:
-        """Take an instance, and views of its two blocks that are fast to write and read."""
+        """Use an instance, through views of its two blocks that are fast to write and read."""
         self._instance = instance
         self._request = memoryview(instance.request).cast("B").cast("d")
         self._reply = np.frombuffer(memoryview(instance.reply).cast("B"), dtype=np.float64)
 
     def _replaced_instance(self, request: bytes, reply: Float) -> Instance | None:
-        """Return another instance if the first step shows that this one was not at its start.
+        """Return another instance if the first step shows that the reset of this one did not work.
 
         Parameters
         ----------
         request : bytes
-            Request block of the first step; the other instance is to make it again.
+            The request block of the first step, which the new instance has to repeat.
         reply : (n,) ndarray
-            Outputs after it.
+            The outputs after it.
+
+        Returns
+        -------
+        Instance or None
+            None if the present instance is right.
         """
-        other = self._host.replace_if_contradicted(request, reply)
-        if other is not None:
-            self._use_instance(other)
+        replacement = self._host.replace_if_contradicted(request, reply)
+        if replacement is not None:
+            self._use_instance(replacement)
             self._request.cast("B")[:] = request
-        return other
+        return replacement
 
     def _opened_instance(self, inputs: InputsByRole | None = None) -> Instance:
-        """Return the instance; the first use opens it, but it is never started again unasked.
+        """Return the instance; start it at the first use.
+
+        An instance that was closed or broken is not started again: the user must reset the asset.
 
         Parameters
         ----------
         inputs : mapping of str to mapping, optional
-            Inputs of the step that is going to be made. The start values of an array that was
-            resized need not fit if the step gives the whole array.
+            Inputs of the next step. If it sets the whole of an array that was resized, the FMU's
+            start values of this array need not fit.
         """
         self._refuse_closed()
         if self._phase == "new":
-            # straight lines begin at the start values, which must be there then
+            # under linear interpolation the first step begins at the start values, so they must fit
             needs_no_start_values = (
                 self.binding.binding.structural_parameters and not self._linear_count
             )
@@ -390,7 +415,7 @@ class OpenedFmu:
     # ------------------------------------------------------------------ outputs and errors
 
     def _observation(self) -> Observation:
-        """Return the observation in the reply block."""
+        """Return the observation that the reply block holds; refuse values that are not finite."""
         self._refuse_not_finite()
         return self._exchange.outputs.observation(self._reply, self.time)
 
@@ -415,7 +440,9 @@ class OpenedFmu:
             )
 
     def _raise_located(self, error: FmuError, action: str) -> NoReturn:
-        """Raise an error of the FMU with its file and what was done; keep its messages in the log.
+        """Raise an error of the FMU again, with the name of the FMU and what was done.
+
+        The messages of the error are added to the log.
 
         Parameters
         ----------
@@ -426,7 +453,7 @@ class OpenedFmu:
         """
         for message in error.messages:
             self._log.append(("Error", message))
-        # other errors are about what was asked, and say so
+        # other errors are about the caller's request, and their message is complete
         if not isinstance(error, RuntimeError | TimeoutError):
             raise error
         hint = ""

@@ -53,7 +53,10 @@ class _BoundInput(NamedTuple):
 
 
 class _PlainInput(NamedTuple):
-    """An input that is sent as it is, if it is a float in its range: one real number, same unit."""
+    """An input that needs no conversion: one real number, in the FMU's own unit.
+
+    A value is sent without further checks if it is a float within the limits.
+    """
 
     position: int
     low: float
@@ -65,7 +68,7 @@ _NOT_PLAIN = _PlainInput(position=0, low=1.0, high=0.0)
 
 
 class RequestBlock:
-    """The layout of the request block, and how inputs are put there.
+    """The layout of the request block, and how inputs are written to it.
 
     Parameters
     ----------
@@ -82,7 +85,7 @@ class RequestBlock:
     Raises
     ------
     BindingError
-        If an input does not fit the FMU, or two set the same value.
+        If an input does not fit the FMU, or two inputs set the same value.
     """
 
     def __init__(self, resolver: BindingResolver, ports: Sequence[PortQuantity]) -> None:
@@ -103,7 +106,7 @@ class RequestBlock:
     # ------------------------------------------------------------------ resolving
 
     def _role_inputs(self) -> list[_BoundInput]:
-        """Return the inputs that are sent at every step, by role."""
+        """Return the bound inputs of all roles, without health that is set only at the start."""
         resolver = self._resolver
         bound_inputs = []
         for role in INPUT_ROLES:
@@ -115,7 +118,7 @@ class RequestBlock:
         return bound_inputs
 
     def _port_inputs(self, ports: Sequence[PortQuantity]) -> list[_BoundInput]:
-        """Return the inputs of ports."""
+        """Return the bound inputs of ports; a port quantity that is an output is left out."""
         bound_inputs = []
         for quantity in ports:
             if quantity.is_read:
@@ -127,14 +130,19 @@ class RequestBlock:
         return bound_inputs
 
     def _slot(self, bound: _BoundInput, user_of_position: dict[int, str]) -> InputSlot:
-        """Return the slot of an input, and note its label at its positions.
+        """Return the slot of an input, and enter its positions in the list of users.
 
         Parameters
         ----------
         bound : _BoundInput
             The input.
         user_of_position : dict of int to str
-            Label of the input that sets each position; extended in place.
+            The label of the input that sets each position; extended in place.
+
+        Raises
+        ------
+        BindingError
+            If its variables differ in unit or type, or another input sets one of its positions.
         """
         resolver = self._resolver
         if (
@@ -165,7 +173,7 @@ class RequestBlock:
         return resolver.slot(bound.label, bound.input_binding, variable, positions)
 
     def _check_linear_interpolation(self) -> None:
-        """Refuse straight lines of inputs where the FMU, or none of its inputs, can follow them."""
+        """Refuse linear interpolation if the FMU, or all of its inputs, cannot follow it."""
         description = self._resolver.description
         request = (
             f"The binding {self._resolver.binding.name} asks for linear interpolation of inputs, "
@@ -197,19 +205,20 @@ class RequestBlock:
         return [*self._slots.get(role, {})]
 
     def _known_slot(self, role: str, name: str) -> InputSlot:
+        """Return the slot of an input; refuse a name that the binding does not have."""
         slot = self.slot(role, name)
         if slot is None:
             raise unknown_input(self._resolver.binding.name, role, name, self.names(role))
         return slot
 
     def start_values(self, inputs: InputsByRole) -> list[float]:
-        """Return a request block with the FMU's own start values of the inputs.
+        """Return a request block that holds the FMU's own start values of the inputs.
 
         Parameters
         ----------
         inputs : mapping of str to mapping or None
-            Inputs that will be put in their place, by role. Whole arrays among them are left at
-            zero: an array that was resized may have no start values that fit.
+            Inputs by role that will be written over these. If they set a whole array, it is zero
+            here: the start values of a resized array may not fit.
 
         Raises
         ------
@@ -228,11 +237,11 @@ class RequestBlock:
             block += start_values(
                 self._resolver.description, variable, placeholders=variable.name in given_arrays
             )
-        # lines begin at the start values
+        # linear inputs begin at the start values, too; their begins are the last part of the block
         return block + block[2 : 2 + linear_count]
 
     def place(self, target: NumberBlock, inputs: InputsByRole) -> bool:
-        """Put inputs into a request block; return whether there were any.
+        """Write inputs to a request block; return whether there were any.
 
         Parameters
         ----------
@@ -256,7 +265,7 @@ class RequestBlock:
             plain_inputs = self._plain_inputs.get(role, {})
             for name, value in values.items():
                 position, low, high = plain_inputs.get(name, _NOT_PLAIN)
-                # NaN and infinities are in no range
+                # a fast path for plain inputs; NaN and infinities lie in no range
                 if isinstance(value, float) and low <= value <= high:
                     target[position] = value
                 else:
@@ -265,23 +274,24 @@ class RequestBlock:
 
     @staticmethod
     def _place_checked(target: NumberBlock, slot: InputSlot, value: npt.ArrayLike) -> None:
+        """Check and convert the values of an input, and write them to a request block."""
         numbers = slot.numbers(value).tolist()
         for position, number in zip(slot.positions, numbers, strict=True):
             target[position] = number
 
     def rows(self, last: Float, histories: InputsByRole, steps: int | None) -> Float:
-        """Return the request blocks of many steps, still without time and step size.
+        """Return the request blocks of many steps, from checked histories of inputs.
 
-        All histories are checked.
+        Time and step size are not set.
 
         Parameters
         ----------
         last : (2 + n_inputs,) ndarray
-            The last request; an input that is not given keeps its value.
+            The last request block. An input without a history keeps its value.
         histories : mapping of str to mapping
             Inputs by role and name.
         steps : int, optional
-            Number of steps N; that of the histories if absent.
+            The number of steps N; by default that of the histories.
 
         Returns
         -------
@@ -300,23 +310,25 @@ class RequestBlock:
         for role, by_name in histories.items():
             for name, values in (by_name or {}).items():
                 slots_and_values.append((self._known_slot(role, name), values))
-        checked = [(slot, slot.numbers(values, history=True)) for slot, values in slots_and_values]
-        rows = np.tile(last, (step_count(checked, steps), 1))
-        for slot, numbers in checked:
-            rows[:, list(slot.positions)] = numbers
-        return rows
+        checked_histories = [
+            (slot, slot.numbers(values, history=True)) for slot, values in slots_and_values
+        ]
+        blocks = np.tile(last, (step_count(checked_histories, steps), 1))
+        for slot, numbers in checked_histories:
+            blocks[:, list(slot.positions)] = numbers
+        return blocks
 
 
 def _plain_inputs(slots: Mapping[str, InputSlot]) -> dict[str, _PlainInput]:
-    """Return the inputs that are sent as they are, by name: real numbers in the FMU's unit."""
-    plain = {}
+    """Return the inputs that need no conversion, by name."""
+    plain_inputs = {}
     for name, slot in slots.items():
         is_plain = slot.conversion == IDENTITY and not slot.takes_whole_numbers
         if is_plain and len(slot.positions) == 1:
             low = max(slot.low, -_LARGEST)
             high = min(slot.high, _LARGEST)
-            plain[name] = _PlainInput(slot.positions[0], low, high)
-    return plain
+            plain_inputs[name] = _PlainInput(slot.positions[0], low, high)
+    return plain_inputs
 
 
 def unknown_input(binding: str, role: str, name: str, known: Sequence[str]) -> BindingError:
@@ -336,19 +348,19 @@ def unknown_input(binding: str, role: str, name: str, known: Sequence[str]) -> B
 
 
 def step_count(histories: Sequence[tuple[InputSlot, Float]], steps: int | None) -> int:
-    """Return the number of steps on which histories and the caller agree.
+    """Return the number of steps that histories and the caller ask for.
 
     Parameters
     ----------
     histories : sequence of (InputSlot, (n,) or (N, n) ndarray)
-        Each input with its values.
+        Each input with its values; an (n,) array is for all steps.
     steps : int, optional
-        Number that the caller asks for.
+        The number that the caller asks for.
 
     Raises
     ------
     FmuInputError
-        If they do not agree, or nothing says a number.
+        If the numbers differ, or none is given.
     """
     count = steps
     source = "`steps`"

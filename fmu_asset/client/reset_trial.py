@@ -23,18 +23,18 @@ _logged: set[tuple[str, "RestartMethod"]] = set()
 
 @dataclass(frozen=True)
 class InstanceStart:
-    """The state in which an instance is initialised.
+    """How an instance is initialised.
 
     Attributes
     ----------
     time : float
-        Start time [s].
+        The start time [s].
     settings : list of InitialValue
         Values that are set before the initialisation.
     request : list of float
         The request block: time, step size, inputs.
     with_inputs : bool
-        Whether the inputs of the block hold already during the initialisation.
+        Whether the inputs of the block are set before the initialisation.
     """
 
     time: float
@@ -90,7 +90,7 @@ class FirstStep:
     reply: Float
 
     def repeat(self, instance: Instance) -> Float:
-        """Return the outputs (n,) of another instance that is started and stepped in the same way.
+        """Return the outputs (n,) of another instance after the same start and the same step.
 
         Parameters
         ----------
@@ -109,27 +109,28 @@ _FAULTS = {
         "Another instance in the same process does not begin as the first one did"
     ),
 }
-"""Fault of a method whose first step differs."""
+"""The fault of a restart method, if the first step after it differs from that of a new instance."""
 _NEXT_PLACES = {RestartMethod.RESET: "instance", RestartMethod.RENEWAL: "process"}
-"""Thing that is made anew at every start after a method has failed."""
+"""What is made anew at every start, once a restart method has failed."""
 
 
 @dataclass
 class ResetTrial:
-    """Findings about the restart of an FMU; shared by all assets of one opening.
+    """What is known about restarts of an FMU; shared by all assets that use one extracted FMU.
 
     Attributes
     ----------
     comparable : bool
-        Whether there are other instances to compare one with, and they begin alike.
+        Whether restarts can be verified by comparison: there can be several instances, and new ones
+        give equal outputs.
     works : bool or None
-        Whether the FMU's reset works; None as long as nothing has shown it.
+        Whether the FMU's own reset works; None if this is not known yet.
     fault : str
-        Sentence on its fault; empty as long as none is known.
+        A sentence on the fault of its restart; empty if none is known.
     lies : bool
-        Whether it returns OK and does nothing useful.
+        Whether it reports success although its restart does not work.
     method : RestartMethod
-        The fastest method that has shown no difference.
+        The fastest method without a known fault.
     first_step : FirstStep or None
         The first step of the first instance, once it has been made.
     """
@@ -142,7 +143,7 @@ class ResetTrial:
     first_step: FirstStep | None = field(default=None, repr=False)
 
     def record_refused_reset(self) -> None:
-        """Record that the FMU has no reset."""
+        """Record that the FMU refuses to be reset."""
         self.works = False
         self.method = RestartMethod.RENEWAL
         self.fault = "It cannot be reset; every start takes a new instance."
@@ -150,20 +151,20 @@ class ResetTrial:
     def accepts(
         self, label: str, method: RestartMethod, first_step: FirstStep, reply: Float
     ) -> bool:
-        """Return whether a first step shows that a method has worked.
+        """Return whether the first step after a restart agrees with that of a new instance.
 
-        If it does not, a warning is logged once and a slower method is used from now on.
+        If it does not, a warning is logged once, and a slower method is used from now on.
 
         Parameters
         ----------
         label : str
-            Name of the FMU, for the warning.
+            The name of the FMU, for the warning.
         method : RestartMethod
-            Method by which the instance was brought to its start.
+            The method by which the instance was restarted.
         first_step : FirstStep
             The step with which it is compared.
         reply : (n,) ndarray
-            Outputs after the same step.
+            The outputs after the same step.
         """
         expected = first_step.reply
         is_equal = (reply == expected) | (np.isnan(reply) & np.isnan(expected))
@@ -172,7 +173,7 @@ class ResetTrial:
                 self.works = True
             return True
         if method == RestartMethod.LOADING:
-            # not even a new process begins alike: nothing can be compared
+            # even new processes give different outputs, so no comparison can show a fault
             self.comparable = False
             self.first_step = None
             self.method = RestartMethod.RENEWAL

@@ -24,39 +24,40 @@ from .session import FmiAsset
 MOST_INSTANCES = 8
 """Instances (step sizes) that are open at the same time."""
 CACHE_BYTES = 256 * 2**20
-"""Results that are remembered."""
+"""Largest memory of the results that are kept [bytes]."""
 SETTLE_CHUNK = 200
-"""Steps between two looks whether the motion has come to rest."""
+"""Number of steps after which it is checked whether the motion has come to rest."""
 NO_OFFSETS: Mapping[str, float] = MappingProxyType({})
 
 
 class OperatingPoint(NamedTuple):
-    """Parameters and constant inputs of a run; pairs of the binding's name and a value, sorted."""
+    """Parameters and constant inputs of a run, as sorted pairs of a binding's name and a value."""
 
     parameters: tuple[tuple[str, float], ...] = ()
     inputs: tuple[tuple[str, float], ...] = ()
 
     def with_parameters(self, values: Mapping[str, float]) -> "OperatingPoint":
-        """Return the point with other values of some parameters."""
+        """Return the operating point with changed values of some parameters."""
         parameters = {**dict(self.parameters), **values}
         return self._replace(parameters=tuple(sorted(parameters.items())))
 
 
 class FmuRun(NamedTuple):
-    """A motion that an FMU is asked for.
+    """A simulation that is wanted from an FMU.
 
     Attributes
     ----------
     operating_point : OperatingPoint
-        Parameters and constant inputs.
+        The parameters and the constant inputs.
     step : float
-        Communication step [s].
+        The communication step [s].
     steps : int
-        Number of steps.
+        The number of steps.
     initial_offsets : mapping of str to float
-        Additions to inputs before the run; under these the FMU is at rest at its start.
+        Values that are added to the constant inputs before the run. The run starts from the state
+        of rest under these inputs.
     offsets : mapping of str to (steps,) array
-        Additions to inputs in each step of the run.
+        Values that are added to the constant inputs in each step of the run.
     """
 
     operating_point: OperatingPoint
@@ -67,20 +68,21 @@ class FmuRun(NamedTuple):
 
 
 class FmuRuns:
-    """An FMU that is run again and again.
+    """An FMU that is simulated many times; its instances and results are kept.
 
     Parameters
     ----------
     path : Path
         The FMU file.
     binding : Binding
-        Its variables; the inputs that are set are its loads, zero unless a run gives a value.
+        Its variables. The inputs of a run are the loads of the binding; they are zero unless the
+        run gives a value.
     isolated : bool
         Whether instances run in processes of their own.
     limit : float
-        Longest motion until rest [s].
+        The longest motion until rest [s].
     tolerance : float
-        Largest movement of an output that counts as rest, as a share of its largest value.
+        The largest change of an output that counts as rest, as a fraction of its largest value.
     """
 
     def __init__(
@@ -95,12 +97,15 @@ class FmuRuns:
         self._results = ResultCache(CACHE_BYTES, attrgetter("nbytes"))
 
     def refusal_context(self) -> AbstractContextManager[None]:
-        """Return a context for calls of the FMU; a subclass adds to what the FMU's errors say."""
+        """Return a context for calls of the FMU.
+
+        A subclass can add an explanation to the FMU's errors in it.
+        """
         return nullcontext()
 
     @cached_property
     def asset(self) -> FmiAsset:
-        """The FMU with its binding, for what it declares.
+        """The FMU with its binding; it is not run, but asked what it declares.
 
         Raises
         ------
@@ -110,11 +115,20 @@ class FmuRuns:
         return FmiAsset(self._path, self._binding, isolated=self._isolated)
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave out the asset when this is sent to another process, which opens its own."""
+        """Return the state for another process, without the asset, which it opens anew."""
         return {name: value for name, value in vars(self).items() if name != "asset"}
 
     def cached(self, key: Hashable, compute: Callable[[], FloatArray]) -> FloatArray:
-        """Return the result of `compute` for a key, computed once; old results are dropped."""
+        """Return the result for a key, computed at the first call.
+
+        Parameters
+        ----------
+        key : hashable
+            The key of the result.
+        compute : callable
+            Computes the result. If the results need too much memory, old ones are dropped, and are
+            then computed again.
+        """
         result = self._results.get(key, compute)
         result.setflags(write=False)
         return result
@@ -124,12 +138,15 @@ class FmuRuns:
         self._assets.clear()
 
     def probing_amplitude(self, name: str) -> float:
-        """Return an amplitude that an input can have with both signs, for tests of linearity."""
+        """Return an amplitude by which tests of linearity can vary an input in both directions.
+
+        It is 1 in the binding's unit, or a tenth of the smaller limit of the range.
+        """
         low, high = self.asset.input_range("load", name)
         return min(1.0, 0.1 * abs(low), 0.1 * abs(high))
 
     def start_run(self, run: FmuRun) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
-        """Return an instance at the start of a run, its outputs there, and the inputs of each step.
+        """Return an instance at the start of a run, with its outputs and the inputs of all steps.
 
         Parameters
         ----------
@@ -139,19 +156,19 @@ class FmuRuns:
         Returns
         -------
         asset : FmiAsset
-            The instance, at its start or, with initial offsets, at rest under them.
+            The instance at its start; if there are initial offsets, at rest under them.
         outputs : (C,) ndarray
             Its outputs.
         inputs : dict of str to (steps,) ndarray
-            Value of every input in each step.
+            The value of every input in each step.
 
         Raises
         ------
         FmuError
             If the FMU refuses, or does not come to rest.
         """
-        constant = self._constant_inputs(run.operating_point, NO_OFFSETS)
-        inputs = {name: value + np.zeros(run.steps) for name, value in constant.items()}
+        constant_inputs = self._constant_inputs(run.operating_point, NO_OFFSETS)
+        inputs = {name: value + np.zeros(run.steps) for name, value in constant_inputs.items()}
         for name, offsets in run.offsets.items():
             inputs[name] = inputs[name] + offsets
         with self.refusal_context():
@@ -163,17 +180,17 @@ class FmuRuns:
         return asset, outputs, inputs
 
     def outputs_of_run(self, run: FmuRun) -> FloatArray:
-        """Return the outputs (steps + 1, C) of a run, the first at its start.
+        """Return the outputs (steps + 1, C) of a run, from its start on.
 
         Raises
         ------
         FmuError
             If the FMU refuses, or does not come to rest.
         """
-        asset, first, inputs = self.start_run(run)
+        asset, initial_outputs, inputs = self.start_run(run)
         with self.refusal_context():
             history = asset.simulate(load=inputs, steps=run.steps)
-            return np.vstack((first, history.values))
+            return np.vstack((initial_outputs, history.values))
 
     def outputs_at_rest(
         self,
@@ -203,8 +220,10 @@ class FmuRuns:
             If the FMU refuses, or does not come to rest.
         """
         offsets_by_point = []
-        for row in range(len(points)):
-            offsets_by_point.append({name: float(values[row]) for name, values in offsets.items()})
+        for point_number in range(len(points)):
+            offsets_by_point.append(
+                {name: float(values[point_number]) for name, values in offsets.items()}
+            )
         with self.refusal_context():
             if settle:
                 outputs = []
@@ -212,17 +231,22 @@ class FmuRuns:
                     asset = self._reset_instance(point, step, point_offsets)
                     outputs.append(self._outputs_after_settling(asset))
                 return np.array(outputs)
-            rows = []
+            # A quasi-static FMU has no memory: one run with a step for each point gives all
+            # equilibria.
+            inputs_of_points = []
             for point, point_offsets in zip(points, offsets_by_point, strict=True):
-                rows.append(self._constant_inputs(point, point_offsets))
-            inputs = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+                inputs_of_points.append(self._constant_inputs(point, point_offsets))
+            inputs = {
+                name: np.array([point_number[name] for point_number in inputs_of_points])
+                for name in inputs_of_points[0]
+            }
             asset = self._reset_instance(points[0], step, offsets_by_point[0])
-            return asset.simulate(load=inputs, steps=len(rows)).values
+            return asset.simulate(load=inputs, steps=len(inputs_of_points)).values
 
     def _constant_inputs(
         self, point: OperatingPoint, offsets: Mapping[str, float]
     ) -> dict[str, float]:
-        """Return the value of every input at an operating point, offsets added."""
+        """Return the value of every input at an operating point, with offsets added."""
         inputs = {**dict.fromkeys(self._binding.load, 0.0), **dict(point.inputs)}
         for name, offset in offsets.items():
             inputs[name] = inputs[name] + offset
@@ -241,15 +265,24 @@ class FmuRuns:
         return asset
 
     def _outputs_after_settling(self, asset: FmiAsset) -> FloatArray:
-        """Return the outputs (C,) of an instance when it has come to rest under its inputs."""
+        """Return the outputs (C,) of an instance at rest under its present inputs.
+
+        The instance is simulated until every output stays within the tolerance over `SETTLE_CHUNK`
+        steps.
+
+        Raises
+        ------
+        FmuOutputError
+            If this takes longer than the limit.
+        """
         duration = 0.0
         largest: FloatArray | float = 0.0
         while True:
-            chunk = asset.simulate(steps=SETTLE_CHUNK).values
+            recent_outputs = asset.simulate(steps=SETTLE_CHUNK).values
             duration += SETTLE_CHUNK * asset.binding.step_size
-            high = chunk.max(axis=0)
-            low = chunk.min(axis=0)
-            largest = np.maximum(largest, np.abs(chunk).max(axis=0))
+            high = recent_outputs.max(axis=0)
+            low = recent_outputs.min(axis=0)
+            largest = np.maximum(largest, np.abs(recent_outputs).max(axis=0))
             if np.all(high - low <= self._tolerance * largest):
                 return np.asarray(0.5 * (high + low))
             if duration >= self._limit:

@@ -44,12 +44,13 @@ class InputSlot(NamedTuple):
         return self.variable.kind not in FLOAT_KINDS
 
     def numbers(self, values: npt.ArrayLike, *, history: bool = False) -> Float:
-        """Return values in the FMU's unit, all of them checked.
+        """Return values in the FMU's unit, after checking all of them.
 
         Parameters
         ----------
         values : float, str or array_like
-            As many values as the slot takes; for a history either these for all steps, or for each.
+            The n values of the input in the binding's unit. For a history, either these for all
+            steps, or N times as many, one set for each step.
         history : bool
             Whether it is a history.
 
@@ -68,20 +69,22 @@ class InputSlot(NamedTuple):
         varies = self._varies(array) if history else False
         if not history:
             self._check_count(array, values)
-        rows = array.reshape(-1, len(self.positions))
+        rows_of_steps = array.reshape(-1, len(self.positions))
         with np.errstate(all="ignore"):
-            converted = self._converted(rows)
+            converted = self._converted(rows_of_steps)
             clipped = np.clip(converted, self.low, self.high)
             refused = np.argwhere(~self._acceptable(converted, clipped))
         if len(refused):
             # name the first value that is refused, as the caller gave it
             step, element = refused[0].tolist()
-            value = values if isinstance(values, int | float) else rows[step, element].item()
+            value = (
+                values if isinstance(values, int | float) else rows_of_steps[step, element].item()
+            )
             sentence = self._refusal(value, converted[step, element])
             if varies:
-                sentence += f" It is the value of step {step} of the {len(rows)}."
+                sentence += f" It is the value of step {step} of the {len(rows_of_steps)}."
             raise FmuInputError(sentence)
-        # values that a conversion has rounded out of the range are set to its limit
+        # a value that the conversion of units has rounded out of the range is set to its limit
         is_inside = (self.low <= converted) & (converted <= self.high)
         checked = np.where(is_inside, converted, clipped)
         return checked if varies else checked[0]
@@ -103,6 +106,7 @@ class InputSlot(NamedTuple):
         return values
 
     def _number_of_item(self, name: str) -> float:
+        """Return the number of an enumeration's item; refuse an unknown name."""
         if name not in self.variable.items:
             raise FmuInputError(
                 f"{self.label} must be an item of the enumeration {self.variable.name!r} "
@@ -111,6 +115,7 @@ class InputSlot(NamedTuple):
         return float(self.variable.items[name])
 
     def _float_array(self, values: npt.ArrayLike, *, history: bool) -> Float:
+        """Return values as an array of floats; refuse what is no number."""
         try:
             return np.asarray(values, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -118,7 +123,10 @@ class InputSlot(NamedTuple):
             raise FmuInputError(f"{self.label} must be {wanted}, but is {values!r}.") from error
 
     def _varies(self, history: Float) -> bool:
-        """Return whether a history has values for each step; refuse one of another shape."""
+        """Return whether a history (N, n), or (N,) for one value, has values for each step.
+
+        A history of another shape is refused.
+        """
         count = len(self.positions)
         shape_of_one_step = () if count == 1 else (count,)
         if history.shape == shape_of_one_step:
@@ -131,6 +139,7 @@ class InputSlot(NamedTuple):
         return True
 
     def _check_count(self, array: Float, values: npt.ArrayLike) -> None:
+        """Refuse an array of another number of values than the input has."""
         count = len(self.positions)
         if array.size == count:
             return
@@ -141,21 +150,24 @@ class InputSlot(NamedTuple):
     # ------------------------------------------------------------------ checking
 
     def _converted(self, rows: Float) -> Float:
-        """Return values in the FMU's unit, with the arithmetic, and the bits, of `to_fmu`."""
+        """Return values in the FMU's unit.
+
+        The operations are those of `Conversion.to_fmu`, so that the results are equal bit by bit.
+        """
         if self.conversion == IDENTITY:
             return rows
         return self.conversion.factor * rows + self.conversion.offset
 
     def _acceptable(self, values: Float, clipped: Float) -> npt.NDArray[np.bool_]:
-        """Return which values may be sent.
+        """Return which values (N, n) may be sent to the FMU.
 
         Parameters
         ----------
         values : (N, n) ndarray
-            Values in the FMU's unit.
+            The values in the FMU's unit.
         clipped : (N, n) ndarray
-            The same, limited to the range. A conversion of units may round a value at the edge of
-            the range to just outside of it; that is accepted.
+            The same values, limited to the range. A value that differs from these by no more than
+            the rounding error of a conversion of units is accepted.
         """
         is_near_range = np.abs(clipped - values) <= 1e-12 * np.maximum(np.abs(clipped), 1.0)
         acceptable = np.isfinite(values) & is_near_range
@@ -166,7 +178,15 @@ class InputSlot(NamedTuple):
         return acceptable
 
     def _refusal(self, value: float, number: float) -> str:
-        """Return the sentence that refuses a value, which is `number` in the FMU's unit."""
+        """Return the sentence that refuses a value.
+
+        Parameters
+        ----------
+        value : float
+            The value as the caller gave it.
+        number : float
+            The value in the FMU's unit.
+        """
         if not math.isfinite(number):
             return f"{self.label} must be finite, but is {value!r}; nothing was sent to the FMU."
         if self.takes_whole_numbers and not float(number).is_integer():

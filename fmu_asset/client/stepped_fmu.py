@@ -58,10 +58,11 @@ class SteppedFmu(OpenedFmu):
             inputs = self._restart_if_health_changes(inputs)
         instance = self._opened_instance(inputs)
         request = self._request
-        request_before = request.tobytes()
+        previous_request = request.tobytes()
         begin = self._start_time + self.step_index * self._interval
         if self._linear_count:
-            # lines begin where the last ones ended
+            # Linear inputs begin at their values at the end of the last step. The block holds their
+            # values at the end of the step first, and those at its begin last.
             request[-self._linear_count :] = request[2 : 2 + self._linear_count]
         try:
             self._exchange.request.place(request, inputs)
@@ -71,7 +72,7 @@ class SteppedFmu(OpenedFmu):
             if not self.step_index:
                 self._repeat_first_step_if_contradicted()
         except FmuError as error:
-            self._request.cast("B")[:] = request_before
+            self._request.cast("B")[:] = previous_request
             self._raise_located(error, f"step {self.step_index} from t = {begin:g} s")
         self.step_index += 1
         if self.state_method == "replay":
@@ -79,12 +80,15 @@ class SteppedFmu(OpenedFmu):
         return self._observation()
 
     def _repeat_first_step_if_contradicted(self) -> None:
-        """Repeat the first step in other instances until one has begun at its start."""
+        """Repeat the first step in a new instance, if it shows that the reset has not worked.
+
+        The host replaces the instance until it has one that was properly at its start.
+        """
         while True:
-            other = self._replaced_instance(self._request.tobytes(), self._reply)
-            if other is None:
+            replacement = self._replaced_instance(self._request.tobytes(), self._reply)
+            if replacement is None:
                 return
-            other.step()
+            replacement.step()
 
     def hold(
         self,
@@ -93,10 +97,10 @@ class SteppedFmu(OpenedFmu):
         load: Values | None = None,
         port: Values | None = None,
     ) -> None:
-        """Set inputs from this moment on, without a step.
+        """Set inputs now, without a step.
 
-        A step that does not name them keeps them. Under linear interpolation the lines of the next
-        step begin there, so that an input can jump.
+        Later steps keep them unless they give other values. Under linear interpolation the next
+        step begins at these values, so this is how an input can jump.
 
         Parameters
         ----------
@@ -112,11 +116,11 @@ class SteppedFmu(OpenedFmu):
         if self._exchange.health_slots:
             inputs = self._restart_if_health_changes(inputs)
         self._opened_instance(inputs)
-        request_before = self._request.tobytes()
+        previous_request = self._request.tobytes()
         try:
             self._exchange.request.place(self._request, inputs)
         except FmuError:
-            self._request.cast("B")[:] = request_before
+            self._request.cast("B")[:] = previous_request
             raise
 
     # ------------------------------------------------------------------ many steps
@@ -170,15 +174,15 @@ class SteppedFmu(OpenedFmu):
     def _simulate_with_restarts(
         self, histories: InputsByRole, steps: int | None, progress: Progress | None
     ) -> ObservationHistory:
-        """Make many steps, with a new start wherever health changes; see `simulate`."""
-        parts = []
+        """Make many steps, with a new start whenever the health changes; see `simulate`."""
+        histories_of_runs = []
         for run in split_where_health_changes(self._exchange, histories, steps):
             self._restart_if_health_changes(run.first_inputs)
-            part = self._simulate(run.histories, run.steps, progress)
-            parts.append(part)
-            if part.ended:
+            history = self._simulate(run.histories, run.steps, progress)
+            histories_of_runs.append(history)
+            if history.ended:
                 break
-        return joined_histories(parts)
+        return joined_histories(histories_of_runs)
 
     def _simulate(
         self, histories: InputsByRole, steps: int | None, progress: Progress | None
@@ -198,33 +202,47 @@ class SteppedFmu(OpenedFmu):
         ended = self._run_in_blocks(requests, replies, progress)
         if ended is None:
             return self._exchange.outputs.history(times[1:], replies)
-        made = self.step_index - first_index
-        if ended.time is not None and ended.time > times[made]:
-            # the FMU has made a part of the next step, or all of it
-            made += 1
-            times[made] = ended.time
-            replies[made - 1] = np.frombuffer(self._present_outputs())
-        return self._exchange.outputs.history(times[1 : made + 1], replies[:made], ended.sentence)
+        steps_made = self.step_index - first_index
+        if ended.time is not None and ended.time > times[steps_made]:
+            # The FMU ended within the next step: its last outputs, at the time at which it ended,
+            # are added.
+            steps_made += 1
+            times[steps_made] = ended.time
+            replies[steps_made - 1] = np.frombuffer(self._present_outputs())
+        return self._exchange.outputs.history(
+            times[1 : steps_made + 1], replies[:steps_made], ended.sentence
+        )
 
     def _set_begins_of_lines(self, requests: Float) -> None:
-        """Let the lines of each step begin where those of the step before end."""
-        moving = slice(2, 2 + self._linear_count)
-        requests[0, -self._linear_count :] = np.array(self._request[moving])
-        requests[1:, -self._linear_count :] = requests[:-1, moving]
-
-    def _run_in_blocks(
-        self, requests: Float, replies: Float, progress: Progress | None
-    ) -> FmuEndedError | None:
-        """Make steps in blocks of limited size; return how the FMU ended its simulation, if it did.
+        """Let the linear inputs of each step begin at their values at the end of the step before.
 
         Parameters
         ----------
         requests : (N, 2 + n_inputs) ndarray
-            Request block of each step.
+            The request block of each step; changed in place.
+        """
+        end_values = slice(2, 2 + self._linear_count)
+        requests[0, -self._linear_count :] = np.array(self._request[end_values])
+        requests[1:, -self._linear_count :] = requests[:-1, end_values]
+
+    def _run_in_blocks(
+        self, requests: Float, replies: Float, progress: Progress | None
+    ) -> FmuEndedError | None:
+        """Make many steps, in blocks that limit the memory of a call to the worker.
+
+        Parameters
+        ----------
+        requests : (N, 2 + n_inputs) ndarray
+            The request block of each step.
         replies : (N, n_outputs) ndarray
             Filled with the reply block of each step.
         progress : Progress, optional
             Where progress is shown.
+
+        Returns
+        -------
+        FmuEndedError or None
+            How the FMU ended its simulation, if it did.
         """
         length = max(1, _BLOCK_BYTES // max(requests[0].nbytes, replies[0].nbytes))
         total = len(requests)
@@ -239,38 +257,38 @@ class SteppedFmu(OpenedFmu):
     def _run_block(self, requests: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
         """Make a block of steps; return how the FMU ended its simulation, if it did.
 
-        Whatever happens, the asset is where the last complete step has left it.
+        If a step fails, the asset is left in the state after the last complete step.
         """
-        request_before = np.array(self._request)
+        previous_request = np.array(self._request)
         first_index = self.step_index
         counter = _StepCounter(stage)
         failure: FmuError | None = None
         try:
             failure = self._run_and_check_start(requests, replies, counter)
         finally:
-            made = counter.made
-            self.step_index += made
-            last_request = requests[made - 1] if made else request_before
+            steps_made = counter.made
+            self.step_index += steps_made
+            last_request = requests[steps_made - 1] if steps_made else previous_request
             self._request[:] = last_request.data
             if self.state_method == "replay":
-                self._record += [row[2:].tobytes() for row in requests[:made]]
+                self._record += [row[2:].tobytes() for row in requests[:steps_made]]
         if isinstance(failure, FmuEndedError):
             return failure
         if failure is not None:
             self._raise_located(failure, f"step {self.step_index} from t = {self.time:g} s")
-        self._reply[:] = replies[made - 1]
-        self._refuse_not_finite(f" It was step {first_index + made - 1}.")
+        self._reply[:] = replies[steps_made - 1]
+        self._refuse_not_finite(f" It was step {first_index + steps_made - 1}.")
         return None
 
     def _run_and_check_start(
         self, requests: Float, replies: Float, counter: "_StepCounter"
     ) -> FmuError | None:
-        """Make a block of steps, again in other instances if the first step contradicts the start.
+        """Make a block of steps; repeat it in a new instance if a reset proves not to have worked.
 
         Parameters
         ----------
         requests : (N, 2 + n_inputs) ndarray
-            Request block of each step.
+            The request block of each step.
         replies : (N, n_outputs) ndarray
             Filled with the reply block of each step.
         counter : _StepCounter
@@ -279,7 +297,7 @@ class SteppedFmu(OpenedFmu):
         Returns
         -------
         FmuError or None
-            Error of the step at which the FMU failed, if one did.
+            The error of the step at which the FMU failed, if one did.
         """
         instance = self._opened_instance()
         is_first_block = self.step_index == 0
@@ -291,10 +309,10 @@ class SteppedFmu(OpenedFmu):
                 failure = error
             if not is_first_block or not counter.made:
                 return failure
-            other = self._replaced_instance(requests[0].tobytes(), replies[0])
-            if other is None:
+            replacement = self._replaced_instance(requests[0].tobytes(), replies[0])
+            if replacement is None:
                 return failure
-            instance = other
+            instance = replacement
             counter.report(0)
 
     def observe(self) -> Observation:
@@ -313,7 +331,7 @@ class SteppedFmu(OpenedFmu):
         return self._observation()
 
     def _present_outputs(self) -> bytes:
-        """Return the outputs of this moment as doubles, as the FMU gives them."""
+        """Return the present outputs of the FMU as the bytes of doubles."""
         self._instance.read()
         return self._reply.tobytes()
 
@@ -337,6 +355,6 @@ class _StepCounter:
         self.made = 0
 
     def report(self, made: int) -> None:
-        """Take the number of steps made."""
+        """Set the number of steps made so far, and show the progress since the last call."""
         self._stage.advance(made - self.made)
         self.made = made

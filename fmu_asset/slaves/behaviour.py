@@ -34,15 +34,16 @@ They are the bound of the strains, the load point or else the bound of the displ
 modes.
 """
 _NONE_LENGTH = -1.0
-"""Length that stands for a part of a saved state that is None."""
+"""Length that marks a part of a saved state as None."""
 
 
 class StructureBehaviour:
-    """The behaviour of a structure: a call either completes or raises and changes nothing.
+    """The behaviour of a structure: each call completes, or raises and changes nothing.
 
-    Outputs are gauges, displacements and accelerations. While effects of structure or loads are on,
-    and in every motion of a structure that can have them, the wing for patches is at rest and
-    moves, instead of the reduced model itself.
+    The outputs are gauges, displacements and accelerations. There are two models of the structure.
+    The reduced model gives the response as long as no effect changes structure or loads. Otherwise,
+    and in every motion of a structure that can have such effects, the patched wing gives it (see
+    `SwitchableEffects.wing`).
 
     Parameters
     ----------
@@ -68,14 +69,14 @@ class StructureBehaviour:
         self._effects = effects
         self._inputs = [row.name for row in table if row.causality == "input"]
         self._accelerations_at_rest = [0.0] * len(model.accelerations)
-        # of the values of the model, those of controls come last and do not change the modes
+        # the values of the controls come last in the model, and do not change its modes
         self._structural_count = len(model.input_names) - len(model.controls)
         # set before the initialisation and between steps
         self._parameters: Mapping[str, float] = {}
         self._is_transient = False
         self._tuned: Mapping[str, float] = {}
         self._tuned_start_time = 0.0
-        # the present state; without an integrator, the model itself is at rest
+        # the present state; if there is no integrator, the reduced model is at rest
         self._begin_time = 0.0
         self._active: ActiveEffects | None = None
         self._vector: FloatArray | None = None
@@ -86,14 +87,14 @@ class StructureBehaviour:
         self._readings: list[float] = []
 
     def tune(self, values: Mapping[str, float], start_time: float) -> None:
-        """Take the variables of the effects.
+        """Set the variables of the effects, which take effect at the next start or step.
 
         Parameters
         ----------
         values : mapping of str to float
-            Their values by name.
+            The values by name.
         start_time : float
-            Time at the start of the simulation [s].
+            The time at the start of the simulation [s].
         """
         self._tuned = values
         self._tuned_start_time = start_time
@@ -120,12 +121,12 @@ class StructureBehaviour:
         return self._completely(time, 0.0, inputs, parameters)
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Return the outputs after one step, with inputs and effects held.
+        """Return the outputs after one step, over which inputs and effects are constant.
 
         Parameters
         ----------
         time, duration : float
-            Begin and duration of the step [s].
+            The begin and the duration of the step [s].
         inputs : sequence of float
             Inputs in the order of the table.
 
@@ -139,7 +140,7 @@ class StructureBehaviour:
         return self._completely(time, duration, inputs)
 
     def later(self, group: int) -> list[float]:
-        """Return the outputs of a group.
+        """Return the outputs of a group that is computed only when it is read.
 
         Parameters
         ----------
@@ -151,7 +152,7 @@ class StructureBehaviour:
         if group == MODES:
             return self._modes(self._vector)
         if group == POINT_OR_BOUND and self._roles.load_point is not None:
-            # as sensors read it, where they are on
+            # if effects of sensors are on, the load point is the last channel that they read
             return [self._readings[-1] if self._readings else self._point_displacement()]
         static = self._static_response(self._vector)
         if group == BOUND:
@@ -159,7 +160,7 @@ class StructureBehaviour:
         return [static.displacement_error_bound]
 
     def _modes(self, vector: FloatArray) -> list[float]:
-        """Return frequencies [Hz] and damping ratios of the modes in the table."""
+        """Return the frequencies [Hz] and then the damping ratios [1] of the tabulated modes."""
         integrator = self._integrator
         modes = self._model.modes(vector) if integrator is None else integrator.modes
         frequency = modes.frequency[:MODE_COUNT]
@@ -174,7 +175,10 @@ class StructureBehaviour:
         return self._static
 
     def _point_displacement(self) -> float:
-        """Return the displacement of the point whose load holds the structure aside [m]."""
+        """Return the displacement of the load point [m].
+
+        That is the point at which a load holds the structure before a release.
+        """
         if self._integrator is not None and self._state is not None:
             load = self._holding_load(self._integrator)
             return self._integrator.point_displacement(self._state, load)
@@ -185,9 +189,9 @@ class StructureBehaviour:
     # ------------------------------------------------------------ saved states
 
     def state(self) -> list[float]:
-        """Return everything that is remembered, without the parameters.
+        """Return everything that is needed to continue, except the parameters.
 
-        The numbers are the number of parts, then the length and the numbers of each part.
+        The first number is that of the parts; then each part follows as its length and its numbers.
         """
         motion: list[Sequence[float] | FloatArray] = []
         if self._state is not None:
@@ -211,14 +215,14 @@ class StructureBehaviour:
         return numbers
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
-        """Go back to what `state` returned.
+        """Restore a state that `state` has returned.
 
         Parameters
         ----------
         parameters : mapping of str to float
-            Parameters of that moment by name.
+            The parameters at the time of that state, by name.
         state : sequence of float
-            What `state` returned.
+            The state.
 
         Raises
         ------
@@ -248,6 +252,7 @@ class StructureBehaviour:
     # ------------------------------------------------------------ steps
 
     def _take_parameters(self, parameters: Mapping[str, float]) -> None:
+        """Set the parameters, and what follows from them."""
         self._parameters = dict(parameters)
         self._damping = (parameters["damping.alpha"], parameters["damping.beta"])
         self._is_transient = int(parameters["response"]) == TRANSIENT
@@ -259,18 +264,18 @@ class StructureBehaviour:
         inputs: Sequence[float],
         start_parameters: Mapping[str, float] | None = None,
     ) -> list[float]:
-        """Return the outputs after a start or a step; after an error everything is as it was.
+        """Return the outputs after a start or a step; restore the previous state after an error.
 
         Parameters
         ----------
         time, duration : float
-            Begin and duration of the step [s].
+            The begin and the duration of the step [s].
         inputs : sequence of float
             Inputs in the order of the table.
         start_parameters : mapping of str to float, optional
-            Parameters of a start; None for a step.
+            The parameters of a start; None for a step.
         """
-        attributes_before = dict(self.__dict__)
+        previous_attributes = dict(self.__dict__)
         try:
             if start_parameters is not None:
                 self._take_parameters(start_parameters)
@@ -281,14 +286,17 @@ class StructureBehaviour:
                 self._filters = None
             return self._outputs_after(time, duration, inputs)
         except Exception as error:
-            self.__dict__.update(attributes_before)
+            self.__dict__.update(previous_attributes)
             if not isinstance(error, FiniteElementError):
                 raise
             sentence = str(error).removesuffix(".")
             raise UnacceptableValuesError(f"{sentence}.") from error
 
     def _outputs_after(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
-        """Begin, where there is no state yet, or advance; return the outputs."""
+        """Return the outputs after a step, or those at the start if there is no state yet.
+
+        Arguments are those of `advance`.
+        """
         has_changed = self._effects is not None and self._take_effects(self._effects)
         values = {**self._parameters, **dict(zip(self._inputs, inputs, strict=True))}
         vector = np.array([values[name] for name in self._roles.chosen])
@@ -317,20 +325,20 @@ class StructureBehaviour:
     def _next_motion(
         self, vector: FloatArray, time: float, duration: float, *, has_changed: bool
     ) -> tuple[ModalIntegrator, TransientState]:
-        """Return the integrator and the state after a start or a step.
+        """Return the integrator and the state of the motion after a start or a step.
 
         Parameters
         ----------
         vector : (V,) ndarray
-            Values of the model.
+            The values of the model.
         time, duration : float
-            Begin and duration of the step [s].
+            The begin and the duration of the step [s].
         has_changed : bool
             Whether the effects have changed.
         """
         integrator = self._integrator
         state = self._state
-        # another integrator where the structure has changed
+        # If the structure has changed, make a new integrator and express the state in its modes.
         if integrator is None or has_changed or self._structure_differs(vector):
             integrator = self._make_integrator(vector)
             if self._integrator is not None and state is not None:
@@ -339,8 +347,8 @@ class StructureBehaviour:
         if not self._is_transient:
             return integrator, integrator.equilibrium(load, state)
         if state is not None:
-            since_begin = time - self._begin_time
-            return integrator, integrator.advance(state, duration, load, since_begin)
+            time_since_start = time - self._begin_time
+            return integrator, integrator.advance(state, duration, load, time_since_start)
         if self._roles.release is None:
             return integrator, integrator.state_at_rest(load)
         release = self._parameters[self._roles.release]
@@ -348,19 +356,19 @@ class StructureBehaviour:
         return integrator, integrator.state_after_release(release, load, holding_load)
 
     def _structure_differs(self, vector: FloatArray) -> bool:
-        """Return whether values that change the modes differ from the last ones, to the bit."""
+        """Return whether a value that changes the modes differs from that of the last step."""
         if self._vector is None:
             return True
         count = self._structural_count
         return vector[:count].tobytes() != self._vector[:count].tobytes()
 
     def _holding_load(self, integrator: ModalIntegrator) -> int:
-        """Return the number of the load that holds the structure aside before a release."""
+        """Return the number of the load that holds the displaced structure before a release."""
         holding = integrator.structure.holding_load
         return self._roles.point_load if holding is None else holding
 
     def _make_integrator(self, vector: FloatArray) -> ModalIntegrator:
-        """Return the structure in time; a wing with effects in its basis for patches."""
+        """Return the time integrator of the structure, or of the patched wing if there is one."""
         if self._effects is None or self._effects.wing is None:
             alpha, beta = self._damping
             return ModalIntegrator(self._model.structure_at(vector), alpha, beta)
@@ -370,12 +378,13 @@ class StructureBehaviour:
     # ------------------------------------------------------------ effects
 
     def _take_effects(self, effects: SwitchableEffects) -> bool:
-        """Take the effects as they are tuned; return whether they changed."""
+        """Apply the variables of the effects; return whether the effects have changed."""
         values = effects.values(self._tuned)
         previous = self._active
         if previous is not None and previous.values == values:
             return False
         self._active = effects.active(values)
+        # Other filters cannot continue with the memory of these.
         if previous is None or previous.filters != self._active.filters:
             self._filters = None
         return True
@@ -383,16 +392,16 @@ class StructureBehaviour:
     def _read_by_sensors(
         self, active: ActiveEffects, outputs: list[float], duration: float, end: float
     ) -> list[float]:
-        """Return outputs as sensors read them, and keep the memory of the sensors' filters.
+        """Return the outputs as sensors with effects read them; keep their filters' memory.
 
         Parameters
         ----------
         active : ActiveEffects
             The effects.
         outputs : list of float
-            Outputs of the structure.
+            The true outputs of the structure.
         duration, end : float
-            Duration and end of the step [s].
+            The duration and the end of the step [s].
         """
         assert self._effects is not None
         if not len(active.patch):
@@ -416,19 +425,30 @@ class StructureBehaviour:
         )
         self._filters = readings.filter_memory
         self._readings = readings.values
+        # The displacement of the load point is the last channel; it is not among these outputs.
         return self._readings[:-1]
 
     def _strains_across(self, active: ActiveEffects, channels: int) -> FloatArray | None:
-        """Return the strains across the gauges and in shear (2, channels), zero for other channels.
+        """Return the strains transverse to the gauges, and the shear strains there.
 
-        None if no sensor needs them.
+        Parameters
+        ----------
+        active : ActiveEffects
+            The effects.
+        channels : int
+            The number of channels C; the first are the gauges.
+
+        Returns
+        -------
+        (2, C) array or None
+            Zero for channels that are no gauges; None if no sensor needs them.
         """
         if self._integrator is None or self._state is None or not active.changes_structure:
             return None
         displacement = self._integrator.displacement(self._state)
         strains = self._integrator.structure.strain_component_rows @ displacement
-        missing = channels - strains.shape[1]
-        return np.pad(strains, ((0, 0), (0, missing)))
+        other_channels = channels - strains.shape[1]
+        return np.pad(strains, ((0, 0), (0, other_channels)))
 
 
 def _parts_of_state(state: Sequence[float]) -> list[list[float] | None]:

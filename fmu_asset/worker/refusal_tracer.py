@@ -81,16 +81,18 @@ class RefusalTracer:
         self._buffer = ctypes.create_string_buffer(_CALL_HEAD.size + 8 * 8)
 
     def begin(self, worker: int) -> None:
-        """Trace a process from now on; if the system does not allow it, the report says so.
+        """Trace a process from now on. If the system does not allow it, the report says so.
 
         Parameters
         ----------
         worker : int
-            Number of the process.
+            The number of the process.
         """
         try:
             if not self._calls:
                 raise OSError(0, f"the system calls of {os.uname().machine} are not known")
+            # SEIZE attaches without a stop; INTERRUPT stops the worker, and `resume` then lets it
+            # run from system call to system call.
             self._ptrace(_SEIZE, worker, 0, _OPTIONS)
             self._ptrace(_INTERRUPT, worker)
         except OSError as error:
@@ -99,41 +101,47 @@ class RefusalTracer:
         self._save()
 
     def resume(self, thread: int, status: int) -> None:
-        """Resume a thread that has stopped, after a look at the system call that it has made.
+        """Resume a thread that has stopped, after looking at the system call it stopped at.
 
         Parameters
         ----------
         thread, status : int
-            Number and status of the thread from waitpid(2).
+            The number and the status of the thread from waitpid(2).
         """
         stop_signal = os.WSTOPSIG(status)
         event = status >> 16
-        delivered = 0
+        signal_to_deliver = 0
         request = _CONTINUE_TO_CALL
+        # ptrace(2): a thread stops for a system call, for a stop of its whole group (it must then
+        # stay stopped: LISTEN), for another event, or for a signal, which it has to get.
         if stop_signal == _CALL_STOP:
             self._look_at_call(thread)
         elif event == _STOP_EVENT and stop_signal in _HALTING:
             request = _LISTEN
         elif not event:
-            delivered = stop_signal
+            signal_to_deliver = stop_signal
         # it may have been killed meanwhile
         with suppress(OSError):
-            self._ptrace(request, thread, 0, delivered)
+            self._ptrace(request, thread, 0, signal_to_deliver)
 
     def _ptrace(self, request: int, thread: int, address: int = 0, data: int = 0) -> None:
+        """Make a request of ptrace(2); raise an `OSError` if it fails."""
         if self._libc.ptrace(request, thread, address, data) < 0:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
 
     def _look_at_call(self, thread: int) -> None:
-        """Remember a call that begins; count one that ends with a refusal."""
+        """Remember the system call that a thread enters; count it if it returns as refused.
+
+        Arguments are known only at the entry, and the result only at the exit.
+        """
         try:
             self._ptrace(_GET_CALL, thread, len(self._buffer), ctypes.addressof(self._buffer))
         except OSError:
             return
-        stage, *_ = _CALL_HEAD.unpack_from(self._buffer)
-        if stage == _AT_ENTRY:
+        stop_kind, *_ = _CALL_HEAD.unpack_from(self._buffer)
+        if stop_kind == _AT_ENTRY:
             self._pending[thread] = _CALL_ENTRY.unpack_from(self._buffer, _CALL_HEAD.size)
-        elif stage == _AT_EXIT:
+        elif stop_kind == _AT_EXIT:
             number, *arguments = self._pending.pop(thread, (0,))
             result, has_failed = _CALL_EXIT.unpack_from(self._buffer, _CALL_HEAD.size)
             call = self._calls.get(number)
@@ -141,52 +149,70 @@ class RefusalTracer:
                 self._count(thread, call, arguments)
 
     def _count(self, thread: int, call: SystemCall, arguments: list[int]) -> None:
-        """Count a refused call; the first of its kind is described.
+        """Count a refused call, and describe the first one of its kind.
 
         Parameters
         ----------
         thread : int
-            Number of the thread that made the call.
+            The number of the thread that made the call.
         call : SystemCall
             The call.
         arguments : list of int
             Its arguments.
         """
-        count, first = self._refused.get(call.kind, (0, ""))
-        description = first or self._description(thread, call, arguments)
+        count, first_description = self._refused.get(call.kind, (0, ""))
+        description = first_description or self._description(thread, call, arguments)
         self._refused[call.kind] = (count + 1, description)
         self._save()
 
     def _description(self, thread: int, call: SystemCall, arguments: list[int]) -> str:
-        """Return the thing that a call reached for, and its name; arguments as for `_count`."""
-        value = arguments[call.argument]
+        """Return a text with the target of a call and its name; arguments as for `_count`."""
+        target = arguments[call.argument]
         if call.kind == "others":
             return call.name
         if call.kind == "files" or call.name in PATH_OF_PROGRAM:
             folder = _WORKING_FOLDER
             if call.name in CALLS_OF_FOLDERS:
                 folder = ctypes.c_int(arguments[0]).value
-            return f"{self._path(thread, folder, value)} by {call.name}"
+            return f"{self._path(thread, folder, target)} by {call.name}"
         if call.name in ("socket", "socketpair"):
-            return f"{_FAMILIES.get(value, f'family {value}')} by {call.name}"
+            return f"{_FAMILIES.get(target, f'family {target}')} by {call.name}"
         if call.name == "sendmsg":
             return call.name
         if call.kind == "sockets":
-            return f"{_address_text(self._memory(thread, value, _LONGEST_ADDRESS))} by {call.name}"
-        return f"process {ctypes.c_int(value).value} by {call.name}"
+            return f"{_address_text(self._memory(thread, target, _LONGEST_ADDRESS))} by {call.name}"
+        return f"process {ctypes.c_int(target).value} by {call.name}"
 
     def _path(self, thread: int, folder: int, address: int) -> str:
-        """Return the absolute path at an address in the memory of a thread."""
+        """Return the absolute path that a thread has passed to a system call.
+
+        Parameters
+        ----------
+        thread : int
+            The number of the thread.
+        folder : int
+            The file descriptor of the folder in which a relative path begins, or `_WORKING_FOLDER`.
+        address : int
+            The address of the path in the thread's memory.
+        """
         text, *_ = self._memory(thread, address, _LONGEST_PATH).split(b"\0")
         path = os.fsdecode(text)
-        start = "cwd" if folder == _WORKING_FOLDER else f"fd/{folder}"
+        base_link = "cwd" if folder == _WORKING_FOLDER else f"fd/{folder}"
         with suppress(OSError):
-            base = os.readlink(f"/proc/{thread}/{start}")  # noqa: PTH115 - light
+            base = os.readlink(f"/proc/{thread}/{base_link}")  # noqa: PTH115 - light
             path = os.path.join(base, path)  # noqa: PTH118
         return path.encode("utf-8", "replace").decode()
 
     def _memory(self, thread: int, address: int, length: int) -> bytes:
-        """Return the bytes at an address; fewer where the memory ends, none where there is none."""
+        """Return bytes of a thread's memory, or fewer if they cannot be read.
+
+        Parameters
+        ----------
+        thread : int
+            The number of the thread.
+        address, length : int
+            The address of the bytes and their number.
+        """
         try:
             memory = os.open(f"/proc/{thread}/mem", os.O_RDONLY | os.O_CLOEXEC)
         except OSError:
@@ -199,16 +225,18 @@ class RefusalTracer:
             os.close(memory)
 
     def _save(self) -> None:
+        """Write the counts to the report, so that they survive the end of this process."""
         self._write({"refused": self._refused})
 
     def _write(self, record: dict[str, Any]) -> None:
+        """Replace the content of the report."""
         content = json.dumps(record).encode()
         os.pwrite(self._report, content, 0)
         os.ftruncate(self._report, len(content))
 
 
 def _is_refusal(call: SystemCall, error: int) -> bool:
-    """Return whether a call has failed with an error as the sandbox lets it fail."""
+    """Return whether the error of a failed call is one by which the sandbox refuses it."""
     if error == EACCES:
         return True
     if error == EPERM:
@@ -217,7 +245,7 @@ def _is_refusal(call: SystemCall, error: int) -> bool:
 
 
 def _address_text(address: bytes) -> str:
-    """Return a socket address (`struct sockaddr`) as text."""
+    """Return a socket address (`struct sockaddr`) as a text for users."""
     if len(address) < 2:
         return "an address"
     family = int.from_bytes(address[:2], "little")

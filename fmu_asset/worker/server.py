@@ -35,34 +35,37 @@ _locate_errno.restype = ctypes.c_void_p
 
 
 class _AuditEvent(NamedTuple):
-    """An event of Python's auditing: its name and arguments."""
+    """An event of Python's audit hooks (PEP 578): its name and its arguments."""
 
     name: str
     arguments: tuple[object, ...]
 
 
 _REACHES = ("open", "os.", "shutil.", "socket.", "subprocess.", "urllib.")
-"""Beginnings of the names of events by which Python code reaches beyond its process."""
+"""Beginnings of the names of audit events for accesses to files, sockets and other processes."""
 _last_reaches: list[_AuditEvent] = []
-"""The last such event since the last question, if there was one."""
+"""The last such event since the last question; empty if there was none."""
 
 
 def _record_reach(event: str, arguments: tuple[object, ...]) -> None:
-    """Record an event by which Python code reaches beyond its process (a hook of auditing)."""
-    # os.chdir is free, and our own code calls it
+    """Record an audit event if it is an access to files, sockets or other processes.
+
+    This is an audit hook, which Python calls at every event.
+    """
+    # the sandbox does not restrict os.chdir, and our own code calls it
     if event.startswith(_REACHES) and event != "os.chdir":
         _last_reaches[:] = [_AuditEvent(event, arguments)]
 
 
 def _sandbox_hint() -> str:
-    """Return the sentence on what the sandbox has refused, with its name if Python knows it."""
+    """Return a sentence on what the sandbox has refused; it quotes Python's last access."""
     attempt = ""
     for event in _last_reaches:
-        listed = []
+        argument_texts = []
         for argument in event.arguments:
             if isinstance(argument, str | bytes | list | tuple):
-                listed.append(repr(argument))
-        call = f"{event.name}({', '.join(listed)})"
+                argument_texts.append(repr(argument))
+        call = f"{event.name}({', '.join(argument_texts)})"
         attempt = f"; the last that its Python code tried was {call}"
     return (
         f" The system refused it something (Permission denied{attempt}), as its sandbox does: what "
@@ -75,14 +78,14 @@ def _sandbox_hint() -> str:
 
 
 def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
-    """Answer questions until the twin asks for the end or its pipe closes, and end this process.
+    """Answer the twin's questions until it asks for the end or closes its pipe; end this process.
 
     Parameters
     ----------
     incoming, outgoing : int
         File descriptors of the pipes.
     confined : bool
-        Whether this process is in a sandbox, so that a failure may come from it.
+        Whether this process is in a sandbox, so that the sandbox may cause a failure.
     """
     # The twin decides what an interruption means; the worker ends when its pipe closes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -107,7 +110,7 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
 
 
 def _limit_file_size() -> None:
-    """Let the system end an FMU that fills the disk."""
+    """Limit the size of files, so that the system ends an FMU that fills the disk."""
     import resource
 
     _, hard_limit = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -169,7 +172,13 @@ class _Server:
         self._errno = ctypes.c_int.from_address(_locate_errno())
 
     def answer_questions(self) -> bool:
-        """Answer questions; return whether the twin asked for the end, or its pipe just closed."""
+        """Answer questions until the last one.
+
+        Returns
+        -------
+        bool
+            Whether the twin asked for the end; otherwise its pipe was closed.
+        """
         header = memoryview(bytearray(HEADER.size))
         poll = select.poll()
         poll.register(self._incoming, select.POLLIN | select.POLLHUP)
@@ -195,7 +204,15 @@ class _Server:
         return False
 
     def _answer(self, kind: Answer, payload: bytes | memoryview) -> None:
-        """Send an answer to the present question."""
+        """Send an answer to the present question.
+
+        Parameters
+        ----------
+        kind : Answer
+            The kind of the answer.
+        payload : bytes-like
+            Its content.
+        """
         if os.getpid() != self._process:
             os._exit(0)  # this is a copy of the worker that the FMU has made
         has_log = False
@@ -205,7 +222,7 @@ class _Server:
         send(self._outgoing, self._answer_header, payload)
 
     def _answer_failure(self, error: FmuError) -> None:
-        """Send an error as the answer to the present question."""
+        """Send an error as the answer; if the sandbox may have caused it, the message says so."""
         sentence = error.sentence
         is_refused = self._errno.value == errno.EACCES or "ermission denied" in str(error)
         if self._confined and is_refused:
@@ -221,7 +238,7 @@ class _Server:
         self._answer(Answer.FAILURE, payload)
 
     def _result_of(self, call: _Call) -> bytes | memoryview:
-        """Make a call and return its result as bytes."""
+        """Make a call that the twin asks for, and return its result as bytes."""
         self._errno.value = 0
         _last_reaches.clear()
         if call.name == "open":
@@ -245,7 +262,7 @@ class _Server:
         return result or b""
 
     def _open(self, *arguments: Any) -> None:
-        """Free the instance, if there is one, and make another as `open_instance` does."""
+        """Free the instance, if there is one, and make a new one; arguments of `open_instance`."""
         if self.instance is not None:
             self.instance.close()
         self.instance = open_instance(*arguments)
@@ -253,7 +270,15 @@ class _Server:
         self._reply = memoryview(self.instance.reply).cast("B")
 
     def _run(self, instance: FmuInstance, requests: Float) -> None:
-        """Make many steps, and send the replies in parts."""
+        """Make many steps, and send their replies in parts while they are made.
+
+        Parameters
+        ----------
+        instance : FmuInstance
+            The instance.
+        requests : (N, 2 + n_inputs) array
+            The request block of each step.
+        """
         replies = np.empty((len(requests), len(instance.reply)))
         sent = 0
 
