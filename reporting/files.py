@@ -67,7 +67,10 @@ def explained_write_errors(path: Path) -> Iterator[None]:
 
 
 def _destination(path: Path) -> Path:
-    """Return the file that a path leads to, through links; refuse a folder and a device."""
+    """Return the file that a path leads to, following symbolic links.
+
+    A folder or a device is refused.
+    """
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
         kind = "a folder" if target.is_dir() else "not an ordinary file"
@@ -78,7 +81,7 @@ def _destination(path: Path) -> Path:
 
 
 def synchronise(path: Path) -> None:
-    """Flush a file or a folder to the disk."""
+    """Flush a file or a folder to the disk, so that it survives a power failure."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -226,9 +229,14 @@ def write_members(folder: Path, members: Mapping[str, bytes]) -> None:
 
 
 def remove_leftovers(folder: str | os.PathLike[str]) -> int:
-    """Remove the temporary files that killed processes left in a folder, and return their number.
+    """Remove temporary files that killed processes have left in a folder.
 
-    No other process may be writing to the folder at this moment.
+    No other process may be writing to the folder meanwhile.
+
+    Returns
+    -------
+    int
+        The number of files removed.
     """
     leftovers = [path for path in Path(folder).glob(f".*{TEMPORARY_SUFFIX}*") if path.is_file()]
     for path in leftovers:

@@ -24,7 +24,8 @@ _REPLACED = "replaced"
 def lock_folder(folder: Path) -> int | None:
     """Lock a folder for this process.
 
-    The lock stays with the folder when it is renamed, and ends with the process.
+    The lock belongs to the folder itself, so it stays when the folder is renamed. The system
+    releases it when the process ends.
 
     Returns
     -------
@@ -45,7 +46,7 @@ def lock_folder(folder: Path) -> int | None:
 
 @contextmanager
 def closing_lock(lock: int) -> Iterator[None]:
-    """Return a context that ends the lock of a folder when the block ends."""
+    """Return a context at whose end the lock of a folder is released."""
     try:
         yield
     finally:
@@ -53,7 +54,7 @@ def closing_lock(lock: int) -> Iterator[None]:
 
 
 def fresh_folder(folder: Path) -> Path:
-    """Return a new empty folder beside `folder`, with the permissions of the user's umask.
+    """Return a new empty folder next to `folder`, with the permissions of the user's umask.
 
     Raises
     ------
@@ -63,13 +64,14 @@ def fresh_folder(folder: Path) -> Path:
     folder.parent.mkdir(parents=True, exist_ok=True)
     fresh = _make_folder_beside(folder, _NEW)
     # The umask can only be read by setting it.
-    mask = os.umask(0)
-    os.umask(mask)
-    fresh.chmod(0o777 & ~mask)
+    umask = os.umask(0)
+    os.umask(umask)
+    fresh.chmod(0o777 & ~umask)
     return fresh
 
 
 def _lock_or_refuse(folder: Path) -> int:
+    """Lock a folder and return the file descriptor; refuse if another process has locked it."""
     lock = lock_folder(folder)
     if lock is None:
         raise FileNotWrittenError(f"another process is replacing {folder}: look at what it leaves.")
@@ -80,19 +82,19 @@ def _lock_or_refuse(folder: Path) -> int:
 def whole_folder(
     folder: Path, lock: Callable[[Path], int] = _lock_or_refuse, lock_owner: ExitStack | None = None
 ) -> Iterator[Path]:
-    """Return a context with an empty folder, which replaces `folder` at the end of the block.
+    """Return a context with an empty folder, which replaces `folder` at the end of the context.
 
-    If the block raises, `folder` stays as it was.
+    If the block raises an exception, `folder` is unchanged.
 
     Parameters
     ----------
     folder : Path
         The folder to write.
     lock : callable
-        Locks a folder for this process and returns the file descriptor, or raises the reason.
+        Locks a folder for this process and returns the file descriptor, or raises an exception.
     lock_owner : ExitStack, optional
-        Holds the lock of the new folder until it is closed; by default the lock ends with the
-        block.
+        Holds the lock of the new folder until it is closed. By default the lock ends with the
+        context.
 
     Yields
     ------
@@ -117,36 +119,37 @@ def whole_folder(
 
 
 def replace_folder(fresh: Path, folder: Path) -> None:
-    """Put a folder in the place of another, which is removed; this process has locked both.
+    """Replace a folder by a new one, and remove the old one. This process has locked both.
 
-    After a kill either the new or the old folder is in place, or `restore_folder` finds the old
-    one.
+    If the process is killed meanwhile, either the new or the old folder is in place, or
+    `restore_folder` can put the old one back.
 
     Raises
     ------
     OSError
         If the location is not writable; the old folder is unchanged.
     """
-    parking = _make_folder_beside(folder, _old_label(fresh))
-    parked = parking / folder.name
+    parking_folder = _make_folder_beside(folder, _old_label(fresh))
+    old_content = parking_folder / folder.name
     try:
-        folder.rename(parked)
+        folder.rename(old_content)
         fresh.rename(folder)
     except OSError:
-        if parked.is_dir():
-            parked.rename(folder)
-        parking.rmdir()
+        if old_content.is_dir():
+            old_content.rename(folder)
+        parking_folder.rmdir()
         raise
-    # The new name tells a later process that the content is no longer needed.
-    replaced = _make_folder_beside(folder, _REPLACED)
-    parking.rename(replaced)
-    shutil.rmtree(replaced, ignore_errors=True)
+    # The label of this name tells a later process that it may remove the old content.
+    discarded = _make_folder_beside(folder, _REPLACED)
+    parking_folder.rename(discarded)
+    shutil.rmtree(discarded, ignore_errors=True)
 
 
 def restore_folder(folder: Path) -> bool:
-    """Put back the old content that a killed process had moved aside.
+    """Put back the old content of a folder if a killed process had moved it away.
 
-    What the process had already replaced, or had begun to write, is removed.
+    The process was killed in `replace_folder`. Content that it had already replaced or had only
+    begun to write is removed.
 
     Returns
     -------
@@ -159,8 +162,8 @@ def restore_folder(folder: Path) -> bool:
         If the location is not writable.
     """
     was_restored = False
-    for parking in _folders_beside(folder, _OLD):
-        if _restore_from(parking, folder):
+    for parking_folder in _folders_beside(folder, _OLD):
+        if _restore_from(parking_folder, folder):
             was_restored = True
     for abandoned in (*_folders_beside(folder, _NEW), *_folders_beside(folder, _REPLACED)):
         lock = lock_folder(abandoned)
@@ -171,21 +174,30 @@ def restore_folder(folder: Path) -> bool:
 
 
 def _restore_from(parking: Path, folder: Path) -> bool:
-    """Move the old content back if its place is empty, and return whether that was done."""
-    parked = parking / folder.name
-    if not parked.is_dir():
+    """Move old content back to its folder if that is missing; return whether it was moved.
+
+    Parameters
+    ----------
+    parking : Path
+        The folder into which `replace_folder` had moved the old content.
+    folder : Path
+        The folder to restore.
+    """
+    old_content = parking / folder.name
+    if not old_content.is_dir():
         return False
-    lock = lock_folder(parked)
+    lock = lock_folder(old_content)
     if lock is None:  # another process is replacing the folder at this moment
         return False
     was_restored = False
     with closing_lock(lock), explained_write_errors(folder):
         if not folder.exists():
-            parked.rename(folder)
+            old_content.rename(folder)
             was_restored = True
         elif parking.name.startswith(_prefix(folder, _old_label(folder))):
-            # The folder in place is the one that replaced this content. Otherwise somebody else
-            # made it, and the old content stays.
+            # By its inode, the present folder is the one that replaced this content, so the old
+            # content is no longer needed. Any other folder was made by somebody else, and the old
+            # content is kept.
             shutil.rmtree(parking, ignore_errors=True)
     with suppress(OSError):
         parking.rmdir()
@@ -193,17 +205,20 @@ def _restore_from(parking: Path, folder: Path) -> bool:
 
 
 def _old_label(fresh: Path) -> str:
-    """Return the label of old content that is replaced by `fresh`, which its inode identifies."""
+    """Return the label of old content, which contains the inode of the folder replacing it."""
     return f"{_OLD}-{fresh.stat().st_ino}"
 
 
 def _prefix(folder: Path, label: str) -> str:
+    """Return the beginning of the names of temporary folders of a kind next to `folder`."""
     return f".{folder.name}.{label}-"
 
 
 def _make_folder_beside(folder: Path, label: str) -> Path:
+    """Make a temporary folder next to `folder`, with a label that says its kind."""
     return Path(tempfile.mkdtemp(prefix=_prefix(folder, label), dir=folder.parent))
 
 
 def _folders_beside(folder: Path, label: str) -> list[Path]:
+    """Return the temporary folders of a kind that lie next to `folder`."""
     return sorted(folder.parent.glob(glob.escape(_prefix(folder, label)) + "*"))

@@ -50,15 +50,15 @@ class Variable(NamedTuple):
 
 @dataclass(frozen=True)
 class Group:
-    """Variables with the coordinates of their axes.
+    """Variables together with the coordinates of their axes.
 
     Attributes
     ----------
     variables : mapping of str to Variable
         The data.
     coords : mapping of str to Variable
-        The coordinates. A coordinate with the name of an axis labels this axis; the others are
-        further labels along axes.
+        The coordinates. A coordinate with the name of an axis labels the entries of this axis; the
+        others are additional labels.
     attrs : mapping of str to str
         The attributes of the group.
     """
@@ -95,7 +95,10 @@ def write_groups(path: Path, groups: Mapping[str, Group], attrs: Mapping[str, An
 
 
 def _write_group(target: h5py.Group, group: Group) -> None:
-    """Write a group as NetCDF-4 prescribes for HDF5: axes are scales, to which variables refer."""
+    """Write a group in the form that NetCDF-4 prescribes for HDF5.
+
+    Each axis is an HDF5 dimension scale, which is attached to the variables that have this axis.
+    """
     target.attrs.update(group.attrs)
     axis_sizes = _axis_sizes(group)
     for axis, size in axis_sizes.items():
@@ -113,7 +116,7 @@ def _write_group(target: h5py.Group, group: Group) -> None:
 
 
 def _axis_sizes(group: Group) -> dict[str, int]:
-    """Return the size of each axis of a group, in the order of their first use."""
+    """Return the size of each axis of a group, in the order in which axes are first used."""
     sizes = {}
     for variable in {**group.variables, **group.coords}.values():
         for axis, size in zip(variable.dims, variable.values.shape, strict=True):
@@ -134,7 +137,10 @@ def _write_axis(target: h5py.Group, group: Group, axis: str, size: int) -> None:
 
 
 def _further_coordinates(group: Group, variable: Variable) -> list[str]:
-    """Return the coordinates along axes of a variable that do not have the name of an axis."""
+    """Return the names of a variable's coordinates that are not labels of a whole axis.
+
+    The attribute "coordinates" of the variable lists them, as the CF conventions prescribe.
+    """
     axis_sizes = _axis_sizes(group)
     return [
         name
@@ -144,11 +150,12 @@ def _further_coordinates(group: Group, variable: Variable) -> list[str]:
 
 
 def _write_variable(target: h5py.Group, name: str, variable: Variable) -> h5py.Dataset:
+    """Write an array with its attributes as a dataset of HDF5; texts get variable length."""
     import h5py
 
     values = variable.values
     is_text = values.dtype.kind == "U"
-    # HDF5 stores an axis of no entries only where it may grow.
+    # HDF5 accepts an axis without entries only if the axis may grow.
     is_empty = 0 in values.shape
     dataset = target.create_dataset(
         name,
@@ -162,13 +169,13 @@ def _write_variable(target: h5py.Group, name: str, variable: Variable) -> h5py.D
 
 
 SECONDS = 10
-"""Processor time that the reading of any file may take [s]."""
+"""Processor time that reading a small file may take [s]."""
 BYTES_IN_A_SECOND = 5_000_000
 """Bytes of a file for which one more second is allowed; HDF5 reads about 1e8 in a second."""
 WAITING = 6
-"""Seconds on the clock that are allowed for one second of processor time."""
+"""Wall-clock time that is allowed for one second of processor time [s]."""
 MEMORY = 512 * 1024**2
-"""Memory that the reading of any file may take [bytes]."""
+"""Memory that reading a small file may take [bytes]."""
 MEMORY_OF_A_BYTE = 64
 """Further memory for each byte of the file, which may be compressed [bytes]."""
 
@@ -185,7 +192,7 @@ def read_groups(path: Path) -> xr.DataTree:
     """
     if not path.is_file():
         raise DamagedFileError(f"there is no file {path}")
-    # Imported here, so that the forks need not import them again.
+    # Imported in the parent process, so that the forks need not import them again.
     import h5netcdf  # noqa: F401
     import xarray as xr
 
@@ -196,7 +203,21 @@ def read_groups(path: Path) -> xr.DataTree:
 
 
 def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
-    """Return the groups of a file, or the reason why there are none, as a fork reads them."""
+    """Return the groups of a file, which a forked process reads.
+
+    A damaged file can make the HDF5 library crash, hang or fill the memory. The fork takes the
+    damage.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Returns
+    -------
+    dict of str to Dataset, or str
+        The groups, or the reason why the file cannot be read.
+    """
     reading_end, writing_end = os.pipe()
     with warnings.catch_warnings():
         # Python 3.12 warns of threads. They are those of BLAS, and the fork does not call BLAS.
@@ -218,7 +239,15 @@ def _groups_read_by_fork(path: Path) -> dict[str, xr.Dataset] | str:
 
 
 def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
-    """Send the groups of a file, or the reason why there are none, and end this process."""
+    """As the fork, send the groups of a file, or why it cannot be read, and end the process.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    writing_end : int
+        The file descriptor of the pipe to the parent process.
+    """
     try:
         # Among the inherited descriptors may be the lock of a run folder, which must end with the
         # parent process even if this fork outlives it.
@@ -236,7 +265,7 @@ def _send_groups_and_exit(path: Path, writing_end: int) -> NoReturn:
 
 
 def _read_groups(path: Path) -> dict[str, xr.Dataset] | str:
-    """Return the groups of a file by path, or the first line of why it cannot be read."""
+    """Return the groups of a file by their paths, or a line on why it cannot be read."""
     import xarray as xr
 
     try:
@@ -249,7 +278,9 @@ def _read_groups(path: Path) -> dict[str, xr.Dataset] | str:
 
 
 def _limit_resources(file_size: int) -> None:
-    """Let the kernel end this process when it takes more time or memory than a file may need.
+    """Limit time and memory of this process to what a file of this size may need.
+
+    The kernel ends the process when it exceeds a limit.
 
     Parameters
     ----------

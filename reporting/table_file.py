@@ -31,13 +31,15 @@ class TableErrors(NamedTuple):
 
 
 def plain_number(text: str) -> float:
-    """Return the number in a text of the digits 0 to 9; NaN and infinities are numbers here.
+    """Return the number in a text that is written with the digits 0 to 9.
+
+    NaN and infinities are accepted.
 
     Raises
     ------
     ValueError
-        If the text is no number, or is one that `float` accepts and no measuring software writes:
-        digits of another script, or underscores between digits.
+        If the text is no number. That includes forms that `float` accepts but measuring software
+        never writes: digits of another script, and underscores between digits.
     """
     if not text.isascii() or "_" in text:
         raise ValueError(f"{text!r} is not written with the digits 0 to 9")
@@ -55,16 +57,16 @@ def is_number(cell: str) -> bool:
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table of text.
+    """A table whose cells are texts, as read from a file.
 
     Attributes
     ----------
     name : str
         The name of the file, for messages.
     columns : mapping of str to tuple of str
-        The cells of each column, stripped.
+        The cells of each column, without blanks around them.
     lines : tuple of int
-        The line of the file of each row.
+        The number of the line in the file, for each row.
     errors : TableErrors
         The exceptions to raise.
     """
@@ -140,6 +142,7 @@ class TextTable:
     def _check_value(
         self, value: float, column: str, row: int, *, empty_allowed: bool, positive: bool
     ) -> None:
+        """Refuse a number that is not finite, or not positive if it must be."""
         if not isfinite(value):
             if empty_allowed:
                 advice = "; leave the cell of a reading empty that is to be left out"
@@ -155,6 +158,7 @@ class TextTable:
             )
 
     def _location(self, column: str, row: int) -> str:
+        """Return the name of a cell for messages: file, line and column."""
         return f"{self.name}, line {self.lines[row]}: column {column!r}"
 
     def refuse_repeated(self, keys: Sequence[object], what: str, remedy: str) -> None:
@@ -219,18 +223,18 @@ def parse_table(
     header: Sequence[str] | None = None,
     separator: str | None = ",",
 ) -> TextTable:
-    """Return the table in a text.
+    """Return the table in a text of lines and cells.
 
     Parameters
     ----------
     text : str
-        The lines of the table; empty lines and lines that begin with # do not count.
+        The lines of the table; empty lines and lines that begin with # are skipped.
     name : str
         The name of the table in messages.
     errors : TableErrors
         The exceptions to raise, for the reasons of `read_table`.
     header : sequence of str, optional
-        The names of the columns, where the text has no header line.
+        The names of the columns, if the text has no header line.
     separator : str or None
         The character between cells; None for blanks.
     """
@@ -245,8 +249,8 @@ def parse_table(
         )
     _check_columns(columns, name, errors)
     if not rows:
-        but = "a header line but " if header is None else ""
-        raise errors.layout(f"{name} has {but}no rows.")
+        header_phrase = "a header line but " if header is None else ""
+        raise errors.layout(f"{name} has {header_phrase}no rows.")
     for row in rows:
         if len(row.cells) != len(columns):
             has_commas = bool(separator)
@@ -262,8 +266,8 @@ def parse_table(
 
 
 def _parse_rows(text: str, separator: str | None, name: str, errors: TableErrors) -> list[_Row]:
-    """Return the rows of a text, its header among them."""
-    # Comments become empty lines, so that line numbers stay those of the file.
+    """Return the rows of a text, including its header line."""
+    # Comments are replaced by empty lines, so that line numbers remain those of the file.
     lines = []
     for line in text.splitlines():
         is_comment = line.lstrip().startswith("#")
@@ -276,6 +280,7 @@ def _parse_rows(text: str, separator: str | None, name: str, errors: TableErrors
 def _parse_separated_rows(
     lines: Sequence[str], separator: str, name: str, errors: TableErrors
 ) -> list[_Row]:
+    """Return the rows of lines whose cells have a separator, and may be quoted."""
     stream = io.StringIO("\n".join(lines))
     reader = csv.reader(stream, delimiter=separator, skipinitialspace=True)
     rows = []
@@ -305,7 +310,7 @@ def _check_columns(columns: Sequence[str], name: str, errors: TableErrors) -> No
 
 
 def _width_message(row: _Row, columns: Sequence[str], *, has_header: bool, has_commas: bool) -> str:
-    """Return why a row does not fit its table: the number of its cells is not that of columns."""
+    """Return the message about a row whose number of cells is not that of the columns."""
     cells = counted(len(row.cells), "cell")
     wanted = counted(len(columns), "column")
     if has_header:
@@ -335,6 +340,7 @@ def table_text(columns: Mapping[str, Sequence[str] | Float]) -> str:
 
 
 def _cells_of(column: Sequence[str] | Float) -> Sequence[str]:
+    """Return the cells of a column as texts; NaN becomes an empty cell."""
     if not isinstance(column, np.ndarray):
         return column
     # NaN alone is not equal to itself.

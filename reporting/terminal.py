@@ -51,7 +51,7 @@ SHARED = {
 
 @functools.cache
 def commands_of(package: str) -> dict[str, dict[str, Any]]:
-    """Return the tables of the file `commands.toml` of a package, by the words of the commands."""
+    """Return the entries of a package's file `commands.toml`, by the words that call a command."""
     file = files(package).joinpath("commands.toml")
     return tomllib.loads(file.read_text(encoding="utf-8"))
 
@@ -178,7 +178,7 @@ def show(command: str, words: "Words | str", **values: Any) -> None:
 
 
 def _row_colour(row: Sequence[str], colours: Mapping[str, str]) -> str:
-    """Return the colour of the first cell that has one, or ""."""
+    """Return the colour of the first cell in a row that has one, or "" if there is none."""
     for cell in row:
         if cell in colours:
             return colours[cell]
@@ -188,7 +188,7 @@ def _row_colour(row: Sequence[str], colours: Mapping[str, str]) -> str:
 def answer(
     command: str, words: "Words | str", record: Mapping[str, Any], *, json: bool, **values: Any
 ) -> None:
-    """Print a record as JSON, or as text like `show`.
+    """Print the result of a command, as JSON or as text.
 
     Parameters
     ----------
@@ -237,7 +237,10 @@ LONGEST_WORD = 14
 
 
 def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width: int) -> "Table":
-    """Return a table without empty columns, whose long words break at underscores and hyphens.
+    """Return a table without empty columns, for a terminal of a given width.
+
+    In a narrow terminal long words are broken after underscores and hyphens. The first column is
+    not wrapped if it has room, since it holds the names of the rows.
 
     Parameters
     ----------
@@ -246,36 +249,38 @@ def console_table(headings: Sequence[str], rows: Iterable[Sequence[str]], width:
     rows : iterable of sequence of str
         The cells of each row; missing cells at its end are empty.
     width : int
-        The width of the terminal in columns.
+        The width of the terminal in columns of characters.
     """
     from rich import box
     from rich.table import Table
 
     cells = [[*row, *[""] * (len(headings) - len(row))] for row in rows]
-    columns = [
+    shown_columns = [
         column for column in range(len(headings)) if not cells or any(row[column] for row in cells)
     ]
-    first_column = columns[0] if columns else 0
+    first_column = shown_columns[0] if shown_columns else 0
     if width < WIDE:
         cells = [_with_broken_words(row, first_column) for row in cells]
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column in columns:
-        # The first column names the row, so the others make room for it, unless it is too wide.
-        lines = [line for row in cells for line in row[column].split("\n")]
-        longest_line = max(map(len, lines), default=0)
+    for column in shown_columns:
+        # Rich wraps the other columns if the first one may not be wrapped. It has room if the
+        # terminal is not too narrow and no line of it takes more than half of the width.
+        lines_of_column = [line for row in cells for line in row[column].split("\n")]
+        longest_line = max(map(len, lines_of_column), default=0)
         has_room = width >= NARROWEST and longest_line <= width // 2
         no_wrap = column == first_column and has_room
         table.add_column(headings[column], overflow="fold", no_wrap=no_wrap)
     for row in cells:
-        table.add_row(*[row[column] for column in columns])
+        table.add_row(*[row[column] for column in shown_columns])
     return table
 
 
 def _with_broken_words(row: Sequence[str], first_column: int) -> list[str]:
+    """Return the cells of a row with their long words broken."""
     cells = []
     for column, text in enumerate(row):
-        longest = LONGEST_NAME if column == first_column else LONGEST_WORD
-        cells.append(break_words(text, longest))
+        longest_part = LONGEST_NAME if column == first_column else LONGEST_WORD
+        cells.append(break_words(text, longest_part))
     return cells
 
 
@@ -293,6 +298,7 @@ def break_words(text: str, longest: int) -> str:
 
 
 def _break_word(word: str, longest: int) -> str:
+    """Return a word with line breaks after underscores or hyphens, if it is long."""
     lines = [""]
     for syllable in re.findall(r"[^_-]*[_-]|[^_-]+", word):
         if lines[-1] and len(lines[-1]) + len(syllable) > longest:
@@ -419,9 +425,9 @@ def _extend_commands(command: _Command, options: Sequence[_Option]) -> None:
 
 @contextmanager
 def _shown_progress() -> Iterator[None]:
-    """Return a context in which library functions show their stages, and that Ctrl-C may end."""
+    """Return a context for a command: library functions show their stages, and Ctrl-C ends it."""
     previous_progress = reporting.progress.default_progress
-    # One object for all stages of the command, made when the first begins.
+    # The cache makes one progress object for all stages of the command, when the first begins.
     reporting.progress.default_progress = functools.cache(progress)
     try:
         with interruptible():

@@ -29,7 +29,7 @@ _KEYS = re.compile(f"{_COMMENT}|{_LONG_TEXT}|{_LONG_LITERAL_TEXT}|{_DOTTED_KEY}"
 """Comments and texts of several lines, which are skipped, or a dotted key, which is group 1."""
 
 LONGEST_ARRAY = 90
-"""Longest array that is written in one line, in characters of its entries."""
+"""Largest number of characters in the entries of an array that is written in one line."""
 
 _LONGEST_SHOWN_VALUE = 60  # in a message, in characters
 
@@ -86,9 +86,10 @@ def parse_toml(content: bytes | str, source: str, error: type[Exception]) -> dic
 
 
 def _has_too_long_key(text: str) -> bool:
-    """Return whether a text has a dotted key of more parts than tables may be nested.
+    """Return whether a text has a dotted key with more parts than tables may be nested.
 
-    The time that `tomllib` takes for a dotted key grows with the square of its parts.
+    Such a key is refused before parsing, since the time that `tomllib` takes for a dotted key grows
+    with the square of the number of its parts.
     """
     if all(line.count(".") < DEEPEST_NESTING for line in text.split("\n")):
         return False
@@ -162,12 +163,14 @@ def toml_text(content: dict[str, Any]) -> str:
 
 
 def _is_array_of_tables(value: object) -> bool:
+    """Return whether a value is a list of tables with at least one entry."""
     if not isinstance(value, list) or not value:
         return False
     return all(isinstance(row, dict) for row in value)
 
 
 def _key_value_lines(table: dict[str, Any]) -> str:
+    """Return a line "key = value" for each value that is not None."""
     return "".join(f"{pair}\n" for pair in _key_value_pairs(table))
 
 
@@ -181,6 +184,7 @@ def _key_value_pairs(table: dict[str, Any]) -> list[str]:
 
 
 def _toml_key(name: str) -> str:
+    """Return a key as TOML writes it: bare if possible, else in quotes."""
     return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else toml_value(name)
 
 
@@ -201,6 +205,7 @@ def toml_value(value: object) -> str:
 
 
 def _toml_array(entries: list[str]) -> str:
+    """Return an array of TOML texts, in several lines if it is long."""
     if sum(len(entry) for entry in entries) > LONGEST_ARRAY:
         lines = "".join(f"    {entry},\n" for entry in entries)
         return f"[\n{lines}]"
@@ -236,7 +241,7 @@ Fault = tuple[object, str]
 
 
 class Section(BaseModel):
-    """A table of a file; unknown keys are refused, and words are not converted to numbers."""
+    """The model of a table in a file; it refuses unknown keys, and converts no text to a number."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -260,16 +265,16 @@ MISSING_KEY = "missing_key"
 
 
 def missing_keys(keys: list[str], sentence: str) -> PydanticCustomError:
-    """Return the error that a validator raises where keys are missing.
+    """Return the error by which a validator says that keys are missing.
 
-    The message names all missing keys of a file together.
+    If several keys of a file are missing, one message names them all.
 
     Parameters
     ----------
     keys : list of str
-        The keys, as the file would have them in the table that is validated.
+        The keys, relative to the table that is validated.
     sentence : str
-        The message where only one key of the file is missing.
+        The message if only one key of the file is missing.
     """
     return PydanticCustomError(MISSING_KEY, "{sentence}", {"keys": keys, "sentence": sentence})
 
@@ -335,7 +340,17 @@ _MISSING_KEY_TYPES = ("missing", "missing_argument", MISSING_KEY)
 
 
 def _validation_message(error: ValidationError, what: str, first_index: int) -> str:
-    """Return the message about the most telling fault that pydantic found."""
+    """Return the message about the fault that helps the user most, of those pydantic found.
+
+    Parameters
+    ----------
+    error : ValidationError
+        The error of pydantic, with all faults.
+    what : str
+        What the file describes, with its article.
+    first_index : int
+        The number of the first entry of a list in messages.
+    """
     faults = error.errors(include_url=False)
     # A misspelt key is reported twice, as unknown and as missing; the unknown key tells more.
     unknown = [fault for fault in faults if fault["type"] in _UNKNOWN_KEY_TYPES]
@@ -353,6 +368,7 @@ def _validation_message(error: ValidationError, what: str, first_index: int) -> 
 
 
 def _unknown_keys_message(faults: list[ErrorDetails], what: str, first_index: int) -> str:
+    """Return the message about keys that the model does not have."""
     keys = [short_repr(_location_in_file(fault["loc"], first_index)) for fault in faults]
     if len(keys) > 1:
         return f"{listing(keys)} are not keys of {what}; remove them or correct their spelling"
@@ -385,7 +401,7 @@ def _value_message(fault: ErrorDetails, first_index: int) -> str:
 
 
 def _missing_locations(fault: ErrorDetails, first_index: int) -> list[str]:
-    """Return the locations of the keys that are missing according to one error of pydantic."""
+    """Return the locations of missing keys that one fault of pydantic names."""
     location = _location_in_file(fault["loc"], first_index)
     if fault["type"] != MISSING_KEY:
         return [location]
@@ -393,7 +409,17 @@ def _missing_locations(fault: ErrorDetails, first_index: int) -> list[str]:
 
 
 def _location_in_file(location: tuple[int | str, ...], first_index: int) -> str:
-    """Return a location such as "tables[1].key", without the names of types that pydantic adds."""
+    """Return a location such as "tables[1].key".
+
+    Names of types, which pydantic adds to its locations, are left out.
+
+    Parameters
+    ----------
+    location : tuple of int and str
+        The location as pydantic gives it.
+    first_index : int
+        The number of the first entry of a list in messages.
+    """
     text = ""
     for step in location:
         if isinstance(step, int):
@@ -404,5 +430,5 @@ def _location_in_file(location: tuple[int | str, ...], first_index: int) -> str:
 
 
 def _is_type_name_of_pydantic(step: str) -> bool:
-    """Return whether a step of a location is no key but like "list[float]" or "constrained-str"."""
+    """Return whether a part of a location is a type, such as "list[float]", and no key."""
     return re.search(r"[^\w]|^constrained", step) is not None

@@ -31,15 +31,24 @@ def counted(count: int, noun: str, plural: str | None = None) -> str:
 
 
 def brief(record: object, **facts: object) -> str:
-    """Return a record in one line, for `__repr__`: its class, and some of its values by name.
+    """Return a description of a record in one line, for `__repr__`.
 
-    Long texts are cut; a collection shows its length and its first three entries.
+    It consists of the name of the class and of some values. Long texts are shortened; a collection
+    is shown by its length and its first three entries.
+
+    Parameters
+    ----------
+    record : object
+        The record.
+    **facts : object
+        The values to show, by name.
     """
     pairs = ", ".join(f"{name}={_short(value)}" for name, value in facts.items())
     return f"{type(record).__name__}({pairs})"
 
 
 def _short(value: object) -> str:
+    """Return a value as a short text."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, Mapping | list | tuple):
@@ -50,6 +59,7 @@ def _short(value: object) -> str:
 
 
 def _short_collection(entries: list[object]) -> str:
+    """Return the length of a collection and its first entries as a text."""
     if not entries:
         return "none"
     texts = [_short(entry) for entry in entries[:_LISTED_ITEMS]]
@@ -72,7 +82,7 @@ def listing(words: Iterable[str], joint: str = "and") -> str:
 
 
 def comma_list(words: Iterable[object]) -> str:
-    """Return words as "a, b, c", or "none"; of many the first are written out."""
+    """Return words as "a, b, c", or "none"; a long list is cut after its first words."""
     texts = [str(word) for word in words]
     listed = ", ".join(texts[:MOST_LISTED]) or "none"
     if len(texts) > MOST_LISTED:
@@ -102,7 +112,9 @@ def number(value: object) -> str:
 
 
 def rounded(value: float, deviation: float) -> str:
-    """Return a value with the decimals that two digits of its standard deviation need.
+    """Return a value as text, with the decimals that its standard deviation justifies.
+
+    The last decimal is the second significant digit of the standard deviation.
 
     Parameters
     ----------
@@ -113,13 +125,13 @@ def rounded(value: float, deviation: float) -> str:
         return "—"
     if not (deviation > 0.0 and isfinite(deviation)):
         return _with_minus_sign(f"{value:.6g}")
-    decimals = 1 - floor(log10(deviation))
+    decimal_places = 1 - floor(log10(deviation))
     if abs(value) >= 1e6 or deviation < 1e-6:
         leading_exponent = floor(log10(max(abs(value), deviation)))
-        digits = max(2, leading_exponent + decimals + 1)
+        digits = max(2, leading_exponent + decimal_places + 1)
         return f"{value:.{min(digits, 12) - 1}e}"
     # The option "z" writes a rounded negative zero without its sign.
-    return _with_minus_sign(f"{value:z.{max(decimals, 0)}f}")
+    return _with_minus_sign(f"{value:z.{max(decimal_places, 0)}f}")
 
 
 def _with_minus_sign(text: str) -> str:
