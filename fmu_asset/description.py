@@ -26,19 +26,19 @@ LOG_CATEGORIES = {
 }
 
 PLACEHOLDER = "0_content_0_"
-"""Stands for the tag, the first characters of the content hash, until that is known."""
+"""Placeholder for the first characters of the content hash, until the hash is known."""
 
 
 class DeclaredUnit(NamedTuple):
-    """A unit in terms of SI.
+    """A unit, expressed in SI base units.
 
     Attributes
     ----------
     base : dict of str to float
-        Exponents of base units that are not zero, and factor and offset where they are not 1 and 0;
-        empty for a unit that is not understood.
+        The non-zero exponents of base units. Factor and offset are included if they are not 1 and
+        0. Empty for a unit that is not understood.
     displays : dict of str to float
-        Factors of display units.
+        The factors of display units.
     """
 
     base: dict[str, float]
@@ -90,16 +90,16 @@ class Declaration:
 
 
 def _declare_unit(unit: DeclaredUnit, name: str, display_unit: str | None) -> None:
-    """Fill the declaration of a unit.
+    """Complete the declaration of a unit from its name.
 
     Parameters
     ----------
     unit : DeclaredUnit
         The declaration; extended in place.
     name : str
-        Name of the unit.
+        The name of the unit.
     display_unit : str or None
-        A display unit that a variable has.
+        The display unit of a variable that has this unit.
     """
     meaning = meaning_of(name)
     if meaning is None:
@@ -142,23 +142,23 @@ def _templates() -> Environment:
 
 
 def rendered(template: str, /, **values: object) -> bytes:
-    """Return the text of a template with values filled in, as UTF-8; floats keep their bits.
+    """Return a template with values filled in, as UTF-8; floats are written with all their digits.
 
     Parameters
     ----------
     template : str
-        Name of a file in `fmu_asset/templates`, without `.jinja`.
+        The name of a file in `fmu_asset/templates`, without `.jinja`.
     **values : object
-        Values that the template uses.
+        The values that the template uses.
     """
     return _templates().get_template(f"{template}.jinja").render(**values).encode()
 
 
 def _c_text(text: str) -> str:
-    """Return a text as a C string.
+    """Return a text as a string literal of C.
 
-    Units may contain anything that a user writes, and messages go through printf: everything but
-    plain characters is escaped.
+    Units may contain any character, and messages pass through printf, so everything but plain
+    characters is escaped.
     """
     characters = []
     for byte in text.encode():
@@ -169,14 +169,30 @@ def _c_text(text: str) -> str:
 
 
 def _c_number(value: float | None, absent: str) -> str:
-    """Return a float as a C constant with the same bits; `absent` for None and infinity."""
+    """Return a float as a constant of C with the same bits.
+
+    Parameters
+    ----------
+    value : float or None
+        The number.
+    absent : str
+        The text for None and for infinity.
+    """
     if value is None or math.isinf(value):
         return absent
     return repr(float(value))
 
 
 def _xml_value(value: float | None, kind: str) -> str | None:
-    """Return a value of a variable of some kind as XML writes it."""
+    """Return the value of a variable as XML writes it.
+
+    Parameters
+    ----------
+    value : float or None
+        The value.
+    kind : str
+        The type of the variable: Boolean, Real, or one of whole numbers.
+    """
     if value is None:
         return None
     if kind == "Boolean":
@@ -206,24 +222,25 @@ class ArrayVariable:
 
     @property
     def description(self) -> str:
-        """Description of the first element, with i in the place of its index or label."""
+        """Description of the first element, with "i" instead of its index or label."""
         labels = []
         for row in self.rows:
             match = _ELEMENT.fullmatch(row.name)
             if match:
                 labels.append(match["index"] or match["label"])
-        first = labels[0]
-        pattern = rf"\b{re.escape(first)}\b|\b1\b"
+        first_label = labels[0]
+        pattern = rf"\b{re.escape(first_label)}\b|\b1\b"
         text = re.sub(pattern, "i", self.rows[0].description, count=1)
-        if first == "1":
+        if first_label == "1":
             return text
         return f"{text}; i is one of {', '.join(labels)}"
 
 
 def arrays_of(table: Sequence[FmuVariable]) -> tuple[ArrayVariable, ...]:
-    """Return the arrays of a table: numbered variables, and inputs and outputs such as `health.z1`.
+    """Return the arrays that the variables of a table form in FMI 3.
 
-    Rows of one stem with different units or ranges stay scalars.
+    These are numbered variables such as `strain[1]`, and inputs and outputs such as `health.z1`, if
+    they follow one another. Rows with different units or ranges stay scalars.
 
     Parameters
     ----------
@@ -242,7 +259,7 @@ def arrays_of(table: Sequence[FmuVariable]) -> tuple[ArrayVariable, ...]:
 
 
 def _array_stem(row: FmuVariable) -> str | None:
-    """Return the name of the array that a row may belong to."""
+    """Return the name of the array that a row may belong to, or None for a scalar."""
     match = _ELEMENT.fullmatch(row.name)
     if match is None or row.causality == "parameter" or row.kind != "Real":
         return None

@@ -18,15 +18,16 @@ _CANDIDATES = ("/tmp", "/var/tmp", "/dev/shm")
 """Folders for temporary files if the usual one cannot be used."""
 _PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.\-]+")
 _SEARCH_ROUNDS = 100
-"""Number of searches after which processes that always start others are given up."""
+"""Largest number of searches for processes that keep starting others."""
 _cleaned_parents: set[Path] = set()
 
 
 def plain_folder() -> Path:
-    """Return a new private folder with only ASCII letters, digits and `/_.-` in its path.
+    """Return a new private folder whose path has only ASCII letters, digits and `/_.-`.
 
-    Other characters in the path crash some FMUs (pythonfmu's decode only `%20`). On the way, this
-    removes what an ended process has left behind because it and its worker were killed at once.
+    Other characters in the path crash some FMUs (those of pythonfmu decode only `%20`). This
+    function also removes folders that an ended process has left, because it was killed together
+    with its worker.
 
     Raises
     ------
@@ -60,7 +61,10 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove our folders whose process has ended, once for each parent, if the system tells."""
+    """Remove our folders in a parent folder whose process has ended; once for each parent.
+
+    Nothing is done on a system without /proc, which cannot tell whether a process runs.
+    """
     if parent in _cleaned_parents or not Path("/proc/self").exists():
         return
     _cleaned_parents.add(parent)
@@ -76,9 +80,9 @@ def _remove_leftovers(parent: Path) -> None:
 
 
 def _prefix() -> str:
-    """Return the beginning of our folders' names, with the number of the process namespace.
+    """Return the beginning of our folders' names, which contains the process namespace.
 
-    Two containers may share a folder, but not process numbers.
+    Containers may share a folder for temporary files, but not their process numbers.
     """
     try:
         namespace = Path("/proc/self/ns/pid").stat().st_ino
@@ -88,28 +92,28 @@ def _prefix() -> str:
 
 
 def end_processes(folder: str | os.PathLike[str]) -> None:
-    """Kill the processes whose folder for temporary files was this one when they began.
+    """Kill the processes that were started with this folder for temporary files.
 
-    A process has inherited that folder from its parent, in whatever group or session it hides, and
-    even if the parent has ended.
+    A process inherits the environment variable TMPDIR from its parent, whatever its group or
+    session, and even if the parent has ended.
 
     Parameters
     ----------
     folder : path-like
         The folder, or the beginning of its path.
     """
-    mark = f"\0TMPDIR={os.fspath(folder)}".encode()
+    environment_entry = f"\0TMPDIR={os.fspath(folder)}".encode()
     empty_searches = 0
     for _ in range(_SEARCH_ROUNDS):
-        has_found = False
+        found_process = False
         for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
                 environment = b"\0" + (process / "environ").read_bytes()
-                if mark in environment:
+                if environment_entry in environment:
                     os.kill(int(process.name), signal.SIGKILL)
-                    has_found = True
-        empty_searches = 0 if has_found else empty_searches + 1
-        # one search may miss the child of a process that ends meanwhile
+                    found_process = True
+        empty_searches = 0 if found_process else empty_searches + 1
+        # two empty searches, since one can miss the child of a process that ends meanwhile
         if empty_searches == 2:
             return
         time.sleep(0.01)
@@ -117,7 +121,7 @@ def end_processes(folder: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def _path_of_opened(folder: str) -> Iterator[str]:
-    """Return a context with a path of this very folder, even if it is moved or replaced."""
+    """Return a context with a path that leads to this folder even if it is moved or replaced."""
     descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         yield f"/proc/self/fd/{descriptor}"
@@ -126,11 +130,11 @@ def _path_of_opened(folder: str) -> Iterator[str]:
 
 
 def remove_folder(folder: str | os.PathLike[str]) -> None:
-    """Remove a folder and everything in it that can be removed, however deep an FMU has nested it.
+    """Remove a folder with everything in it that can be removed, however deeply it is nested.
 
-    Inner folders are first moved to the top: `shutil.rmtree` calls itself for each level, and the
-    path of a deep one is longer than the system allows. Links are not followed, not even those that
-    a process of the FMU puts in the place of a folder meanwhile: it cannot reach what it links to.
+    Inner folders are first moved to the top. `shutil.rmtree` would call itself for each level, and
+    a deep path is longer than the system allows. Links are not followed, not even those by which a
+    process of the FMU replaces a folder meanwhile.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
-"""Files for the FMU of a structure: its binding, and the file that makes it a model of campaigns.
+"""Files for the FMU of a structure: its binding, and the file by which campaigns use it as a model.
 
-By the latter, campaigns are calibrated and effects searched for: `docs/fmu_models.md`.
+With the latter, campaigns are calibrated and missing effects are searched for:
+`docs/fmu_models.md`.
 """
 
 import numpy as np
@@ -14,17 +15,15 @@ from reporting.toml_file import parse_toml
 
 
 def structure_binding_text(design: StructureDesign, frequencies: int = 0) -> str:
-    """Return the binding file of a structure's FMU.
-
-    It binds controls, health, parameters, observations and monitors.
+    """Return the binding file of a structure's FMU, with all its variables.
 
     Parameters
     ----------
     design : StructureDesign
         The structure; its reduced model has the same names.
     frequencies : int
-        Number of natural frequencies that are observed, too; they cost the FMU more time than all
-        the rest.
+        The number of natural frequencies that are observed as well. They take the FMU more time
+        than all the other outputs.
     """
     modes = [f"[{mode}]" for mode in range(1, frequencies + 1)]
     text = rendered("structure_binding.toml", design=design, modes=modes).decode()
@@ -39,12 +38,12 @@ def structure_binding(design: StructureDesign, frequencies: int = 0) -> Binding:
 
 
 def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
-    """Return the file that makes a structure's FMU a model of campaigns.
+    """Return the file by which campaigns use a structure's FMU as a model.
 
     It has the forces, outputs, ports and parameters of the structure's file. A control in N is a
-    force, and one named load_factor is the load factor of flights. Where a load of 1 N at a point
-    meets a displacement output along it, there is a port. Ports of the structure file are named in
-    a comment only: the FMU has no input for a force there.
+    force, and one named load_factor is the load factor of flights. A point with a load of 1 N and a
+    displacement output along it becomes a port. Ports of the structure file are only named in a
+    comment, since the FMU has no input for a force there.
 
     Parameters
     ----------
@@ -83,7 +82,7 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
 
 
 def _is_unit_force_along(load: Load | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
-    """Return whether a load is a force of 1 N at the point or node of an output, and along it."""
+    """Return whether a load is a force of 1 N at the location and in the direction of an output."""
     if load.force is None or output.direction is None:
         return False
     load_location = _location(load)

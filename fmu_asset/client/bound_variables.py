@@ -26,9 +26,14 @@ _Texts = Annotated[tuple[_Text, ...], Field(strict=False)]
 
 
 def _with_expanded_patterns(names: object) -> object:
-    """Return the names in a text or in a list of texts, with patterns expanded.
+    """Return names with their patterns expanded, see `expand`.
 
-    Anything else is returned as it is, for pydantic to refuse.
+    What is neither a text nor a list is returned unchanged, so that pydantic refuses it.
+
+    Parameters
+    ----------
+    names : object
+        A text or a list of texts, as read from a file.
     """
     if isinstance(names, str):
         return expand(names)
@@ -44,7 +49,7 @@ def _with_expanded_patterns(names: object) -> object:
 
 
 def expand(pattern: str) -> tuple[str, ...]:
-    """Return the names for which a pattern stands: `a[{1..3}]` is a[1], a[2], a[3].
+    """Return the names that a pattern stands for: `a[{1..3}]` is a[1], a[2], a[3].
 
     Parameters
     ----------
@@ -54,7 +59,7 @@ def expand(pattern: str) -> tuple[str, ...]:
     Raises
     ------
     ValueError
-        If a range is empty or too long, or there is more than one.
+        If the range is empty or too long, or there is more than one.
     """
     ranges = _RANGE.findall(pattern)
     if not ranges:
@@ -97,14 +102,14 @@ class InputBinding(ScalarBinding):
 
     @property
     def limits(self) -> tuple[float, float]:
-        """The range in `unit`, infinite where no limit is stated."""
+        """The range in `unit`; infinite on a side without a limit."""
         low = -math.inf if self.minimum is None else self.minimum
         high = math.inf if self.maximum is None else self.maximum
         return low, high
 
 
 class ParameterBinding(InputBinding):
-    """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another.
+    """A parameter, whose `value` (in `unit`) is set at every reset unless the caller gives another.
 
     The value is a text for a text parameter (of the unit "1"), and may be the name of an item of an
     enumeration.
@@ -147,7 +152,7 @@ class VectorBinding(Section):
         return self.model_copy(update={"variables": tuple(names), "unit": unit_of_vector})
 
     def faults(self) -> Iterator[Fault]:
-        """Yield units that are neither one nor as many as variables."""
+        """Yield the fault that there is neither one unit nor one for each variable."""
         count = len(self.variables)
         unit_count = len(self.units)
         yield (
@@ -158,11 +163,11 @@ class VectorBinding(Section):
 
 
 class PortBinding(Section):
-    """A mechanical port, where another FMU can be coupled.
+    """A mechanical port, at which another FMU can be coupled.
 
-    Force and motion go opposite ways: an FMU takes the force and gives displacement or velocity, or
-    the other way round. Inputs are given to `FmiAsset.step` as `port={"<name>.force": ...}`,
-    outputs are in `Observation.extra` under the same names.
+    One of force and motion is an input of the FMU and the other an output: an FMU takes the force
+    and gives displacement or velocity, or the reverse. Inputs are given to `FmiAsset.step` as
+    `port={"<name>.force": ...}`; outputs are in `Observation.extra` under the same names.
     """
 
     force: VectorBinding
@@ -170,7 +175,7 @@ class PortBinding(Section):
     velocity: VectorBinding | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a port without motion, and units that it cannot have."""
+        """Yield the faults of a port: no motion, or a unit that its quantity cannot have."""
         has_motion = self.displacement is not None or self.velocity is not None
         yield not has_motion, "a port needs a displacement or a velocity beside its force"
         for name, vector in self.quantities.items():

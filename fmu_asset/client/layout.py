@@ -29,7 +29,7 @@ _KIND_ORDER = ("Real", "Float64", "Integer", "Boolean")
 
 
 class VariableElements(NamedTuple):
-    """A variable and the elements of it that are meant: one, or all."""
+    """A variable, and those of its elements that a binding names: one or all."""
 
     variable: VariableInfo
     elements: range
@@ -73,7 +73,13 @@ def find_variable(
 
 
 def _find_element(description: FmuDescription, name: str, label: str) -> VariableElements | None:
-    """Return the element of an array that a name like `p[3]` means; None if there is no array."""
+    """Return the element of an array that a name like `p[3]` means.
+
+    Returns
+    -------
+    VariableElements or None
+        None if the name has another form, or the FMU has no such array.
+    """
     match = _ELEMENT.fullmatch(name)
     if match is None:
         return None
@@ -119,12 +125,12 @@ def _check_use(
 
 
 class _GroupKey(NamedTuple):
-    """What the variables of a group in a block have in common; groups are sorted by it.
+    """The properties that the variables of a group in a block share; groups are sorted by it.
 
     Attributes
     ----------
     is_held : bool
-        Whether the values are held over a step; those that move in straight lines come first.
+        Whether the values are constant over a step. Linear inputs come first.
     kind_number : int
         Position of the base type in `_KIND_ORDER`.
     kind : str
@@ -137,20 +143,20 @@ class _GroupKey(NamedTuple):
 
 
 class BlockLayout:
-    """The order of variables in a block of values: by base type, then as the binding names them.
+    """The order of variables in a block of values: by base type, then as in the binding.
 
-    An array is in it with all its elements, since FMI 3 sets and reads arrays as a whole.
+    An array is in the block with all its elements, since FMI 3 sets and reads arrays as a whole.
 
     Parameters
     ----------
     description : FmuDescription
         The FMU.
     variables : sequence of VariableInfo
-        Variables that are exchanged; one that is named twice is once in the block.
+        Variables that are exchanged. A variable that is named twice is in the block once.
     begin : int
         Position of the first value.
     linear : bool
-        Whether continuous inputs move in straight lines over a step; these come first.
+        Whether continuous inputs change linearly over a step. These come first in the block.
 
     Attributes
     ----------
@@ -204,7 +210,9 @@ class BlockLayout:
 def start_values(
     description: FmuDescription, variable: VariableInfo, *, placeholders: bool = False
 ) -> list[float]:
-    """Return the declared start values; a single one stands for all elements of an array.
+    """Return the start values that an FMU declares for all elements of a variable.
+
+    A single start value of an array applies to all of its elements.
 
     Parameters
     ----------
@@ -213,8 +221,8 @@ def start_values(
     variable : VariableInfo
         The variable, with its present shape.
     placeholders : bool
-        Whether zeros are enough, since the caller gives all of its values. An array that was
-        resized may have no start values that fit.
+        Whether to return zeros, because the caller sets all values. The start values of a resized
+        array may not fit.
 
     Raises
     ------
@@ -222,9 +230,12 @@ def start_values(
         If they are no numbers, or not as many as the array has elements.
     """
     text = "0" if placeholders else variable.start or "0"
-    words = text.lower().split() or ["0"]
+    value_texts = text.lower().split() or ["0"]
     try:
-        values = [float({"true": "1", "false": "0"}.get(word, word)) for word in words]
+        values = [
+            float({"true": "1", "false": "0"}.get(value_text, value_text))
+            for value_text in value_texts
+        ]
     except ValueError as error:
         raise FmuFileError(
             f"{variable.name!r} of {description.label} has a start value that is no number "
@@ -243,7 +254,7 @@ def start_values(
 def with_structural_parameters(
     description: FmuDescription, binding: Binding
 ) -> tuple[FmuDescription, list[InitialValue]]:
-    """Return an FMU with the array sizes that a binding sets, and the values that set them.
+    """Return an FMU with the array sizes that a binding chooses, and the values that set them.
 
     Parameters
     ----------
@@ -263,8 +274,8 @@ def with_structural_parameters(
     lengths: dict[str | None, int] = {}
     for name, value in binding.binding.structural_parameters.items():
         label = f"structural_parameters.{name}"
-        where = f"{label} of the binding {binding.name}"
-        variable = find_variable(description, name, where, "structuralParameter").variable
+        location = f"{label} of the binding {binding.name}"
+        variable = find_variable(description, name, location, "structuralParameter").variable
         low, high = variable.bounds
         slot = InputSlot(label, (0,), low, high, IDENTITY, variable)
         numbers = slot.numbers(value).tolist()

@@ -52,7 +52,7 @@ class BindingResolver:
         self.binding = binding
 
     def place_in_binding(self, label: str) -> str:
-        """Return the name of a place in the binding, for messages."""
+        """Return a text for messages: a place in the binding, and the name of the binding."""
         return f"{label} of the binding {self.binding.name}"
 
     def find(self, name: str, label: str, causality: str) -> VariableElements:
@@ -75,12 +75,12 @@ class BindingResolver:
         return find_variable(self.description, name, self.place_in_binding(label), causality)
 
     def variable_or_array(self, name: str) -> VariableInfo | None:
-        """Return the variable of a name, or the array whose element it names, if there is one."""
+        """Return the variable of a name, or the array to whose element the name belongs."""
         array_name = name.rpartition("[")[0]
         return self.description.variable(name) or self.description.variable(array_name)
 
     def is_set_at_start(self, name: str) -> bool:
-        """Return whether a variable can be set before the initialisation only."""
+        """Return whether a variable can be set only before the initialisation."""
         variable = self.variable_or_array(name)
         if variable is None:
             return False
@@ -96,18 +96,18 @@ class BindingResolver:
         variable: VariableInfo,
         positions: Sequence[int],
     ) -> InputSlot:
-        """Return how values of an input are checked, converted and placed.
+        """Return the slot of an input, which checks and converts values and has their positions.
 
         Parameters
         ----------
         label : str
-            Place in the binding.
+            The place in the binding.
         input_binding : InputBinding
-            Unit and range of the input.
+            The unit and the range of the input.
         variable : VariableInfo
-            Its variable.
+            The FMU's variable.
         positions : sequence of int
-            Positions of its values.
+            The positions of the input's values in the request block.
 
         Raises
         ------
@@ -117,6 +117,7 @@ class BindingResolver:
         definitions = self.description.units_of(variable)
         unit_conversion = conversion(input_binding.unit, variable, definitions, where=label)
         low, high = variable.bounds
+        # A negative factor of the conversion exchanges the limits, so they are sorted.
         stated_low, stated_high = sorted(
             unit_conversion.to_fmu(limit) for limit in input_binding.limits
         )
@@ -138,7 +139,7 @@ class BindingResolver:
     def start_slot(self, label: str, input_binding: InputBinding) -> InputSlot:
         """Return the slot of a value that is set before the initialisation.
 
-        Its positions count from the first value of the variable itself.
+        The positions of its values count from the first element of the variable.
 
         Raises
         ------
@@ -151,23 +152,26 @@ class BindingResolver:
     # ------------------------------------------------------------------ ports
 
     def port_quantities(self) -> list[PortQuantity]:
-        """Return the quantities of all ports.
+        """Return the quantities of all ports of the binding.
 
         Raises
         ------
         BindingError
-            If a port mixes inputs and outputs, or force and motion are on the same side of the FMU.
+            If a port mixes inputs and outputs, or if force and motion are both inputs or both
+            outputs.
         """
         quantities = []
         for port_name, port in self.binding.port.items():
             force_count = len(port.force.variables)
-            sides: dict[str, bool] = {}
+            is_output_of_quantity: dict[str, bool] = {}
             for quantity, vector in port.quantities.items():
                 name = f"{port_name}.{quantity}"
-                sides[quantity] = self._is_output_vector(f"port.{name}", vector, force_count)
-                quantities.append(PortQuantity(name, vector, sides[quantity]))
-            force_is_output = sides.pop("force")
-            if force_is_output in sides.values():
+                is_output_of_quantity[quantity] = self._is_output_vector(
+                    f"port.{name}", vector, force_count
+                )
+                quantities.append(PortQuantity(name, vector, is_output_of_quantity[quantity]))
+            force_is_output = is_output_of_quantity.pop("force")
+            if force_is_output in is_output_of_quantity.values():
                 side = "outputs" if force_is_output else "inputs"
                 raise BindingError(
                     f"In {self.place_in_binding(f'port.{port_name}')}, force and motion are both "
@@ -176,18 +180,29 @@ class BindingResolver:
         return quantities
 
     def _is_output_vector(self, label: str, vector: VectorBinding, force_count: int) -> bool:
-        """Return whether the variables of a port's quantity are outputs of the FMU."""
-        where = self.place_in_binding(label)
+        """Return whether the variables of a port's quantity are outputs of the FMU.
+
+        Parameters
+        ----------
+        label : str
+            The place of the quantity in the binding.
+        vector : VectorBinding
+            The variables of the quantity.
+        force_count : int
+            The number of components of the force, which the quantity must have, too.
+        """
+        location = self.place_in_binding(label)
         count = len(vector.variables)
         if count != force_count:
             raise BindingError(
-                f"{where} has {count} values and the force {force_count}; give as many."
+                f"{location} has {count} values and the force {force_count}; give as many."
             )
-        sides = {self._is_input(variable) for variable in vector.variables}
-        if len(sides) > 1:
-            raise BindingError(f"{where} mixes inputs and outputs of the FMU.")
-        return not sides.pop()
+        are_inputs = {self._is_input(variable) for variable in vector.variables}
+        if len(are_inputs) > 1:
+            raise BindingError(f"{location} mixes inputs and outputs of the FMU.")
+        return not are_inputs.pop()
 
     def _is_input(self, name: str) -> bool:
+        """Return whether a name is that of an input, or of an element of an array input."""
         variable = self.variable_or_array(name)
         return variable is not None and variable.causality == "input"

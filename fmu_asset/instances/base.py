@@ -70,7 +70,8 @@ class FmiCall(NamedTuple):
     call : callable
         Makes the call and returns its status.
     convert_before, convert_after : callable or None
-        Converts values before they are set, and after they are read, where that is needed.
+        Converts values of the block before they are set, or into the block after they are read;
+        None if no conversion is needed.
     """
 
     function: str
@@ -107,7 +108,7 @@ class FmuInstance(Instance):
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(plan)
-        # time and step size, where they stand in the request
+        # time and step size as views of the first two numbers of the request block
         self._step_begin = ctypes.c_double.from_buffer(self.request, 0)
         self._step_size = ctypes.c_double.from_buffer(self.request, 8)
         self._plan = plan
@@ -127,7 +128,7 @@ class FmuInstance(Instance):
         self._motion_calls = [] if self._lines is None else self._calls_that_move(self._lines)
 
     def _load(self) -> FmpyInstance:
-        """Return fmpy's object with the binary loaded and the instance made."""
+        """Load the binary, instantiate the FMU, and return fmpy's object of it."""
         register(self._name, self)
         with chdir("."):
             try:
@@ -143,7 +144,7 @@ class FmuInstance(Instance):
         return fmu
 
     def _instantiate(self) -> FmpyInstance:
-        """Return fmpy's object, instantiated."""
+        """Instantiate the FMU and return fmpy's object of it."""
         plan = self._plan
         fmu = self.classes[self._version](
             guid=plan.fmu.guid,
@@ -166,7 +167,7 @@ class FmuInstance(Instance):
     def _go_to_start(
         self, start_time: float, parameters: InitialValues, *, with_inputs: bool
     ) -> None:
-        """Bring the instance to its first communication point; parameters as in `initialise`."""
+        """Set the parameters and initialise the FMU; parameters as in `initialise`."""
         fmu = self._fmu
         experiment = {
             "startTime": start_time,
@@ -194,7 +195,11 @@ class FmuInstance(Instance):
 
     @abstractmethod
     def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
-        """Return the calls that make inputs move: they set derivatives, or the inputs again."""
+        """Return the calls that make linear inputs change over a step.
+
+        Co-simulation sets their derivatives; model exchange sets the inputs themselves at each
+        evaluation.
+        """
 
     def _send_inputs(self) -> None:
         """Set the inputs of the request block."""
@@ -203,11 +208,15 @@ class FmuInstance(Instance):
         self._make_calls(self._set_calls + self._motion_calls)
 
     def _send_moved_inputs(self, lines: LinearInputs) -> None:
-        """Set the inputs at a later communication point of the step."""
+        """Set the inputs at a later communication point between two observations."""
         lines.move_to(self._step_begin.value)
         self._make_calls(self._set_calls + self._motion_calls)
 
     def _terminate_and_free(self) -> None:
+        """Terminate the simulation if it has begun, and free the instance.
+
+        An instance that reports a fatal error is not freed, since that can crash.
+        """
         if self._phase == "stepping":
             try:
                 self._fmu.terminate()
@@ -220,13 +229,13 @@ class FmuInstance(Instance):
 
     def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and go to the first communication point."""
-        errors_before = self._error_count
+        previous_error_count = self._error_count
         if self._lines is not None:
             self._lines.hold()
         with self._fmpy_calls("initialisation"):
             self._go_to_start(start_time, parameters, with_inputs=with_inputs)
             self._phase = "stepping"
-        if self._error_count > errors_before:
+        if self._error_count > previous_error_count:
             hint = "" if self._plan.stop_time is not None else _NO_STOP_TIME
             raise FmuCallError(f"The FMU refused its initialisation{hint}.", self._last_messages())
 
@@ -248,28 +257,32 @@ class FmuInstance(Instance):
         self._make_calls(self._get_calls, "reading outputs")
 
     def _do_substeps(self) -> None:
-        """Make all communication steps between two observations."""
+        """Make all communication steps between two observations.
+
+        If one fails after the first, the instance is lost: it cannot return to the last
+        observation.
+        """
         begin = self._step_begin.value
         size = self._step_size.value
-        number = 0
+        substep = 0
         try:
-            for number in range(self._plan.substeps):
-                self._step_begin.value = begin + number * size
-                if number and self._lines is not None:
+            for substep in range(self._plan.substeps):
+                self._step_begin.value = begin + substep * size
+                if substep and self._lines is not None:
                     self._send_moved_inputs(self._lines)
                 self._do_step()
         except FmuError as error:
-            if number == 0 or isinstance(error, FmuEndedError):
+            if substep == 0 or isinstance(error, FmuEndedError):
                 raise
             # between two observations it cannot go back to the last one
             self.lost = True
             sentence = (
-                f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between "
+                f"{error.sentence} It was step {substep + 1} of the {self._plan.substeps} between "
                 "two observations: reset the asset or restore a state to go on."
             )
             raise type(error)(sentence, error.messages) from error
         finally:
-            # the request is the caller's, and a later start is compared with it
+            # restore the request block: the caller compares it with those of later starts
             self._step_begin.value = begin
 
     def read(self) -> None:
@@ -290,7 +303,7 @@ class FmuInstance(Instance):
     def restore(self, content: bytes) -> None:
         """Restore a serialised FMU state."""
         fmu = self._fmu
-        errors_before = self._error_count
+        previous_error_count = self._error_count
         with self._fmpy_calls("restoring the state"):
             state = fmu.deserializeFMUState(content)
             try:
@@ -298,7 +311,7 @@ class FmuInstance(Instance):
             finally:
                 fmu.freeFMUState(state)
         self._end_time = None
-        if self._error_count > errors_before:
+        if self._error_count > previous_error_count:
             raise FmuStateError("The FMU refused the state.", self._last_messages())
 
     def reset(self) -> None:
@@ -335,7 +348,15 @@ class FmuInstance(Instance):
     # ------------------------------------------------------------------ C calls
 
     def _prepared_call(self, name: str, *arguments: object) -> Callable[[], int]:
-        """Return a call of a C function of the instance, such as SetReal, with C values."""
+        """Return a call of a C function of the instance, such as SetReal.
+
+        Parameters
+        ----------
+        name : str
+            The name of the function without the prefix of its version.
+        *arguments
+            C values, see `prepare_call`.
+        """
         model_prefix = f"{self._plan.fmu.model_identifier}_" if self._version == 1 else ""
         function = getattr(self._fmu.dll, f"{model_prefix}{self._prefix}{name}")
         component = ctypes.c_void_p.from_param(self._fmu.component)
@@ -375,6 +396,7 @@ class FmuInstance(Instance):
         return calls
 
     def _set_initial_values(self, initial_values: InitialValues) -> None:
+        """Set start values or parameters, one variable after the other."""
         for kind, reference, values in initial_values:
             if kind == "String":
                 self._fmu.setString([reference], values)
@@ -384,7 +406,20 @@ class FmuInstance(Instance):
             self._make_calls(self._group_calls("Set", (group,), doubles, 0))
 
     def _make_calls(self, calls: list[FmiCall], purpose: str = "setting inputs") -> None:
-        """Make prepared calls; `purpose` says what for, if one is refused."""
+        """Make prepared calls in order.
+
+        Parameters
+        ----------
+        calls : list of FmiCall
+            The calls.
+        purpose : str
+            What the calls are for, for the message if the FMU refuses one.
+
+        Raises
+        ------
+        FmuCallError
+            If a call returns a status that is not accepted.
+        """
         for function, call, convert_before, convert_after in calls:
             if convert_before is not None:
                 convert_before()
@@ -396,7 +431,10 @@ class FmuInstance(Instance):
 
     @contextmanager
     def _fmpy_calls(self, purpose: str) -> Iterator[None]:
-        """Translate failures of calls that fmpy makes, and come back to the working directory."""
+        """Return a context for calls by fmpy's methods.
+
+        It turns their failures into `FmuCallError`, and restores the working directory.
+        """
         if self.lost:
             raise FmuWorkerError(_LOST)
         with chdir("."):
@@ -409,7 +447,7 @@ class FmuInstance(Instance):
     # ------------------------------------------------------------------ errors
 
     def _ended_error(self, time: float) -> FmuEndedError:
-        """Record that the FMU has ended its simulation, and return the error that says so."""
+        """Record that the FMU has ended its simulation at a time [s]; return the error."""
         self._end_time = time
         return FmuEndedError(
             f"The FMU asked to end the simulation in {self._step_label()}, and ended at "
@@ -419,13 +457,22 @@ class FmuInstance(Instance):
         )
 
     def _step_label(self) -> str:
-        """Return what errors call the present step."""
+        """Return the name of the present step for messages."""
         return f"the step from t = {self._step_begin.value:g} s"
 
     def _call_error(self, function: str, status: int, purpose: str) -> FmuCallError:
-        """Return the error for a call that was not accepted, and give the instance up if it must.
+        """Return the error for a call that was not accepted; mark the instance as lost if it is.
 
         FMI allows some calls after an error. They are not used: the asset makes another instance.
+
+        Parameters
+        ----------
+        function : str
+            The full name of the C function.
+        status : int
+            The status that it returned.
+        purpose : str
+            What it was called for.
         """
         self.lost = self.lost or status != DISCARD
         consequence = {
@@ -442,4 +489,5 @@ class FmuInstance(Instance):
         )
 
     def _last_messages(self) -> list[str]:
+        """Return the last messages of the FMU, and remove all messages from its log."""
         return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]

@@ -46,7 +46,9 @@ class FMU1CoSimulation(FMU1Slave):  # type: ignore[misc]
 
 
 class CoSimulation(FmuInstance):
-    """A co-simulation instance: a step is one call, in FMI 3.0 without event mode or early return.
+    """A co-simulation instance: each step is one call of the FMU.
+
+    In FMI 3.0 it uses neither event mode nor early return.
 
     Parameters
     ----------
@@ -63,13 +65,13 @@ class CoSimulation(FmuInstance):
         self._terminated = ctypes.c_bool()
         self._returned_early = ctypes.c_bool()
         self._reached_time = ctypes.c_double()
-        # the C function itself: fmpy's method logs, and looks up names, at every call
+        # call the C function directly, since fmpy's method logs and looks up names at every call
         self._do_step_call = self._prepared_call(
             "DoStep", self._step_begin, self._step_size, *self._further_arguments()
         )
 
     def _further_arguments(self) -> tuple[object, ...]:
-        """Return the C arguments of doStep after time and step size, by the version of FMI."""
+        """Return the C arguments of doStep after time and step size; they depend on the version."""
         if self._version == 1:
             return (ctypes.c_char.from_param(b"\x01"),)  # newStep
         if self._version == 2:
@@ -83,7 +85,7 @@ class CoSimulation(FmuInstance):
         )
 
     def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
-        """Return the call that sets the first derivatives of inputs that move."""
+        """Return the call that sets the first derivatives of the linear inputs."""
         references: list[int] = []
         for group in self._plan.inputs:
             if group.linear:
@@ -122,22 +124,32 @@ class CoSimulation(FmuInstance):
             )
 
     def _limited_to_step(self, time: float) -> float:
-        """Return a time that the FMU says to have reached, limited to the step."""
+        """Return a time [s] that the FMU claims to have reached, limited to the present step."""
         begin = self._step_begin.value
         return min(max(time, begin), begin + self._step_size.value)
 
     def _raise_ended_if_terminated(self, status: int) -> None:
-        """Raise if an FMU of FMI 2 has discarded a step in order to end its simulation."""
+        """Raise an error if an FMU of FMI 2 has discarded a step because it ended its simulation.
+
+        FMI 2 reports the end of a simulation in this way; details must be asked for.
+
+        Parameters
+        ----------
+        status : int
+            The status of the step.
+        """
         if status != DISCARD or self._version != 2:
             return
         terminated = ctypes.c_int()
-        reached = ctypes.c_double()
+        reached_time = ctypes.c_double()
         dll = self._fmu.dll
         component = self._fmu.component
-        answer = dll.fmi2GetBooleanStatus(component, _TERMINATED, ctypes.byref(terminated))
-        if answer != OK or not terminated.value:
+        query_status = dll.fmi2GetBooleanStatus(component, _TERMINATED, ctypes.byref(terminated))
+        if query_status != OK or not terminated.value:
             return
-        answer = dll.fmi2GetRealStatus(component, _LAST_SUCCESSFUL_TIME, ctypes.byref(reached))
-        # exports of pythonfmu say of every discarded step that they ended where it began
-        if answer == OK and reached.value > self._step_begin.value:
-            raise self._ended_error(self._limited_to_step(reached.value))
+        query_status = dll.fmi2GetRealStatus(
+            component, _LAST_SUCCESSFUL_TIME, ctypes.byref(reached_time)
+        )
+        # FMUs of pythonfmu claim at every discarded step that they ended at its begin
+        if query_status == OK and reached_time.value > self._step_begin.value:
+            raise self._ended_error(self._limited_to_step(reached_time.value))

@@ -50,7 +50,7 @@ InitialValues = list[InitialValue]
 
 @dataclass(frozen=True)
 class VariableGroup:
-    """Variables of one base type, set or read in one call.
+    """Variables of one base type that are set or read by one call.
 
     Attributes
     ----------
@@ -59,9 +59,9 @@ class VariableGroup:
     references : tuple of int
         Value references, in the order of the block.
     count : int
-        Number of values; more than references if there are arrays.
+        The number of values; it exceeds that of the references if there are arrays.
     linear : bool
-        Whether the values move in straight lines over a step; such inputs come first.
+        Whether the values change linearly over a step. Such inputs come first in the block.
     """
 
     kind: str
@@ -96,7 +96,7 @@ class FmuIdentity:
 
     @property
     def major_version(self) -> int:
-        """1, 2 or 3."""
+        """The major version of FMI: 1, 2 or 3."""
         return int(self.fmi_version[0])
 
 
@@ -139,14 +139,14 @@ class Plan:
 
     @property
     def linear_count(self) -> int:
-        """Number of input values that move in straight lines."""
+        """The number of input values that change linearly over a step."""
         return sum(group.count for group in self.inputs if group.linear)
 
     @property
     def input_count(self) -> int:
-        """Number of values after time and step size in a request.
+        """The number of values after time and step size in a request block.
 
-        These are all inputs, and then the values at which straight lines begin.
+        These are all inputs, and then the values of the linear inputs at the begin of the step.
         """
         return sum(group.count for group in self.inputs) + self.linear_count
 
@@ -177,15 +177,15 @@ _BOOLEAN_TYPES: dict[int, CType] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctype
 
 
 class GroupArguments(NamedTuple):
-    """Arguments of a C function that sets or reads a group of variables, after the instance.
+    """The arguments, after the instance, of a C function that sets or reads a group of variables.
 
     Attributes
     ----------
     values : tuple
-        C values.
+        The C values.
     convert : callable or None
         Converts the numbers of the block before they are set, or into the block after they are
-        read; None if the FMU reads and writes the block itself.
+        read. None if the FMU reads and writes the block itself, because its type is double.
     """
 
     values: tuple[object, ...]
@@ -217,16 +217,18 @@ def group_arguments(
     """
     c_type = _BOOLEAN_TYPES[fmi_version] if group.kind == "Boolean" else _C_TYPES[group.kind]
     convert = None
+    # Values of type double are used where they stand; others are converted to and from an array
+    # of their type.
     if c_type is ctypes.c_double and group.count:
         values = (c_type * group.count).from_buffer(doubles, 8 * begin)
     else:
         values = (c_type * group.count)()
-        in_block = values_of(doubles)[begin : begin + group.count]
-        in_fmu = np.ctypeslib.as_array(values)
+        block_values = values_of(doubles)[begin : begin + group.count]
+        fmu_values = np.ctypeslib.as_array(values)
         if sent:
-            convert = partial(np.copyto, in_fmu, in_block, casting="unsafe")
+            convert = partial(np.copyto, fmu_values, block_values, casting="unsafe")
         else:
-            convert = partial(np.copyto, in_block, in_fmu, casting="unsafe")
+            convert = partial(np.copyto, block_values, fmu_values, casting="unsafe")
     reference_count = len(group.references)
     references = (ctypes.c_uint * reference_count)(*group.references)
     arguments: tuple[object, ...] = (
@@ -269,24 +271,25 @@ _ROUNDING = 1e-12
 
 
 class LinearInputs:
-    """Inputs that move in straight lines over a step.
+    """Inputs that change linearly over a step (FMI's input derivatives).
 
-    A request holds the inputs at the end of the step (those that move first), and last the values
-    at which the lines begin.
+    The request block holds their values at the end of the step, before the other inputs, and in its
+    last part their values at the begin of the step.
 
     Parameters
     ----------
     request : C array of double
-        The request block: time, step size, inputs, and begins of lines.
+        The request block: time, step size, inputs at the end of the step, linear inputs at its
+        begin.
     plan : Plan
         What is exchanged.
 
     Attributes
     ----------
     values : C array of double
-        Time, step size, and the inputs of the present moment.
+        Time, step size, and all inputs at the present time within the step.
     slopes : C array of double
-        Derivatives in time of the inputs that move.
+        The derivatives in time of the linear inputs.
     """
 
     def __init__(self, request: DoubleBlock, plan: Plan) -> None:
@@ -304,11 +307,11 @@ class LinearInputs:
         self._duration = 1.0
 
     def hold(self) -> None:
-        """Give the inputs of the request as they are, as in an initialisation."""
+        """Set all present inputs to those of the request, as for an initialisation."""
         self._present[:] = self._request[: len(self._present)]
 
     def begin_step(self) -> None:
-        """Take the lines of a new request, and give the inputs at its begin."""
+        """Compute the slopes of a new request, and set the present inputs to those at its begin."""
         self._start_time = self._request[0]
         self._duration = self._request[1] * self._substeps
         self._slopes[:] = (self._at_end - self._at_begin) / self._duration
@@ -316,7 +319,10 @@ class LinearInputs:
         self._present_moving[:] = self._at_begin
 
     def move_to(self, time: float) -> None:
-        """Give the inputs at a time [s]; those at the end equal the request to the bit."""
+        """Set the linear inputs to their values at a time [s].
+
+        At the end of the step they equal the request bit by bit, whatever the rounding of the time.
+        """
         fraction = (time - self._start_time) / self._duration
         if fraction >= 1.0 - _ROUNDING:
             self._present_moving[:] = self._at_end
@@ -326,7 +332,7 @@ class LinearInputs:
 
 
 class Instance(Protocol):
-    """An instance of an FMU: in this process, in a worker, or of several coupled FMUs.
+    """An instance of an FMU: in this process, in a worker process, or of several coupled FMUs.
 
     Parameters
     ----------
@@ -336,10 +342,10 @@ class Instance(Protocol):
     Attributes
     ----------
     request, reply : C array of double
-        Two blocks that are allocated once: time, step size and all inputs; and all outputs.
-        Integers and Booleans are doubles there.
+        Two blocks of memory that are allocated once. The request holds time, step size and all
+        inputs, the reply all outputs. Integers and Booleans are stored as doubles.
     lost : bool
-        Whether it cannot be used any more.
+        Whether the instance can no longer be used.
     """
 
     request: DoubleBlock

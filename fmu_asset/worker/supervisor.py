@@ -25,14 +25,14 @@ if TYPE_CHECKING:
     from .refusal_tracer import RefusalTracer
 
 _GRACE = 2.0
-"""Seconds in which a worker without a twin ends by itself."""
+"""Time that a worker without a twin has to end by itself [s]."""
 _LONGEST_END = 5.0
-"""Seconds in which the descendants of a worker must have ended."""
+"""Time after which descendants of a worker that still run are given up [s]."""
 _PR_SET_PDEATHSIG = 1
 _PR_SET_CHILD_SUBREAPER = 36
 _ALL_THREADS = 0x40000000  # __WALL of waitpid(2)
 _MOST_STOPS = 1000
-"""Stops of a traced worker after which the supervisor looks at the twin."""
+"""Number of stops of a traced worker after which the supervisor checks whether the twin runs."""
 _HANDLED_SIGNALS = (signal.SIGTERM, signal.SIGCHLD)
 
 
@@ -68,20 +68,20 @@ class _Worker(NamedTuple):
 
 
 def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
-    """Start the worker, wait for its end or the twin's, clear up, and end as the worker did.
+    """Start the worker, wait until it or the twin ends, clean up, and end as the worker did.
 
-    The pipes to the twin are the standard input and output. The worker has them elsewhere, and
-    what an FMU prints goes to the log.
+    At the start, the pipes to the twin are the standard input and output. They are moved to other
+    descriptors for the worker, so that what an FMU prints goes to the log.
 
     Parameters
     ----------
     scratch, shared : str
-        Folder of the worker, and of the extracted FMU; the twin removes them unless it is dead.
+        The folder of the worker, and that of the extracted FMU. They are removed here only if the
+        twin is dead, which otherwise removes them.
     grants : str
-        `Grants` of the sandbox as JSON; an empty text for none.
+        The `Grants` of the sandbox as JSON; empty for no sandbox.
     report : str
-        Number of the file descriptor to which refusals of the sandbox go; an empty text if none are
-        counted.
+        The number of the file descriptor for the report of refusals; empty if they are not counted.
     """
     twin = _move_pipes_of_twin()
     _limit_this_process()
@@ -107,25 +107,27 @@ def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
     os.close(twin.outgoing)
     # wait for its end
     is_deserted = _wait_for_end(worker, twin, tracer, statuses)
-    # from here on no process number is reused unnoticed
+    # From here on children are reaped only by the calls below, so that the number of an ended
+    # process is not given to another one unnoticed.
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     if worker.number in statuses:
-        status = statuses[worker.number]
+        worker_status = statuses[worker.number]
     else:
-        _, status = os.waitpid(worker.number, 0)
+        _, worker_status = os.waitpid(worker.number, 0)
     # clear up
     _end_descendants()
     # the pipes of a twin are closed a moment before it is dead
-    if is_deserted and not was_asked_to_end and status != 0 and has_ended(twin.process, 1.0):
+    if is_deserted and not was_asked_to_end and worker_status != 0 and has_ended(twin.process, 1.0):
         remove_folder(scratch)
         remove_folder(shared)
-    _end_as(status)
+    _end_as(worker_status)
 
 
 def _move_pipes_of_twin() -> _Twin:
-    """Return the twin and its pipes, which are no longer the standard input and output."""
+    """Move the twin's pipes away from the standard input and output; return twin and pipes."""
     parent = os.getppid()
-    # The end of a pipe says nothing: an FMU can open the other side of it for itself.
+    # The end of the twin is seen at its process. A pipe does not show it for certain, since an FMU
+    # can keep the other side of the pipe open.
     process = os.pidfd_open(parent)
     if os.getppid() != parent:
         os._exit(0)  # the twin has ended meanwhile
@@ -144,7 +146,7 @@ def _limit_this_process() -> None:
 
 
 def _start_worker(twin: _Twin, scratch: str, shared: str, grants: str, report: str) -> _Worker:
-    """Return the worker, a fork of this process; arguments as for `supervise`."""
+    """Fork the worker from this process and return it; arguments as for `supervise`."""
     supervisor = os.getpid()
     number = os.fork()
     if number == 0:
@@ -161,7 +163,7 @@ def _start_worker(twin: _Twin, scratch: str, shared: str, grants: str, report: s
 
 
 def _work(twin: _Twin, scratch: str, shared: str, grants: str) -> NoReturn:
-    """Serve the twin in the sandbox, as the worker; arguments as for `supervise`."""
+    """As the worker, enter the sandbox and serve the twin; arguments as for `supervise`."""
     # Imports are here so that the supervisor has nothing of them, and before the sandbox, since
     # some libraries start programs.
     try:
@@ -182,14 +184,14 @@ def _work(twin: _Twin, scratch: str, shared: str, grants: str) -> NoReturn:
 
 
 def _end_as(status: int) -> NoReturn:
-    """End this process in the way of the worker, by the same signal or exit status.
+    """End this process as the worker ended: by the same signal or with the same exit status.
 
     The twin sees only this process, and reports how the worker died.
 
     Parameters
     ----------
     status : int
-        Status of the worker from waitpid(2).
+        The status of the worker from waitpid(2).
     """
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
@@ -219,12 +221,13 @@ def _tracer_of(worker: int, report: str) -> "RefusalTracer | None":
 
 
 def _kill(process: int) -> None:
+    """Kill the process of a file descriptor, unless it has ended."""
     with suppress(ProcessLookupError):
         signal.pidfd_send_signal(process, signal.SIGKILL)
 
 
 def _do_nothing(*_: object) -> None:
-    """Handle a signal: that it came is seen at the wakeup descriptor."""
+    """Handle a signal by doing nothing: the wakeup descriptor shows that it came."""
 
 
 def _reap_children(statuses: dict[int, int]) -> None:
@@ -238,19 +241,19 @@ def _reap_children(statuses: dict[int, int]) -> None:
 
 
 def _resume_stopped(tracer: "RefusalTracer", statuses: dict[int, int]) -> bool:
-    """Resume threads that have stopped at a system call, and reap processes that have ended.
+    """Resume threads that have stopped at a system call, and reap ended processes.
 
     Parameters
     ----------
     tracer : RefusalTracer
-        The tracer, which looks at the calls.
+        The tracer, which inspects the calls.
     statuses : dict of int to int
         Exit statuses by process number; extended in place.
 
     Returns
     -------
     bool
-        Whether there may be more of them.
+        Whether more of them may be waiting, since the limit of stops was reached.
     """
     with suppress(ChildProcessError):
         for _ in range(_MOST_STOPS):
@@ -268,10 +271,11 @@ def _resume_stopped(tracer: "RefusalTracer", statuses: dict[int, int]) -> bool:
 def _wait_for_end(
     worker: _Worker, twin: _Twin, tracer: "RefusalTracer | None", statuses: dict[int, int]
 ) -> bool:
-    """Wait for the worker's end; return whether the twin has closed its pipe or is gone.
+    """Wait for the end of the worker; return whether the twin had left it before.
 
-    A traced worker stops at each of its system calls until it is resumed here. That is not done in
-    the handler of SIGCHLD, since handlers interrupt each other.
+    The twin has left it if it has ended or closed its pipe. The worker is then killed unless it
+    ends soon. A traced worker stops at each of its system calls until it is resumed here. The
+    handler of SIGCHLD must not do so, since handlers can interrupt each other.
 
     Parameters
     ----------
@@ -284,24 +288,24 @@ def _wait_for_end(
     statuses : dict of int to int
         Exit statuses by process number; extended in place.
     """
-    woken, waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-    signal.set_wakeup_fd(waking, warn_on_full_buffer=False)
+    wakeup_read_end, wakeup_write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(wakeup_write_end, warn_on_full_buffer=False)
     has_stopped = tracer is not None
     poll = select.poll()
-    poll.register(woken, select.POLLIN)
+    poll.register(wakeup_read_end, select.POLLIN)
     poll.register(worker.process, select.POLLIN)
     poll.register(twin.incoming, 0)  # the end of a pipe is reported in any case
     poll.register(twin.process, select.POLLIN)
     deadline: float | None = None
     while True:
-        limit = None if deadline is None else 1000.0 * max(deadline - time.monotonic(), 0.0)
-        events = {descriptor for descriptor, _ in poll.poll(0 if has_stopped else limit)}
-        if woken in events:
-            os.read(woken, 4096)
-        if tracer is not None and (has_stopped or woken in events):
+        timeout = None if deadline is None else 1000.0 * max(deadline - time.monotonic(), 0.0)
+        events = {descriptor for descriptor, _ in poll.poll(0 if has_stopped else timeout)}
+        if wakeup_read_end in events:
+            os.read(wakeup_read_end, 4096)
+        if tracer is not None and (has_stopped or wakeup_read_end in events):
             has_stopped = _resume_stopped(tracer, statuses)
-        # the twin first: a worker that its twin has left may end before we look
-        for descriptor in events - {worker.process, woken}:
+        # Check the twin first: if it has left, the worker may have ended for that reason already.
+        for descriptor in events - {worker.process, wakeup_read_end}:
             poll.unregister(descriptor)
             deadline = time.monotonic() + _GRACE
         if worker.process in events:
@@ -312,9 +316,9 @@ def _wait_for_end(
 
 
 def _end_descendants() -> None:
-    """Kill the processes that the worker has left.
+    """Kill the processes that the worker has left behind.
 
-    The children of a process that is killed become the supervisor's children, and are next.
+    When a process is killed, its children become children of the supervisor, and are killed next.
     """
     deadline = time.monotonic() + _LONGEST_END
     while time.monotonic() < deadline:
