@@ -111,7 +111,7 @@ _STYLE: Final[dict[Any, Any]] = {
 
 @contextmanager
 def publication_style() -> Iterator[None]:
-    """Return a context of matplotlib's settings for figures of the project.
+    """Return a context with matplotlib's settings for figures of the project.
 
     The user's own settings have no effect in it, and are restored at its end.
     """
@@ -290,7 +290,7 @@ def panel_label(axes: Axes, label: str, title: str = "") -> None:
 
 
 def to_svg(figure: Figure) -> bytes:
-    """Return a figure as SVG, with text as outlines and with values for the reader's pointer.
+    """Return a figure as SVG, with texts as outlines and with the values that the pointer shows.
 
     The file has neither a date nor a document type.
     """
@@ -351,7 +351,10 @@ def save_figure(figure: Figure, folder: Path, name: str) -> bytes:
 
 
 def _parse_tick_labels_of_powers(figure: Figure) -> None:
-    """Let logarithmic axes show powers of ten, which matplotlib writes as mathematics."""
+    """Let tick labels of logarithmic axes be parsed as mathematics, as in "$10^3$".
+
+    The style of the project turns this off for all other texts.
+    """
     ticks: list[Tick] = []
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):
@@ -369,16 +372,15 @@ _REFERENCE = re.compile(r'(href="#|url\(#)([^")]+)')
 
 
 def inline_svg(svg: bytes, prefix: str, description: str) -> str:
-    """Return an SVG as an element of an HTML page.
-
-    The XML heading is removed, and the size of the drawing follows the page.
+    """Return an SVG as an element of an HTML page, scaled to the width of the page.
 
     Parameters
     ----------
     svg : bytes
         The SVG.
     prefix : str
-        The beginning of all ids and references to them; ids must be unique in a page.
+        The text that is put before all ids and references to them, since ids must be unique in a
+        page.
     description : str
         The description for readers who cannot see the drawing.
 
@@ -388,14 +390,14 @@ def inline_svg(svg: bytes, prefix: str, description: str) -> str:
         If the bytes are not an SVG that can be scaled.
     """
     text = svg.decode("utf-8", errors="replace")
-    start = text.find("<svg")
-    end = text.find(">", start)
-    if start < 0 or end < 0:
+    start_of_tag = text.find("<svg")
+    end_of_tag = text.find(">", start_of_tag)
+    if start_of_tag < 0 or end_of_tag < 0:
         raise InvalidFigureError(
             "A figure for a page must be an SVG; the bytes given have no <svg> element."
         )
-    opening = text[start:end]
-    body = text[end:].rstrip()
+    opening = text[start_of_tag:end_of_tag]
+    body = text[end_of_tag:].rstrip()
     view_box = re.search(r'viewBox="([^"]+)"', opening)
     if view_box is None:
         raise InvalidFigureError(

@@ -166,8 +166,8 @@ class Words:
             The values of the templates; `more` are further columns.
         """
         description = self.content["tables"][name]
-        headings = _shown_headings(description["columns"], values)
-        columns = [_column_of_heading(heading, values) for heading in headings]
+        shown_headings = _shown_headings(description["columns"], values)
+        columns = [_column_of_heading(heading, values) for heading in shown_headings]
         for extra in values.get("more", ()):
             columns.append(extra if isinstance(extra, Column) else number_column(extra))
         all_values = values | self._shared
@@ -176,8 +176,8 @@ class Words:
             filled_row = [fill_template(cell, **all_values) for cell in template_row]
             if any(filled_row[1:]):
                 cells.append(filled_row)
-        if headings and "cell" in headings[0]:  # a table may have no columns but `more`
-            cells += _cells_of_records(headings, rows, all_values)
+        if shown_headings and "cell" in shown_headings[0]:  # a table may have no columns but `more`
+            cells += _cells_of_records(shown_headings, rows, all_values)
         else:
             cells += rows
         if cells:
@@ -185,7 +185,7 @@ class Words:
         return columns, cells
 
     def words(self, kind: str, name: str, /, **values: object) -> dict[str, str]:
-        """Return the "title" and "caption" of one of the `figures` or `tables`."""
+        """Return the title and the caption of one of the `figures` or `tables`."""
         description = self.content[kind][name]
         all_values = self._shared | values
         return {key: fill_template(description[key], **all_values) for key in ("title", "caption")}
@@ -226,6 +226,7 @@ class Words:
     def _table_block(
         self, block: Mapping[str, Any], values: Mapping[str, Any]
     ) -> Iterator[RenderedBlock]:
+        """Yield a table of the file as a block, unless it has no rows."""
         name = block["table"]
         rows = evaluated(block["of"], **values) if "of" in block else None
         more = evaluated(block.get("more", "[]"), **values)
@@ -266,7 +267,7 @@ class Words:
     def add_table(
         self, page: "Page", name: str, rows: Sequence[Any] = (), /, **values: Any
     ) -> None:
-        """Add a table with its title and caption to a page, if it has rows; see `table`."""
+        """Add a table with its title and caption to a page, unless it has no rows; see `table`."""
         columns, cells = self.table(name, rows, **values)
         if cells:
             page.add_table(Table(columns, cells), **self.words("tables", name, **values))
@@ -275,17 +276,21 @@ class Words:
 def _shown_headings(
     headings: Iterable[str | dict[str, Any]], values: Mapping[str, object]
 ) -> list[dict[str, Any]]:
-    """Return the headings of a table as tables of TOML, without those whose `when` is false."""
-    shown = []
+    """Return the headings of a table that are shown, as tables of TOML.
+
+    A heading with the key `when` is left out if the value of that name is false.
+    """
+    shown_headings = []
     for heading in headings:
         if isinstance(heading, str):
             heading = {"text": heading}
         if "when" not in heading or values.get(heading["when"], True):
-            shown.append(heading)
-    return shown
+            shown_headings.append(heading)
+    return shown_headings
 
 
 def _column_of_heading(heading: dict[str, Any], values: Mapping[str, object]) -> Column:
+    """Return the column that a heading describes, with its name filled in."""
     name = fill_template(heading.get("text") or heading["number"], **values)
     return Column(name, heading.get("unit", ""), numeric="number" in heading)
 
@@ -293,6 +298,7 @@ def _column_of_heading(heading: dict[str, Any], values: Mapping[str, object]) ->
 def _cells_of_records(
     headings: Sequence[dict[str, Any]], records: Sequence[Any], values: Mapping[str, object]
 ) -> list[list[str]]:
+    """Return the cells of a table, one row for each record, from the templates of its headings."""
     rows = []
     for number, record in enumerate(records, start=1):
         row_values = {**values, "row": record, "row_number": number}
@@ -303,7 +309,7 @@ def _cells_of_records(
 def _highlights(
     pairs: Iterable[tuple[str, str]], values: Mapping[str, object]
 ) -> list[tuple[str, str]]:
-    """Return pairs of a value and its meaning, without those that have no value."""
+    """Return pairs of a value and its meaning; pairs whose value is empty are left out."""
     highlights = []
     for value_template, meaning_template in pairs:
         value = fill_template(value_template, **values)
@@ -313,7 +319,7 @@ def _highlights(
 
 
 def _text_blocks(block: Mapping[str, Any], values: Mapping[str, object]) -> Iterator[RenderedBlock]:
-    """Yield the text of a block once, or for each of its rows."""
+    """Yield the text of a block once, or once for each entry of its expression `of`."""
     kind = "notice" if "notice" in block else "say"
     rows = evaluated(block["of"], **values) if "of" in block else [None]
     if rows is None:
@@ -349,6 +355,7 @@ class Page:
         self._blocks: list[_PageBlock] = []
 
     def _add(self, kind: str, **content: Any) -> None:
+        """Append a block of a kind with its content."""
         self._blocks.append(_PageBlock(kind, content))
 
     def _next_number(self, kind: str) -> int:
@@ -368,7 +375,7 @@ class Page:
         self._add("notice", text=text)
 
     def add_highlights(self, items: Sequence[tuple[str, str]]) -> None:
-        """Add a row of a few figures in large print: pairs of a value and its meaning."""
+        """Add a row of a few values in large print, each with its meaning."""
         self._add("highlights", items=items)
 
     def add_figure(self, svg: bytes, caption: str, *, title: str) -> int:
@@ -426,7 +433,7 @@ class Page:
 
 @cache
 def script_source() -> str:
-    """Return the source by which a Content-Security-Policy allows the script of pages."""
+    """Return the source that allows the script of pages in a Content-Security-Policy."""
     digest = sha256(_read_resource("hover.js").encode()).digest()
     return f"'sha256-{b64encode(digest).decode()}'"
 

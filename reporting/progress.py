@@ -41,7 +41,7 @@ class Stage:
 
 
 class Progress:
-    """Receives reports of progress; this one shows nothing, the default of library functions."""
+    """The receiver of progress reports; this class, the default of libraries, shows nothing."""
 
     @contextmanager
     def stage(self, description: str, total: int | None = None, unit: str = "") -> Iterator[Stage]:
@@ -67,7 +67,7 @@ SilentProgress = Progress
 
 
 default_progress: Callable[[], Progress] = SilentProgress
-"""Makes the progress of work that was given none; while a command runs, it is the command's."""
+"""Makes the progress of work whose caller gives none. A running command replaces this function."""
 
 
 def reporter(progress: Progress | None = None) -> Progress:
@@ -83,7 +83,7 @@ def stage(
 
 
 def note(message: str) -> None:
-    """Show one line of the running command, such as that a function is compiled."""
+    """Show one line about the running command, such as that a function is being compiled."""
     default_progress().note(message)
 
 
@@ -101,9 +101,10 @@ class _BarStage(Stage):
 
 
 class _LineStage(Stage):
-    """A stage on a pipe: a line now and then shows that the work goes on.
+    """A stage that is shown as lines, on a pipe or in a log.
 
-    A thread shows the last detail again where the work reports nothing for `LONGEST_SILENCE`.
+    If the work reports nothing for `LONGEST_SILENCE`, a thread repeats the last detail, so that the
+    reader sees that the work goes on.
     """
 
     def __init__(
@@ -132,7 +133,7 @@ class _LineStage(Stage):
             self._show(now)
 
     def _show(self, now: float) -> None:
-        """Show how much is done at a time of the clock [s]."""
+        """Show how much is done, with the present time of the clock [s]."""
         self._time_of_last_line = now
         self._lines_shown += 1
         parts = []
@@ -146,12 +147,12 @@ class _LineStage(Stage):
         self._note(f"{self._description}: {', '.join(parts)}")
 
     def _break_silence(self) -> None:
-        """Show a line after each half of the longest silence in which none was shown."""
-        shown_before = self._lines_shown
+        """Show a line whenever none has been shown during half of the longest silence."""
+        previous_count = self._lines_shown
         while not self._has_ended.wait(0.5 * LONGEST_SILENCE):
-            if self._lines_shown == shown_before:
+            if self._lines_shown == previous_count:
                 self._show(time.perf_counter())
-            shown_before = self._lines_shown
+            previous_count = self._lines_shown
 
     def stop(self) -> None:
         """Show no further line."""

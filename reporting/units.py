@@ -87,6 +87,7 @@ class ExactMeaning(NamedTuple):
 
 
 def _meaning(factor: float, **exponents: int) -> Meaning:
+    """Return the meaning of a unit from its factor and the exponents of its base units."""
     return Meaning(tuple(exponents.get(base, 0) for base in BASE_UNITS), factor)
 
 
@@ -108,7 +109,10 @@ _COMMON_UNITS = {
 
 @cache
 def _known_units() -> "UnitRegistry[Any]":
-    """Return pint's units with factors in fractions; multiples of pi are those of the float."""
+    """Return pint's registry of units, with factors as fractions.
+
+    Pi is the fraction that the floating-point number has.
+    """
     import pint
 
     known_units: UnitRegistry[Any] = pint.UnitRegistry(
@@ -122,6 +126,13 @@ def _known_units() -> "UnitRegistry[Any]":
 
 def _pint_expression(unit: str, *, gravity: bool) -> str:
     """Return a unit in the notation of pint.
+
+    Parameters
+    ----------
+    unit : str
+        The unit.
+    gravity : bool
+        Whether g is an acceleration, not a mass.
 
     Raises
     ------
@@ -155,9 +166,8 @@ def _pint_expression(unit: str, *, gravity: bool) -> str:
 def _is_unit_with_power(factor: re.Match[str], *, is_first: bool, is_dividend: bool) -> bool:
     """Return whether a factor can belong to a unit.
 
-    A power of 0 or 1 without caret is the number of a pin, gauge or channel: `A0`, `N1`. The
-    number 1 is a factor only where it is divided by others: `1/s`, `m.(1/s)`; `12` or `m 1` are no
-    units.
+    A power of 0 or 1 without a caret is the number of a pin, gauge or channel: `A0`, `N1`. The
+    number 1 is a factor only if it begins a quotient: `1/s`, `m.(1/s)`; `12` or `m 1` are no units.
 
     Parameters
     ----------
@@ -166,7 +176,7 @@ def _is_unit_with_power(factor: re.Match[str], *, is_first: bool, is_dividend: b
     is_first : bool
         Whether the factor is the first of the unit.
     is_dividend : bool
-        Whether the factor is divided by the next one.
+        Whether the next operator divides the factor.
     """
     has_caret = bool(factor["caret"])
     if factor["name"] == "1":
@@ -227,9 +237,9 @@ def exact_meaning(unit: str, *, gravity: bool = False) -> ExactMeaning:
         offset = known_units.Quantity(Fraction(0), parsed).to_root_units().magnitude
     except (PintError, TokenError, *_ERRORS_OF_THE_PARSER) as cause:
         raise ValueError(f"{unit!r} is no unit") from cause
-    powers: dict[str, Any] = dict(root_units._units)
-    exponents = [powers.pop(base_unit, 0) for base_unit in _PINT_BASE_UNITS]
-    has_other_units = bool(powers)
+    power_of_unit: dict[str, Any] = dict(root_units._units)
+    exponents = [power_of_unit.pop(base_unit, 0) for base_unit in _PINT_BASE_UNITS]
+    has_other_units = bool(power_of_unit)
     if has_other_units or any(exponent != int(exponent) for exponent in exponents):
         raise ValueError(f"{unit!r} is no unit of SI")
     exponent_of_mass = int(exponents[0])

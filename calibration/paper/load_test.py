@@ -83,13 +83,13 @@ def normal_reference_bandwidth(samples: Float) -> float:
 
 
 class KernelDensity(NamedTuple):
-    """A density (N,) on an even grid (N,)."""
+    """A density (N,) at the points of an even grid (N,)."""
 
     grid: Float
     density: Float
 
     def at(self, values: Float) -> Float:
-        """Return the density at values by linear interpolation, elementwise."""
+        """Return the density at given values, interpolated linearly between the grid points."""
         return np.asarray(np.interp(values, self.grid, self.density))
 
 
@@ -99,7 +99,10 @@ def kernel_density(
     window: tuple[float, float],
     weights: Float | None = None,
 ) -> KernelDensity:
-    """Return the Gaussian kernel density of samples.
+    """Return the Gaussian kernel density of samples, on an even grid.
+
+    The samples are counted in cells much narrower than the kernel, and the counts are smoothed,
+    which is far faster than a sum over the samples.
 
     Parameters
     ----------
@@ -108,7 +111,7 @@ def kernel_density(
     bandwidth : float
         The standard deviation of the kernel.
     window : (float, float)
-        The range of the density.
+        The range in which the density is needed.
     weights : (n,) array, optional
         The weights of the samples; equal by default.
     """
@@ -169,7 +172,7 @@ def particle_filter(
     likelihood_grid = prior.mean + prior.standard_deviation * standardised_grid
     window = float(likelihood_grid[0]), float(likelihood_grid[-1])
 
-    # Weights, pair by pair
+    # Weights, pair by pair. A product of likelihoods would underflow, so logarithms are added.
     log_weight = np.zeros(particle_count)
     likelihood = np.zeros((data.count, likelihood_grid.size))
     for pair in range(data.count):
@@ -186,26 +189,28 @@ def particle_filter(
             )
     weight = np.exp(log_weight - float(log_weight.max()))
     weight /= weight.sum()
-    effective = 1.0 / float(np.sum(weight**2))
-    if effective < _FEWEST_EFFECTIVE_PARTICLES:
+    effective_size = 1.0 / float(np.sum(weight**2))
+    if effective_size < _FEWEST_EFFECTIVE_PARTICLES:
         raise PosteriorError(
-            f"only {effective:.1f} of {particle_count} particles effectively remain after "
+            f"only {effective_size:.1f} of {particle_count} particles effectively remain after "
             f"{data.count} pairs; take more particles, or the exact posterior."
         )
 
     # Densities of e and of the stiffness. The standard deviation of the weighted particles replaces
     # the robust one in the rule of the bandwidth.
-    e = _weighted_moments(weight, particles)
+    moments_of_e = _weighted_moments(weight, particles)
     stiffness = _weighted_moments(weight, curve.stiffness(particles))
-    bandwidth = e.standard_deviation * reference_bandwidth_factor(effective)
+    bandwidth = moments_of_e.standard_deviation * reference_bandwidth_factor(effective_size)
     grid, grid_density = kernel_density(particles, bandwidth, window, weight)
-    stored = ScalarPosterior(grid[::CELLS_PER_STORED_VALUE], grid_density[::CELLS_PER_STORED_VALUE])
-    stiffness_density = push_forward(stored, curve)
+    coarse_density = ScalarPosterior(
+        grid[::CELLS_PER_STORED_VALUE], grid_density[::CELLS_PER_STORED_VALUE]
+    )
+    stiffness_density = push_forward(coarse_density, curve)
     return ParticlePosterior(
-        grid=stored.grid,
-        density=stored.density,
-        mean=e.mean,
-        standard_deviation=e.standard_deviation,
+        grid=coarse_density.grid,
+        density=coarse_density.density,
+        mean=moments_of_e.mean,
+        standard_deviation=moments_of_e.standard_deviation,
         likelihood_grid=likelihood_grid,
         likelihood=likelihood,
         stiffness=ScalarPosterior(
@@ -225,7 +230,23 @@ def _pair_density(
     generator: np.random.Generator,
     count: int,
 ) -> KernelDensity:
-    """Return the kernel density of e over a window, from samples of one measured pair."""
+    """Return the paper's likelihood of e by one measured pair: a kernel density of samples.
+
+    Parameters
+    ----------
+    data : LoadDisplacementData
+        The measured pairs.
+    pair : int
+        The number of the pair.
+    curve : StiffnessCurve
+        The stiffness k(e).
+    window : (float, float)
+        The range of e in which the density is needed.
+    generator : Generator
+        The source of random numbers.
+    count : int
+        The number of samples.
+    """
     load_error = data.load_standard_deviation * generator.standard_normal(count)
     displacement_error = data.displacement_standard_deviation * generator.standard_normal(count)
     load = data.load[pair] + load_error
@@ -242,7 +263,7 @@ class _Moments(NamedTuple):
 
 
 def _weighted_moments(weight: Float, value: Float) -> _Moments:
-    """Return the moments of values (N,) with weights (N,) whose sum is 1."""
+    """Return the moments of values (N,) with weights (N,), whose sum is 1."""
     # Pairwise sums rather than dot products, whose last bits depend on the number of BLAS threads.
     mean = float(np.sum(weight * value))
     variance = float(np.sum(weight * (value - mean) ** 2))
@@ -278,7 +299,7 @@ class StaticCalibration:
 
     @property
     def before(self) -> ScalarPosterior:
-        """The prior on a grid."""
+        """The prior of e as a density on a grid."""
         grid = np.linspace(-8.0, 8.0, 2001) * self.prior.standard_deviation + self.prior.mean
         return ScalarPosterior(grid, np.exp(self.prior.log_density(grid)))
 
@@ -358,7 +379,9 @@ def calibrate_static(
 
 
 def push_forward(posterior: ScalarPosterior, curve: StiffnessCurve) -> ScalarPosterior:
-    """Return the density of k(e), p(e) / (dk/de), where k is positive.
+    """Return the density of the stiffness k(e), given that of e: p(k) = p(e) / (dk/de).
+
+    Values of e with a stiffness that is not positive are left out.
 
     Parameters
     ----------

@@ -50,10 +50,11 @@ def fit_masses(
     validity: Mapping[str, tuple[float, float]],
     readings: Sequence[Reading],
 ) -> PaperSamples:
-    """Return masses with the weighed total, and damping coefficients, for each sample of e.
+    """Return the masses and the damping coefficients that fit the readings, for each sample of e.
 
-    One mass is unknown: the pitot tube has the rest of the total. Brent's search ends at 1
-    microgram; the authors' search, of Nelder and Mead, ends at 1 g.
+    The weighed total leaves one unknown mass: that of a servo; the pitot tube has the rest. It
+    minimises the mean relative error of the two frequencies. The search (bounded Brent) ends at
+    1 microgram; the authors' search, by Nelder and Mead, ends at 1 g.
 
     Parameters
     ----------

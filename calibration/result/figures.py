@@ -82,6 +82,7 @@ def corner_figure(titles: Sequence[str], sets: Sequence[tuple[str, Float]]) -> F
 
 
 def _write_correlation(axes: Axes, correlation: float) -> None:
+    """Write a correlation in a panel; the larger it is, the larger the print."""
     axes.set_axis_off()
     is_noticeable = abs(correlation) > NOTICEABLE_CORRELATION
     axes.text(
@@ -97,6 +98,7 @@ def _write_correlation(axes: Axes, correlation: float) -> None:
 
 
 def _prepare_corner_axes(axes: Axes) -> None:
+    """Give a panel few, small tick labels."""
     axes.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
     axes.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
     axes.ticklabel_format(useOffset=False)
@@ -133,12 +135,18 @@ def _draw_scatter(axes: Axes, samples: Sequence[Float], column: int, row: int) -
 
 
 def _limits(samples: Sequence[Float]) -> tuple[float, float]:
-    """Return the limits of an axis for sets of samples (N,), without outliers of the first."""
-    first, *others = samples
-    low, high = np.quantile(first, [0.002, 0.998])
-    for values in others:
-        low = min(low, np.min(values))
-        high = max(high, np.max(values))
+    """Return the limits of an axis for several sets of samples.
+
+    Parameters
+    ----------
+    samples : sequence of (N,) arrays
+        The sets. Outliers of the first are left out; the others are shown completely.
+    """
+    first_set, *other_sets = samples
+    low, high = np.quantile(first_set, [0.002, 0.998])
+    for other_set in other_sets:
+        low = min(low, np.min(other_set))
+        high = max(high, np.max(other_set))
     margin = 0.06 * (high - low)
     if margin == 0.0:
         margin = 1e-3 * abs(high)
@@ -147,7 +155,7 @@ def _limits(samples: Sequence[Float]) -> tuple[float, float]:
 
 @style.publication_style()
 def readings_figure(result: Calibration) -> Figure:
-    """Return the figure of calibrated quantities before and after, with their readings."""
+    """Return the figure of the measured quantities before and after, with their readings."""
     readings = result.readings[:_MOST_READINGS]
     rows = math.ceil(len(readings) / _COLUMNS)
     height = 0.5 + 1.55 * rows
@@ -168,7 +176,7 @@ def readings_figure(result: Calibration) -> Figure:
 
 
 def _draw_reading(axes: Axes, result: Calibration, reading: Reading) -> None:
-    """Draw prior and posterior of a quantity, with its reading."""
+    """Draw the prior and the posterior density of a quantity, with its reading."""
     prior = result.draws_of(reading.name, prior=True)
     posterior = result.draws_of(reading.name)
     value = reading.value
@@ -189,18 +197,18 @@ def _draw_reading(axes: Axes, result: Calibration, reading: Reading) -> None:
         label="measured, 95 %",
     )
     axes.axvline(value, color=style.OBSERVED, lw=0.9)
-    before = gaussian_kde(prior)(grid)
-    top = float(before.max())
+    prior_density = gaussian_kde(prior)(grid)
+    highest_density = float(prior_density.max())
     if posterior.std() > 1e-9 * abs(mean):
-        after = gaussian_kde(posterior)(grid)
-        top = float(after.max())
-        style.band(axes, grid, np.zeros_like(grid), after, style.PAST)
-        axes.plot(grid, after, color=style.PAST, lw=1.3, label="after the calibration")
+        posterior_density = gaussian_kde(posterior)(grid)
+        highest_density = float(posterior_density.max())
+        style.band(axes, grid, np.zeros_like(grid), posterior_density, style.PAST)
+        axes.plot(grid, posterior_density, color=style.PAST, lw=1.3, label="after the calibration")
     else:
         axes.axvline(mean, color=style.PAST, lw=1.3, label="after the calibration")
-    axes.plot(grid, before, color=style.REFERENCE, lw=1.2, ls="--", label="before")
+    axes.plot(grid, prior_density, color=style.REFERENCE, lw=1.2, ls="--", label="before")
     titles = {figure.name: figure.axis_title for figure in result.figures}
-    axes.set(xlim=(grid[0], grid[-1]), ylim=(0.0, 1.12 * top), yticks=[])
+    axes.set(xlim=(grid[0], grid[-1]), ylim=(0.0, 1.12 * highest_density), yticks=[])
     axes.set_xlabel(titles[reading.name])
     axes.spines["left"].set_visible(False)
     axes.xaxis.set_major_locator(MaxNLocator(4))

@@ -255,7 +255,7 @@ class Calibration:
         return moments(self.draws_of(name, prior=True))
 
     def kept_share(self, name: str) -> float:
-        """Return the standard deviation of a figure over that of its prior [1]."""
+        """Return the standard deviation of a figure divided by that of its prior [1]."""
         return self.standard_deviation(name) / self.prior_moments(name)[1]
 
     def interval(self, name: str, probability: float = 0.9) -> tuple[float, float]:
@@ -271,15 +271,16 @@ class Calibration:
 
     @property
     def information(self) -> float | None:
-        """Information gained [nat]: Kullback-Leibler divergence of Gaussians with these moments.
+        """Information gained [nat]: the Kullback-Leibler divergence of posterior from prior.
 
-        It is None where a parameter follows from the others, as the paper's masses follow from e.
+        Both are taken for Gaussians with the moments of the samples. The value is None if a
+        parameter follows from the others, as the paper's masses follow from e.
         """
         # Parameters in units of their prior standard deviations
         parameters = slice(len(self.priors))
-        scale = self.prior_samples[:, parameters].std(axis=0)
-        prior = self.prior_samples[:, parameters] / scale
-        posterior = self.samples[:, parameters] / scale
+        prior_deviation = self.prior_samples[:, parameters].std(axis=0)
+        prior = self.prior_samples[:, parameters] / prior_deviation
+        posterior = self.samples[:, parameters] / prior_deviation
         prior_covariance = np.atleast_2d(np.cov(prior, rowvar=False))
         posterior_covariance = np.atleast_2d(np.cov(posterior, rowvar=False))
         deviations = np.sqrt(np.diag(posterior_covariance))
@@ -288,23 +289,32 @@ class Calibration:
         posterior_correlation = posterior_covariance / np.outer(deviations, deviations)
         if np.linalg.cond(posterior_correlation) > _SINGULAR:
             return None
+        # KL = (tr(C0^-1 C1) + d' C0^-1 d - P + ln(det C0 / det C1)) / 2 for Gaussians 0 (prior)
+        # and 1 (posterior) of P unknowns with means d apart
         shift = posterior.mean(axis=0) - prior.mean(axis=0)
-        precision = np.linalg.inv(prior_covariance)
+        prior_precision = np.linalg.inv(prior_covariance)
         log_prior_volume = np.linalg.slogdet(prior_covariance)[1]
-        log_ratio = log_prior_volume - np.linalg.slogdet(posterior_covariance)[1]
-        trace = np.trace(precision @ posterior_covariance)
-        return 0.5 * float(trace + shift @ precision @ shift - len(shift) + log_ratio)
+        log_volume_ratio = log_prior_volume - np.linalg.slogdet(posterior_covariance)[1]
+        trace = np.trace(prior_precision @ posterior_covariance)
+        return 0.5 * float(trace + shift @ prior_precision @ shift - len(shift) + log_volume_ratio)
 
     def score(self, reading: Reading) -> float:
-        """Return the difference of the model from a reading, in standard deviations of both [1]."""
+        """Return the difference between model and reading, in standard deviations of both [1]."""
         deviation = np.hypot(reading.deviation, self.standard_deviation(reading.name))
         return (self.mean(reading.name) - reading.value) / float(deviation)
 
     def error(self, experiment: str, *, prior: bool = False) -> float:
-        """Return minus the mean of |measured - mean| over the readings of an experiment [1].
+        """Return minus the mean absolute difference between readings and model [1].
 
-        The unit is the half-width of the 95 % interval of a reading, as in the error reward of
-        Kapteyn et al. 2021. The means are those of the posterior, or of the `prior`.
+        Each difference is divided by the half-width of the 95 % interval of the reading, as in the
+        error reward of Kapteyn et al. 2021.
+
+        Parameters
+        ----------
+        experiment : str
+            The experiment of the readings.
+        prior : bool
+            Whether the model has the prior means, instead of the posterior means.
         """
         errors = []
         for reading in self.readings:
@@ -314,17 +324,17 @@ class Calibration:
         return -float(np.mean(errors))
 
     def stratified_draws(self, name: str, count: int, seed: Seed) -> Float:
-        """Return draws (count,) of one figure, one from each of as many strata [unit].
+        """Return draws (count,) of one figure from strata of equal probability, shuffled [unit].
 
-        The strata have equal probability and shuffled order: means of functions of this figure have
-        a far smaller variance than those of independent draws.
+        There is one draw from each stratum. The means of functions of this figure thus have a far
+        smaller variance than those of independent draws.
 
         Parameters
         ----------
         name : str
             The name of the figure.
         count : int
-            The number of draws.
+            The number of draws, and of strata.
         seed : int or SeedSequence
             The same seed gives the same draws.
 
@@ -339,10 +349,10 @@ class Calibration:
         return values[np.minimum(ranks, len(values) - 1)]
 
     def given(self, name: str, values: Float) -> dict[str, Float]:
-        """Return the expectations of the other parameters given values of one.
+        """Return the conditional expectations of all other parameters, given values of one.
 
-        They follow by linear regression on the samples, which is exact for a Gaussian, and stay
-        within the range of the samples.
+        They follow by linear regression on the samples, which is exact for a Gaussian posterior.
+        They are limited to the range of the samples.
 
         Parameters
         ----------
@@ -362,11 +372,11 @@ class Calibration:
         for prior in self.priors:
             if prior.name == name:
                 continue
-            others = self.draws_of(prior.name)
-            covariance = float(np.mean((draws - draws.mean()) * (others - others.mean())))
+            other_draws = self.draws_of(prior.name)
+            covariance = float(np.mean((draws - draws.mean()) * (other_draws - other_draws.mean())))
             slope = covariance / variance if variance else 0.0
-            expected = others.mean() + slope * (values - draws.mean())
-            expectations[prior.name] = np.clip(expected, others.min(), others.max())
+            expected = other_draws.mean() + slope * (values - draws.mean())
+            expectations[prior.name] = np.clip(expected, other_draws.min(), other_draws.max())
         return expectations
 
     @property
@@ -394,7 +404,7 @@ class Calibration:
         return tuple(self._state(row) for row in self.samples)
 
     def _state(self, row: Float) -> DigitalState:
-        """Return the digital state of a wing from values (P + Q,) of the figures."""
+        """Return the digital state of a wing whose figures have given values (P + Q,)."""
         names = [figure.name for figure in self.figures]
         values = dict(zip(names, row.tolist(), strict=True))
         return DigitalState(self.wing_design.geometry, **{name: values[name] for name in STATE})
@@ -404,12 +414,27 @@ _SINGULAR = 1e10  # condition of a correlation matrix in which one figure follow
 
 
 def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> Float:
-    """Return stratified samples (count, P) of truncated priors."""
+    """Return stratified samples of truncated Gaussian priors.
+
+    Parameters
+    ----------
+    priors : tuple of ParameterPrior
+        The priors of P parameters.
+    count : int
+        The number of samples.
+    seed : int
+        The seed.
+
+    Returns
+    -------
+    (count, P) array
+    """
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(2,)))
     columns = []
     for prior in priors:
-        standardised_ends = (np.array((prior.low, prior.high)) - prior.mean) / prior.deviation
-        low, high = ndtr(standardised_ends)
+        standardised_limits = (np.array((prior.low, prior.high)) - prior.mean) / prior.deviation
+        low, high = ndtr(standardised_limits)
+        # Inverse transform: uniform probabilities between those of the limits
         standardised = ndtri(low + (high - low) * stratified(generator, count))
         values = prior.mean + prior.deviation * standardised
         columns.append(np.clip(values, prior.low, prior.high))
@@ -417,17 +442,20 @@ def prior_samples(priors: tuple[ParameterPrior, ...], count: int, seed: int) -> 
 
 
 def moments(values: Float) -> tuple[float, float]:
-    """Return mean and standard deviation of samples (N,); the latter is 0 for a single sample."""
+    """Return the mean and the standard deviation of samples (N,); the latter is 0 for N = 1."""
     standard_deviation = float(values.std(ddof=1)) if values.size > 1 else 0.0
     return float(values.mean()), standard_deviation
 
 
 def correlation(values: Float) -> Float:
-    """Return the correlation matrix of samples (N, F); a constant figure correlates with none."""
+    """Return the correlation matrix (F, F) of samples (N, F).
+
+    The correlation of a constant figure with all others is 0.
+    """
     centred = values - values.mean(axis=0)
     norm = np.linalg.norm(centred, axis=0)
-    scaled = centred / np.where(norm > 0.0, norm, 1.0)
-    matrix = np.clip(scaled.T @ scaled, -1.0, 1.0)
+    unit_columns = centred / np.where(norm > 0.0, norm, 1.0)
+    matrix = np.clip(unit_columns.T @ unit_columns, -1.0, 1.0)
     np.fill_diagonal(matrix, 1.0)
     return np.asarray(matrix)
 

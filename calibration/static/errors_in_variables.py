@@ -113,7 +113,9 @@ def pair_log_likelihoods(
 
 
 def _mean_of_folded_gaussian(mean: Float, deviation: Float) -> Float:
-    """Return E|X| of X ~ N(mean, deviation^2), elementwise."""
+    """Return E|X| of a Gaussian X ~ N(mean, deviation^2), elementwise."""
+    # E|X| = s sqrt(2 / pi) exp(-m^2 / (2 s^2)) + m erf(m / (s sqrt 2)); for s = 0 the score is
+    # infinite and E|X| = m
     score = np.divide(mean, deviation, out=np.full_like(mean, np.inf), where=deviation > 0.0)
     folded = deviation * math.sqrt(2.0 / math.pi) * np.exp(-0.5 * score**2)
     folded += mean * erf(score / math.sqrt(2.0))
@@ -161,9 +163,9 @@ def exact_posterior(
     measure: Measure = "displacement",
     zero_offset_standard_deviation: float = 0.0,
 ) -> ScalarPosterior:
-    """Return p(e | measured pairs) by quadrature on a grid that follows the posterior.
+    """Return p(e | measured pairs) by quadrature on a grid that is adapted to the posterior.
 
-    The first grid contains the prior and the estimate of each pair alone. It is narrowed until it
+    The first grid contains the prior and the estimate by each pair alone. It is narrowed until it
     spans ten standard deviations of the posterior on either side.
 
     Parameters
@@ -179,10 +181,10 @@ def exact_posterior(
         If more than 1e-4 of the posterior lies beyond the range of `curve`.
     """
     prior = prior or GaussianPrior()
-    lower, upper = _first_grid_limits(data, curve, prior)
-    lowest = lower
+    grid_lower, grid_upper = _first_grid_limits(data, curve, prior)
+    lowest_allowed = grid_lower
     for _ in range(_MOST_REFINEMENTS):
-        grid = np.linspace(lower, upper, GRID_SIZE)
+        grid = np.linspace(grid_lower, grid_upper, GRID_SIZE)
         log_density = prior.log_density(grid) + log_likelihood(
             curve,
             data,
@@ -191,13 +193,13 @@ def exact_posterior(
             zero_offset_standard_deviation=zero_offset_standard_deviation,
         )
         posterior = ScalarPosterior(grid, np.exp(log_density - log_density.max()))
-        spacing = (upper - lower) / (GRID_SIZE - 1)
+        spacing = (grid_upper - grid_lower) / (GRID_SIZE - 1)
         half_width = _REACH * max(posterior.standard_deviation, spacing)
-        narrower_lower = max(posterior.mean - half_width, lowest)
+        narrower_lower = max(posterior.mean - half_width, lowest_allowed)
         narrower_upper = posterior.mean + half_width
-        if narrower_upper - narrower_lower > 0.99 * (upper - lower):
+        if narrower_upper - narrower_lower > 0.99 * (grid_upper - grid_lower):
             break
-        lower, upper = narrower_lower, narrower_upper
+        grid_lower, grid_upper = narrower_lower, narrower_upper
     _refuse_posterior_outside(posterior, curve)
     return posterior
 
@@ -205,10 +207,10 @@ def exact_posterior(
 def _first_grid_limits(
     data: LoadDisplacementData, curve: StiffnessCurve, prior: GaussianPrior
 ) -> tuple[float, float]:
-    """Return a wide range of e for the first grid: it holds the prior, and what each pair shows.
+    """Return a wide range of e, which contains the prior and what each measured pair indicates.
 
-    Each measured pair gives a stiffness, load over displacement, within six deviations. The lower
-    limit stays where the stiffness k(e) is positive.
+    A pair indicates a stiffness, load over displacement, within six standard deviations. The lower
+    limit keeps the stiffness k(e) positive.
     """
     stiffness = data.load / data.displacement
     relative_deviation = (
@@ -254,7 +256,7 @@ class FitQuality(NamedTuple):
 
 
 class _RunOffset(NamedTuple):
-    """Mean residual displacement of a loading run and its standard error [m]."""
+    """The mean residual displacement of a loading run, with its standard error [m]."""
 
     number: int
     mean: float
@@ -275,10 +277,10 @@ def assess_fit(data: LoadDisplacementData, stiffness: float) -> FitQuality:
     residual = data.displacement - data.load / stiffness
     standardised = residual * stiffness / load_deviation
     offsets = []
-    for index in data.run_indices:
-        of_run = residual[data.run == index]
-        error = load_deviation / stiffness / math.sqrt(of_run.size)
-        offsets.append(_RunOffset(index + 1, float(of_run.mean()), error))
+    for run in data.run_indices:
+        run_residual = residual[data.run == run]
+        error = load_deviation / stiffness / math.sqrt(run_residual.size)
+        offsets.append(_RunOffset(run + 1, float(run_residual.mean()), error))
     remarks = [*_run_remarks(offsets), *_pair_remarks(data, standardised)]
     return FitQuality(standardised, tuple(remarks))
 

@@ -20,20 +20,34 @@ PRIOR_DEVIATION = 0.05 / 1.96
 
 
 def stratified(generator: np.random.Generator, count: int) -> Float:
-    """Return one uniform number from each of `count` equal parts of 0 to 1, shuffled, (count,)."""
+    """Return stratified uniform random numbers: one from each of `count` equal intervals of [0, 1].
+
+    Parameters
+    ----------
+    generator : Generator
+        The source of random numbers.
+    count : int
+        The number of intervals.
+
+    Returns
+    -------
+    (count,) array
+        The numbers, in shuffled order.
+    """
     strata = (np.arange(count) + generator.random(count)) / count
     return generator.permutation(strata)
 
 
 def child_seed(seed: Seed, purpose: int) -> np.random.SeedSequence:
-    """Return the seed of one purpose.
+    """Return the seed for one of the purposes of a common seed.
 
-    It is the same at every call, while `SeedSequence.spawn` counts its calls.
+    Calls with equal arguments return equal seeds, while the result of `SeedSequence.spawn` depends
+    on the number of its calls.
 
     Parameters
     ----------
     seed : int or SeedSequence
-        The seed of all purposes.
+        The common seed.
     purpose : int
         The number of the purpose.
     """
@@ -118,7 +132,7 @@ class ScalarPosterior:
         )
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the central interval of a probability."""
+        """Return the central interval that contains a given probability."""
         tail = 0.5 * (1.0 - probability)
         lower, upper = self.quantile([tail, 1.0 - tail])
         return float(lower), float(upper)
@@ -180,6 +194,7 @@ class StiffnessCurve:
     def stiffness(self, young_modulus_factor: ArrayLike) -> Float:
         """Return k(e) [N/m], elementwise."""
         factor = np.asarray(young_modulus_factor, dtype=float)
+        # Beyond the range the curve goes on along its tangent.
         inside = np.clip(factor, self.lower, self.upper)
         return np.asarray(self.polynomial(inside) + (factor - inside) * self.slope(inside))
 
@@ -192,6 +207,7 @@ class StiffnessCurve:
     def young_modulus_factor(self, stiffness: ArrayLike) -> Float:
         """Return the inverse e(k) [1], elementwise, of a stiffness [N/m]."""
         value = np.asarray(stiffness, dtype=float)
+        # Inverse by a table within the range, and along the tangents beyond it
         factors = np.linspace(self.lower, self.upper, _INVERSE_TABLE_SIZE)
         stiffnesses = self.polynomial(factors)
         inside = np.clip(value, stiffnesses[0], stiffnesses[-1])
@@ -226,9 +242,10 @@ def stiffness_curve_of(
     limits: tuple[float, float],
     name: str = "finite element model",
 ) -> StiffnessCurve:
-    """Return the tip stiffness of a structural model as a polynomial of e.
+    """Return the tip stiffness of a structural model as a Chebyshev polynomial of e.
 
-    Between its nodes the polynomial must agree with the model within `TABLE_TOLERANCE`.
+    Between the interpolation nodes the polynomial must agree with the model within
+    `TABLE_TOLERANCE`.
 
     Parameters
     ----------
@@ -246,8 +263,10 @@ def stiffness_curve_of(
     """
     stiffness = np.vectorize(tip_stiffness, otypes=[float])
     polynomial = Chebyshev.interpolate(stiffness, _DEGREE, domain=limits)
-    between = np.linspace(*limits, 2 * _DEGREE)
-    error = float(np.max(np.abs(polynomial(between) / stiffness(between) - 1.0)))
+    points_between_nodes = np.linspace(*limits, 2 * _DEGREE)
+    error = float(
+        np.max(np.abs(polynomial(points_between_nodes) / stiffness(points_between_nodes) - 1.0))
+    )
     if error > TABLE_TOLERANCE:
         raise PosteriorError(
             f"the tip stiffness of {name} over e in [{limits[0]:g}, {limits[1]:g}] is too rough "

@@ -227,7 +227,15 @@ class _RecordMaker:
         ).as_dict()
 
     def record(self, procedure: Procedure, states: Float) -> Calibration:
-        """Return the calibration by one procedure, given its samples of the state (N, 5)."""
+        """Return the calibration by one of the procedures.
+
+        Parameters
+        ----------
+        procedure : Procedure
+            The procedure.
+        states : (N, 5) array
+            Its samples of e, masses and Rayleigh coefficients.
+        """
         lab = self._lab
         lengths = _length_samples(lab.lengths, len(states), self._seed)
         calibration = Calibration(
@@ -255,12 +263,22 @@ class _RecordMaker:
 
 
 def _channel_fits(static: StaticCalibration, calibrated_factor: float) -> tuple[ChannelFit, ...]:
-    """Return the residuals of each loading run at the prior mean and the calibrated value of e."""
+    """Return the rms residuals of each loading run before and after the calibration.
+
+    Before, e has its prior mean.
+
+    Parameters
+    ----------
+    static : StaticCalibration
+        The load test and the stiffness curve.
+    calibrated_factor : float
+        The calibrated value of e [1].
+    """
     data = static.data
     factors = [static.prior.mean, calibrated_factor]
     prior_stiffness, calibrated_stiffness = static.curve.stiffness(factors).tolist()
-    before = assess_fit(data, prior_stiffness).standardised_residual ** 2
-    after = assess_fit(data, calibrated_stiffness).standardised_residual ** 2
+    squares_before = assess_fit(data, prior_stiffness).standardised_residual ** 2
+    squares_after = assess_fit(data, calibrated_stiffness).standardised_residual ** 2
     fits = []
     for run in data.run_indices:
         is_in_run = data.run == run
@@ -269,25 +287,43 @@ def _channel_fits(static: StaticCalibration, calibrated_factor: float) -> tuple[
                 name=f"load test, run {run + 1}",
                 trials="fitted",
                 readings=int(is_in_run.sum()),
-                before=float(np.sqrt(before[is_in_run].mean())),
-                after=float(np.sqrt(after[is_in_run].mean())),
+                before=float(np.sqrt(squares_before[is_in_run].mean())),
+                after=float(np.sqrt(squares_after[is_in_run].mean())),
             )
         )
     return tuple(fits)
 
 
 def _length_samples(lengths: Lengths, count: int, seed: int) -> Float:
-    """Return samples (count, 3) of the posterior of the lengths [m]."""
+    """Return samples of the posterior of the three lengths.
+
+    Parameters
+    ----------
+    lengths : Lengths
+        The measured lengths.
+    count : int
+        The number of samples.
+    seed : int
+        The seed.
+
+    Returns
+    -------
+    (count, 3) array
+        Semi-span and chords [m].
+    """
     generator = np.random.default_rng(child_seed(seed, _LENGTHS_PURPOSE))
     strata = (np.arange(count) + generator.random(count)) / count
-    columns = [length.posterior.quantile(generator.permutation(strata)) for length in lengths]
-    return np.column_stack(columns)
+    samples_of_lengths = [
+        length.posterior.quantile(generator.permutation(strata)) for length in lengths
+    ]
+    return np.column_stack(samples_of_lengths)
 
 
 def _all_readings(lab: LabData) -> tuple[Reading, ...]:
-    """Return the readings of lengths, tip stiffness, mass and modes."""
+    """Return all readings of a laboratory: lengths, tip stiffness, mass and modes."""
     pairs = lab.pairs
-    # The stiffness by the pairs alone: least squares through the origin
+    # The stiffness k by the pairs alone: least squares of f = k x, so k = f'x / x'x with the
+    # variance S / x'x, where S is the variance of f - k x.
     displacement_square = float(pairs.displacement @ pairs.displacement)
     stiffness = float(pairs.load @ pairs.displacement) / displacement_square
     load_deviation = np.hypot(
@@ -299,7 +335,7 @@ def _all_readings(lab: LabData) -> tuple[Reading, ...]:
 
 
 def _load_test_dataset(pairs: LoadDisplacementData) -> xr.Dataset:
-    """Return the load test as arrays with units."""
+    """Return the load test as a dataset, with units and reading errors as attributes."""
     dataset = xr.Dataset()
     for name, values, unit, deviation in (
         ("load", pairs.load, "N", pairs.load_standard_deviation),

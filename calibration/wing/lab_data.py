@@ -102,10 +102,12 @@ def write_lab_folder(
 
 
 def _cells(values: Iterable[float]) -> list[str]:
+    """Return numbers as the cells of a table, with ten digits."""
     return [f"{value:.10g}" for value in values]
 
 
 def _record_text(record: RingDownRecord) -> str:
+    """Return a ring-down record as the text of a file: time, spanwise signal, zeros."""
     table = np.column_stack([record.time, record.signal, np.zeros(record.count)])
     stream = io.StringIO()
     np.savetxt(stream, table, fmt=("%.6f", "%.9e", "%d"), delimiter="\t")
@@ -274,25 +276,26 @@ def read_lab_folder(path: Path, targets: Targets | None = None, *, free: bool = 
 
 
 def _with_origin(lab: LabData, step: int, text: str, *, read: bool) -> LabData:
-    """Return lab data with another origin of one step."""
+    """Return lab data in which one step has another origin."""
     origins = {origin.step: origin for origin in lab.origins}
     origins[step] = StepOrigin(step, read, text)
     return replace(lab, origins=tuple(origins.values()))
 
 
 def _with_hashes(lab: LabData, **hashes: str) -> LabData:
+    """Return lab data with the hashes of further inputs."""
     return replace(lab, input_hashes=lab.input_hashes | hashes)
 
 
 def _with_lengths(lab: LabData, path: Path) -> LabData:
-    """Return lab data with the lengths of step 1 in a folder."""
+    """Return lab data with the lengths of step 1 that a folder holds."""
     lengths = read_lengths(path)
     lab = _with_hashes(replace(lab, lengths=lengths), lengths=lengths.sha256)
     return _with_origin(lab, 1, f"{GEOMETRY_FILE.as_posix()} read", read=True)
 
 
 def _with_load_test(lab: LabData, path: Path) -> LabData:
-    """Return lab data with the pairs of step 2 in a folder."""
+    """Return lab data with the load test of step 2 that a folder holds."""
     pairs = read_measurements(path)
     lab = _with_hashes(replace(lab, pairs=pairs), load_test=pairs.sha256)
     text = f"{MEASUREMENTS_FILE.as_posix()} read, {pairs.count} pairs"
@@ -302,12 +305,12 @@ def _with_load_test(lab: LabData, path: Path) -> LabData:
 def _with_ring_downs(
     lab: LabData, path: Path, record_files: Sequence[Path], *, free: bool
 ) -> LabData:
-    """Return lab data with the ring-downs of step 3, and the modal parameters that they show.
+    """Return lab data with the ring-downs of step 3, and the frequencies and damping from them.
 
     Parameters
     ----------
     lab : LabData
-        The lab data so far, with the mass as the only reading.
+        The lab data so far. Its first reading is the mass, which is kept; the others are replaced.
     path : Path
         The lab folder.
     record_files : sequence of Path
@@ -317,8 +320,9 @@ def _with_ring_downs(
     """
     trials = fit_trials(read_records(path), free=free)
     if all(fit.record.lowest is not None for fit in trials):
-        # These records were read off plots. Lowest and highest ink of a column are the extremes of
-        # the signal there, while the middle of the ink is not quite its average.
+        # These records were read off plots. The lowest and the highest ink in a column of pixels
+        # are extremes of the signal in its interval, while the middle between them is not quite
+        # the average.
         trials = refine_by_extremes(trials)
     mass = lab.readings[0]
     lab = replace(lab, trials=trials, readings=(mass, *measured_modes(trials)))
@@ -333,7 +337,7 @@ def _with_ring_downs(
 
 
 def _with_weighed_mass(lab: LabData, file: Path) -> LabData:
-    """Return lab data with the weighed mass in a file."""
+    """Return lab data with the weighed mass of a file as its first reading."""
     mass = read_weighed_mass(file)
     _, *modes = lab.readings
     lab = replace(lab, readings=(mass, *modes))
