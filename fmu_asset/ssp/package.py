@@ -240,7 +240,7 @@ def write_ssp(
     reporting.errors.FileNotWrittenError
         If the file cannot be written.
     """
-    target = checked_target(path, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
+    target = checked_target(path, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError)
     structure, units = wiring.structure, _known_units(wiring)
     ends = (end for link in structure.connections for end in (link.source, link.target))
     used = {end: wiring.variable(end) for end in ends if end.component}
