@@ -11,8 +11,14 @@ from benchmarks.measurement import Measurement, median_seconds
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.companions.build import companion_bytes
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import Component, Connector, Setting, SystemStructure, expand_connection
-from fmu_asset.coupling.system import parts_of, system_description
+from fmu_asset.coupling.structure import (
+    Component,
+    ComponentSetting,
+    Connector,
+    SystemStructure,
+    expand_connection,
+)
+from fmu_asset.coupling.system import stepped_components, system_description
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.binding import Binding, load_binding
 from fmu_asset.door.exchange import Exchange
@@ -65,7 +71,7 @@ def three_fmus(folder: Path) -> Wiring:
         + [Connector(c.target.variable, "output") for c in connections if not c.target.component]
     )
     components = tuple(
-        Component(c.name, fmus[c.name], {key: Setting(value) for key, value in c.parameters.items()})
+        Component(c.name, fmus[c.name], {key: ComponentSetting(value) for key, value in c.parameters.items()})
         for c in asset.component
     )
     return Wiring(SystemStructure("three_fmus", components, tuple(connectors), connections))
@@ -76,7 +82,7 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
 
     The FMUs alone have the bindings and inputs that they have in the system, and nothing passes between them.
     """
-    parts = parts_of(wiring, Exchange(system_description(wiring), binding))
+    parts = stepped_components(wiring, Exchange(system_description(wiring), binding))
     loads = itertools.cycle((2.0, 3.0))
     assets, inputs = [], []
     with CoupledAsset(wiring, binding, isolated=False) as coupled:

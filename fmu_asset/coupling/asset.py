@@ -1,12 +1,16 @@
-"""`CoupledAsset`: several FMUs flown as one `FmiAsset`; what they exchange in a step, and their state."""
+"""Several FMUs stepped as one asset: what they exchange in a step, and their state.
+
+`CoupledFmus` does the work. To `CoupledAsset`, which is an `FmiAsset`, it looks like the instance
+of one FMU: a request block with the inputs, a step, a reply block with the outputs.
+"""
 
 import ctypes
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from itertools import accumulate, pairwise
-from typing import Literal, Self, cast
+from typing import Literal, NamedTuple, Self, cast
 
 import numpy as np
 
@@ -25,20 +29,39 @@ from fmu_asset.errors import (
     FmuError,
     FmuStateError,
     IterationError,
-    said,
 )
 from fmu_asset.instances.plan import Instance, Settings
+from reporting.words import comma_list
 
 from .structure import Endpoint, SystemStructure
-from .system import Part, SystemDescription, parts_of, system_description, wiring_hash
+from .system import (
+    SteppedComponent,
+    SystemDescription,
+    stepped_components,
+    system_description,
+    wiring_hash,
+)
 from .wiring import ConnectedVariable, Schedule, Wiring, loop_sentence
 
 Algorithm = Literal["gauss_seidel", "jacobi"]
 ALGORITHMS: tuple[Algorithm, ...] = ("gauss_seidel", "jacobi")
 
+_REQUEST_HEAD = 2
+"""Values of a request block before its inputs: time and step size."""
+
 
 class CoupledState(PackedState):
-    """A saved state of coupled FMUs; its body holds the states of the components, one behind the other."""
+    """A saved state of coupled FMUs; its body holds the states of the components in their order.
+
+    Attributes
+    ----------
+    held : dict of str to dict of str to float
+        The inputs of each component, in the FMU's units.
+    outputs, before : list of float
+        All outputs that are read, now and at the beginning of the last step.
+    sizes : list of int
+        The length of each component's state [bytes].
+    """
 
     magic = b"UAVSYSTM"
     what = "coupled FMUs"
@@ -51,101 +74,155 @@ class CoupledState(PackedState):
     @property
     def components(self) -> list[bytes]:
         """States of the components; raises `FmuStateError` if the body is damaged."""
-        ends = list(accumulate(self.sizes, initial=0))
-        if ends[-1] != len(self.body):
+        limits = list(accumulate(self.sizes, initial=0))
+        if limits[-1] != len(self.body):
             raise FmuStateError(f"What was given is not a state of {self.what}, or it is damaged.")
-        return [self.body[begin:end] for begin, end in pairwise(ends)]
+        return [self.body[begin:end] for begin, end in pairwise(limits)]
 
 
-class Taps:
-    """Outputs that are wanted together, in the units of who wants them.
+class OutputSelection:
+    """Selects some of all outputs of a system, and converts them to the units of their reader.
 
     Parameters
     ----------
     ports : iterable of ConnectedVariable
-        The outputs, in order.
-    place : mapping of Endpoint to int
-        Where each output stands among all that are read.
+        The selected outputs, in order.
+    position : mapping of Endpoint to int
+        The position of each output among all outputs that are read.
     """
 
-    def __init__(self, ports: Iterable[ConnectedVariable], place: Mapping[Endpoint, int]) -> None:
-        wanted = list(ports)
-        self._index = np.array([place[port.end] + port.delayed * len(place) for port in wanted], np.intp)
-        scales = np.array([port.conversion for port in wanted]).reshape(-1, 2)
-        self._scale = None if (scales == IDENTITY).all() else (scales[:, 0], scales[:, 1])
+    def __init__(
+        self, ports: Iterable[ConnectedVariable], position: Mapping[Endpoint, int]
+    ) -> None:
+        # Delayed outputs are taken from a second copy of all outputs, behind the first.
+        output_count = len(position)
+        indices = []
+        factors = []
+        offsets = []
+        is_identity = True
+        for port in ports:
+            index = position[port.end]
+            indices.append(index + output_count if port.delayed else index)
+            factors.append(port.conversion.factor)
+            offsets.append(port.conversion.offset)
+            is_identity = is_identity and port.conversion == IDENTITY
+        self._indices = np.array(indices, np.intp)
+        self._factors = np.array(factors)
+        self._offsets = np.array(offsets)
+        self._is_identity = is_identity
 
-    def of(self, now: FloatArray, before: FloatArray) -> FloatArray:
-        """Return the values, from all outputs of this moment and of the beginning of the step."""
-        values = np.concatenate((now, before))[self._index]
-        return values if self._scale is None else self._scale[0] * values + self._scale[1]
+    def values(self, outputs: FloatArray, outputs_before: FloatArray) -> FloatArray:
+        """Return the selected outputs in the reader's units.
+
+        Parameters
+        ----------
+        outputs, outputs_before : (O,) array
+            All outputs, now and at the beginning of the step.
+        """
+        values: FloatArray = np.concatenate((outputs, outputs_before))[self._indices]
+        if self._is_identity:
+            return values
+        converted: FloatArray = self._factors * values + self._offsets
+        return converted
+
+
+class _SystemInput(NamedTuple):
+    """An input of the system: its position in the request block, and where it goes."""
+
+    position: int
+    port: ConnectedVariable
 
 
 @contextmanager
-def naming(component: str) -> Iterator[None]:
-    """Give an error of an FMU the name of its component."""
+def errors_of_component(component: str) -> Iterator[None]:
+    """Give errors of an FMU the name of its component."""
     try:
         yield
     except FmuError as error:
-        # Where one of them ended is no moment of the system.
+        # The time at which one FMU ended its simulation is not the end of the system.
         time = None if isinstance(error, FmuEndedError) else error.time
         sentence = f"component {component}: {error.sentence}"
         raise type(error)(sentence, error.messages, time) from error
 
 
 class CoupledFmus(Housing):
-    """Several FMUs as one instance, and where it lives: what `FmiAsset` asks of an instance and its housing.
+    """Several FMUs as one instance, and as its own housing, as `FmiAsset` needs them.
 
     Parameters
     ----------
     exchange : Exchange
-        What a request and a reply hold of the system as one FMU.
+        The request and reply of the system as one FMU.
     order : Schedule
         The order of the components.
-    parts : dict of str to Part
+    components : dict of str to SteppedComponent
         The components, by name.
     assets : dict of str to FmiAsset
-        Their FMUs.
+        Their FMUs, by name.
     jacobi : bool
-        Whether all components take the outputs of the beginning of the step.
+        Whether all components take the outputs at the beginning of the step.
     iterations : int
-        How often a step of a circle of components may be made.
+        The largest number of times that a step of a circle of components is made.
     tolerance : float
-        When the values in a circle have settled.
+        The relative change at which the values in a circle have settled.
     """
 
     lost = False
 
     def __init__(
-        self, exchange: Exchange, order: Schedule, parts: dict[str, Part], assets: dict[str, FmiAsset],
-        *, jacobi: bool, iterations: int, tolerance: float,
-    ) -> None:  # fmt: skip
-        self._exchange, self._schedule, self._parts = exchange, order, parts
-        self._jacobi, self.iterations, self._tolerance = jacobi, iterations, tolerance
+        self,
+        exchange: Exchange,
+        order: Schedule,
+        components: dict[str, SteppedComponent],
+        assets: dict[str, FmiAsset],
+        *,
+        jacobi: bool,
+        iterations: int,
+        tolerance: float,
+    ) -> None:
+        self._exchange = exchange
         self._system = cast("SystemDescription", exchange.description)
-        ends = self._system.ends
+        self._schedule = order
+        self._components = components
+        self._jacobi = jacobi
+        self.iterations = iterations
+        self._tolerance = tolerance
         self.reset_trial = ResetTrial(comparable=False)
-        self._inputs = [(n, port) for n, sent in enumerate(exchange.sent, 2) for port in ends[sent.name]]
-        self._ends = [end for part in parts.values() for end in part.ends]
-        place = {end: index for index, end in enumerate(self._ends)}
-        self._spans = {
-            name: slice(place[part.ends[0]], place[part.ends[-1]] + 1) for name, part in parts.items()
+        # where each input of the request goes
+        self._inputs: list[_SystemInput] = []
+        for position, variable in enumerate(exchange.sent, start=_REQUEST_HEAD):
+            for port in self._system.ends[variable.name]:
+                self._inputs.append(_SystemInput(position, port))
+        # all outputs that are read, one component after the other
+        self._output_ends: list[Endpoint] = []
+        self._output_slices: dict[str, slice] = {}
+        for name, component in components.items():
+            begin = len(self._output_ends)
+            self._output_ends += component.ends
+            self._output_slices[name] = slice(begin, len(self._output_ends))
+        position_of_end = {end: index for index, end in enumerate(self._output_ends)}
+        # who takes which of them
+        self._fed_outputs = {
+            name: OutputSelection(component.fed.values(), position_of_end)
+            for name, component in components.items()
         }
-        self._taps = {name: Taps(part.fed.values(), place) for name, part in parts.items()}
-        self._shown = Taps((ends[read.name][0] for read in exchange.read), place)
+        shown_ports = [self._system.ends[variable.name][0] for variable in exchange.read]
+        self._shown_outputs = OutputSelection(shown_ports, position_of_end)
         self._begin(assets)
 
     def _begin(self, assets: dict[str, FmiAsset]) -> None:
-        """Take the FMUs, which have exchanged nothing."""
+        """Take FMUs that have not exchanged anything yet."""
         self.instance: Instance | None = self
         self.assets = assets
-        self.request = (ctypes.c_double * (2 + len(self._exchange.sent)))()
+        self.request = (ctypes.c_double * (_REQUEST_HEAD + len(self._exchange.sent)))()
         self.reply = (ctypes.c_double * len(self._exchange.read))()
-        self._answer = np.frombuffer(memoryview(self.reply).cast("B"))
-        self._held: dict[str, dict[str, float]] = {}
-        self._now = np.zeros(len(self._ends))
-        self._before = self._earlier = self._now.copy()
+        self._reply_array = np.frombuffer(memoryview(self.reply).cast("B"))
+        self._held_inputs: dict[str, dict[str, float]] = {}
+        # outputs now, at the beginning of the last step, and at the beginning of the step before it
+        self._outputs = np.zeros(len(self._output_ends))
+        self._outputs_before = self._outputs.copy()
+        self._outputs_two_before = self._outputs_before
         self._stepped: set[str] = set()
-        self._broken = False
+        self._at_different_times = False
 
     # ------------------------------------------------------------------ life
 
@@ -167,178 +244,270 @@ class CoupledFmus(Housing):
 
     def sibling(self) -> "CoupledFmus":
         """Return the same system with FMUs of its own."""
-        other = copy(self)
-        other._begin({name: asset.sibling() for name, asset in self.assets.items()})
-        return other
+        sibling = copy(self)
+        sibling._begin({name: asset.sibling() for name, asset in self.assets.items()})
+        return sibling
 
     def close(self) -> None:
         """End all workers; the next start has new ones."""
         for asset in self.assets.values():
             asset.close()
 
-    # ------------------------------------------------------------------ what an asset asks
+    # ------------------------------------------------------------------ the interface of an
+    # instance
 
     def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
-        """Initialise the components in their order; each takes the initial outputs of those before it.
+        """Initialise the components in order; each takes the initial outputs of those before it.
 
         An input whose source comes later starts at the FMU's own start value.
+
+        Parameters
+        ----------
+        start_time : float
+            Ignored: the components have it from their bindings.
+        parameters : Settings
+            Parameters of the system, by value reference.
+        with_inputs : bool
+            Whether the inputs in the request block hold already.
         """
-        tuned = self._system.of_components(parameters)
-        self._held = {name: dict(part.constants) for name, part in self._parts.items()}
+        parameters_of = self._system.settings_of_components(parameters)
+        self._held_inputs = {
+            name: dict(component.constants) for name, component in self._components.items()
+        }
         if with_inputs:
-            self._take()
-        self._broken = True
-        known: set[str] = set()
+            self._take_inputs()
+        self._at_different_times = True
+        initialised: set[str] = set()
         for name in self._schedule.order:
-            part, asset = self._parts[name], self.assets[name]
-            values = self._fed(part, self._now, self._now)
-            fed = {key: values[key] for key, port in part.fed.items() if port.end.component in known}
-            with naming(name):
-                asset.reset({**part.settings, **tuned.get(name, {})}, load=(self._held[name] | fed) or None)
-                self._now[self._spans[name]] = asset.observe().values
-            known.add(name)
-        self._before = self._now.copy()
-        self._broken = False
+            component, asset = self._components[name], self.assets[name]
+            fed_values = self._fed_values(component, self._outputs, self._outputs)
+            load = dict(self._held_inputs[name])
+            for variable, source in component.fed.items():
+                if source.end.component in initialised:
+                    load[variable] = fed_values[variable]
+            with errors_of_component(name):
+                asset.reset(
+                    {**component.settings, **parameters_of.get(name, {})}, load=load or None
+                )
+                self._outputs[self._output_slices[name]] = asset.observe().values
+            initialised.add(name)
+        self._outputs_before = self._outputs.copy()
+        self._at_different_times = False
 
     def step(self) -> None:
         """Make the step that the request block describes."""
-        if self._broken:
-            raise FmuStateError(said("coupling.apart"))
-        self._take()
-        self._earlier, self._before = self._before, self._now.copy()
+        if self._at_different_times:
+            raise FmuStateError(
+                "A step or a restoration failed, and the FMUs no longer stand at the same time; "
+                "reset the asset or restore a state."
+            )
+        self._take_inputs()
+        self._outputs_two_before = self._outputs_before
+        self._outputs_before = self._outputs.copy()
         self._stepped.clear()
-        self._broken = True
+        self._at_different_times = True
         for group in self._schedule.groups:
             if self.iterations > 1 and group in self._schedule.circles:
                 self._iterate(group)
             else:
-                self._pass(group, self._before if self._jacobi else self._now)
-        self._broken = False
+                self._step_group(group, self._outputs_before if self._jacobi else self._outputs)
+        self._at_different_times = False
         self.read()
 
     run = Instance.run
 
     def read(self) -> None:
-        """Put the outputs of this moment into the reply block."""
-        self._answer[:] = self._shown.of(self._now, self._before)
+        """Put the current outputs into the reply block."""
+        self._reply_array[:] = self._shown_outputs.values(self._outputs, self._outputs_before)
 
     def save(self) -> bytes:
-        """Return the states of the components and what they had exchanged."""
+        """Return the states of the components and the values that they had exchanged."""
         states = [asset.save_state() for asset in self.assets.values()]
-        return CoupledState(
-            held={name: dict(sorted(held.items())) for name, held in self._held.items()},
-            outputs=self._now.tolist(),
-            before=self._before.tolist(),
+        held = {name: dict(sorted(inputs.items())) for name, inputs in self._held_inputs.items()}
+        state = CoupledState(
+            held=held,
+            outputs=self._outputs.tolist(),
+            before=self._outputs_before.tolist(),
             sizes=[len(state) for state in states],
             body=b"".join(states),
-        ).to_bytes()
+        )
+        return state.to_bytes()
 
     def restore(self, content: bytes) -> None:
         """Bring the components to a state that `save` returned."""
         saved = CoupledState.from_bytes(content)
-        components = saved.components
-        self._broken = True
-        for (name, asset), state in zip(self.assets.items(), components, strict=True):
-            with naming(name):
+        component_states = saved.components
+        self._at_different_times = True
+        for (name, asset), state in zip(self.assets.items(), component_states, strict=True):
+            with errors_of_component(name):
                 asset.restore_state(state)
-        self._held = saved.held
-        self._now, self._before = np.array(saved.outputs), np.array(saved.before)
-        self._broken = False
+        self._held_inputs = saved.held
+        self._outputs = np.array(saved.outputs)
+        self._outputs_before = np.array(saved.before)
+        self._at_different_times = False
 
     def take_log(self) -> list[tuple[int, str]]:
-        """Return nothing: each component keeps its own log."""
+        """Return no messages: each component keeps its own log."""
         return []
 
     # ------------------------------------------------------------------ stepping
 
-    def _take(self) -> None:
-        """Hand on the inputs of the request; one that nobody has given is not a number."""
-        for place, port in self._inputs:
-            value = self.request[place]
+    def _take_inputs(self) -> None:
+        """Hand on the inputs in the request block; NaN stands for one that nobody has given."""
+        for position, port in self._inputs:
+            value = self.request[position]
             if not math.isnan(value):
-                self._held[port.end.component][port.end.variable] = port.conversion.to_fmu(value)
+                inputs = self._held_inputs[port.end.component]
+                inputs[port.end.variable] = port.conversion.to_fmu(value)
 
-    def _pass(self, group: Sequence[str], source: FloatArray) -> None:
+    def _step_group(self, group: Sequence[str], source_outputs: FloatArray) -> None:
+        """Step components one after the other.
+
+        Parameters
+        ----------
+        group : sequence of str
+            The components.
+        source_outputs : (O,) array
+            The outputs that feed them: the current ones (Gauss-Seidel), which change on the way, or
+            others (Jacobi).
+        """
         for name in group:
-            part, asset, held = self._parts[name], self.assets[name], self._held[name]
-            fed = self._fed(part, source, self._before)
-            with naming(name):
-                if part.linear:
-                    asset.hold(load=self._draw(part, fed, source))
-                held.update(fed)
-                seen = asset.step(load=held)
-                for _ in range(part.substeps - 1):
-                    seen = asset.step()
-            self._now[self._spans[name]] = seen.values
-            if source is self._now:
+            component, asset = self._components[name], self.assets[name]
+            inputs = self._held_inputs[name]
+            fed_values = self._fed_values(component, source_outputs, self._outputs_before)
+            with errors_of_component(name):
+                if component.linear:
+                    line_begins = self._begin_lines(component, fed_values, source_outputs)
+                    asset.hold(load=line_begins)
+                inputs.update(fed_values)
+                observation = asset.step(load=inputs)
+                for _ in range(component.substeps - 1):
+                    observation = asset.step()
+            self._outputs[self._output_slices[name]] = observation.values
+            if source_outputs is self._outputs:
                 self._stepped.add(name)
         self._stepped.update(group)
 
-    def _fed(self, part: Part, now: FloatArray, before: FloatArray) -> dict[str, float]:
-        """Return what the inputs of a component are fed, by their names."""
-        return dict(zip(part.fed, self._taps[part.name].of(now, before).tolist(), strict=True))
+    def _fed_values(
+        self, component: SteppedComponent, outputs: FloatArray, outputs_before: FloatArray
+    ) -> dict[str, float]:
+        """Return the values that feed the inputs of a component, by the inputs' names.
 
-    def _draw(self, part: Part, fed: dict[str, float], source: FloatArray) -> dict[str, float]:
-        """Return where the lines of the inputs that others feed begin; `fed` becomes where they end.
-
-        Where the source is not there yet, its last line goes on, within the range of the input.
+        Parameters
+        ----------
+        component : SteppedComponent
+            The component.
+        outputs, outputs_before : (O,) array
+            All outputs, now and at the beginning of the step.
         """
-        begins = self._fed(part, self._before, self._before)
-        earlier = self._fed(part, self._earlier, self._earlier)
-        for variable, port in part.fed.items():
-            if variable not in part.moving:
-                begins[variable] = fed[variable]
-            elif port.delayed or source is self._before or port.end.component not in self._stepped:
-                low, high = self.assets[part.name].input_range("load", variable)
-                end = 2.0 * begins[variable] - earlier[variable]
-                fed[variable] = min(max(end, low), high)
+        values = self._fed_outputs[component.name].values(outputs, outputs_before)
+        return dict(zip(component.fed, values.tolist(), strict=True))
+
+    def _begin_lines(
+        self, component: SteppedComponent, fed_values: dict[str, float], source_outputs: FloatArray
+    ) -> dict[str, float]:
+        """Return where the straight lines of a component's fed inputs begin.
+
+        Where a source has not been stepped yet, the line of the step before goes on, within the
+        range of the input; its end then takes the place of the value in `fed_values`.
+
+        Parameters
+        ----------
+        component : SteppedComponent
+            The component.
+        fed_values : dict of str to float
+            The ends of the lines by input; changed by this call.
+        source_outputs : (O,) array
+            The outputs that the ends come from.
+
+        Returns
+        -------
+        dict of str to float
+            The begins of the lines by input.
+        """
+        begins = self._fed_values(component, self._outputs_before, self._outputs_before)
+        earlier_begins = self._fed_values(
+            component, self._outputs_two_before, self._outputs_two_before
+        )
+        for variable, source in component.fed.items():
+            if variable not in component.moving:
+                begins[variable] = fed_values[variable]
+                continue
+            source_is_stepped = source.end.component in self._stepped
+            if source.delayed or source_outputs is self._outputs_before or not source_is_stepped:
+                low, high = self.assets[component.name].input_range("load", variable)
+                extrapolated = 2.0 * begins[variable] - earlier_begins[variable]
+                fed_values[variable] = min(max(extrapolated, low), high)
         return begins
 
     def _iterate(self, group: Sequence[str]) -> None:
-        """Repeat the step of a circle of components until what they exchange has settled."""
-        states = {name: self.assets[name].save_state() for name in group}
-        exchanged = {port.end for name in group for port in self._parts[name].fed.values()}
-        watched = [i for i, end in enumerate(self._ends) if end in exchanged and end.component in group]
+        """Repeat the step of a circle of components until what they exchange has settled.
+
+        Raises
+        ------
+        IterationError
+            If they have not after `iterations` steps.
+        """
+        begin_states = {name: self.assets[name].save_state() for name in group}
+        exchanged = self._exchanged_in(group)
         for iteration in range(self.iterations):
-            last = self._now.copy()
-            if iteration:
-                for name, state in states.items():
-                    with naming(name):
+            previous_outputs = self._outputs.copy()
+            if iteration > 0:
+                for name, state in begin_states.items():
+                    with errors_of_component(name):
                         self.assets[name].restore_state(state)
-            self._pass(group, last if self._jacobi else self._now)
-            change = np.abs(self._now - last)[watched]
-            if iteration and (change <= self._tolerance * np.maximum(1.0, np.abs(last[watched]))).all():
+            self._step_group(group, previous_outputs if self._jacobi else self._outputs)
+            change = np.abs(self._outputs - previous_outputs)[exchanged]
+            magnitude = np.maximum(1.0, np.abs(previous_outputs[exchanged]))
+            if iteration > 0 and (change <= self._tolerance * magnitude).all():
                 return
         worst = int(np.argmax(change))
-        left = self._ends[watched[worst]], change[worst]
-        raise IterationError(said("coupling.unsettled", self=self, group=group, left=left))
+        worst_end = self._output_ends[exchanged[worst]]
+        time = self.request[0]
+        raise IterationError(
+            f"The components {comma_list(group)} did not settle in {self.iterations} iterations of "
+            f"the step from t = {time:g} s ({worst_end} still changes by {change[worst]:.3g}); "
+            "allow more iterations or a larger tolerance, make the step smaller, or delay one of "
+            "their connections."
+        )
+
+    def _exchanged_in(self, group: Collection[str]) -> list[int]:
+        """Return the positions of the outputs that components of a group pass to each other."""
+        sources: set[Endpoint] = set()
+        for name in group:
+            sources.update(port.end for port in self._components[name].fed.values())
+        positions = []
+        for position, end in enumerate(self._output_ends):
+            if end in sources and end.component in group:
+                positions.append(position)
+        return positions
 
 
 class CoupledAsset(FmiAsset):
-    """Several FMUs that are flown step by step as one asset, through a binding.
+    """Several FMUs that are stepped as one asset, through a binding.
 
     The step size of the binding is that of the system: outputs are exchanged once a step. With
-    ``"gauss_seidel"`` each component takes the newest outputs of those that were stepped before it, in the
-    order of `schedule`; with ``"jacobi"`` all take the outputs of the beginning of the step. With more than
-    one iteration, components that are connected in a circle repeat the step until what they exchange has
-    settled.
+    ``"gauss_seidel"`` each component takes the newest outputs of those that were stepped before it,
+    in the order of `schedule`; with ``"jacobi"`` all take the outputs of the beginning of the step.
+    With more than one iteration, components that are connected in a circle repeat the step until
+    what they exchange has settled.
 
-    After a step that failed, the components no longer stand at the same time: reset the asset or restore a
-    state of it. Where an FMU ends its simulation, `simulate` ends with the step before.
+    After a step that failed, the components no longer stand at the same time: reset the asset or
+    restore a state of it. Where an FMU ends its simulation, `simulate` ends with the step before.
 
     Parameters
     ----------
     structure : SystemStructure or Wiring
         The system.
     binding : Binding
-        Its variables are connectors of the system, or `component.variable`.
+        The binding; its variables are connectors of the system, or `component.variable`.
     algorithm : {"gauss_seidel", "jacobi"}
-        How values are passed on within a step.
+        How values pass between components within a step.
     iterations : int
         Largest number of times that a step of a circle of components is made.
     tolerance : float
-        A circle has settled when no value exchanged in it changes by more than this times the larger of one
-        and its magnitude.
+        A circle has settled when no value exchanged in it changes by more than this times the
+        larger of one and its magnitude.
     isolated : bool
         Whether each FMU runs in a worker process of its own.
     step_timeout : float, optional
@@ -349,8 +518,8 @@ class CoupledAsset(FmiAsset):
     Raises
     ------
     CouplingError
-        If the system cannot be joined, or has an algebraic loop, and the algorithm is Gauss-Seidel without
-        iterations.
+        If the system cannot be joined, or has an algebraic loop, and the algorithm is Gauss-Seidel
+        without iterations.
     BindingError
         If the binding does not fit.
     FmuFileError, FmuUnsupportedError
@@ -370,45 +539,65 @@ class CoupledAsset(FmiAsset):
         parameters: Values | None = None,
     ) -> None:
         if algorithm not in ALGORITHMS:
-            raise CouplingError(said("coupling.algorithm", known=ALGORITHMS, algorithm=algorithm))
+            raise CouplingError(
+                f"The algorithm must be one of {comma_list(ALGORITHMS)}, and {algorithm!r} came."
+            )
         if iterations < 1 or not (tolerance > 0.0 and math.isfinite(tolerance)):
-            raise CouplingError(said("coupling.iterations", iterations=iterations, tolerance=tolerance))
-        self._wiring = wiring = structure if isinstance(structure, Wiring) else Wiring(structure)
+            raise CouplingError(
+                f"Iterations must be at least 1 and the tolerance positive; {iterations!r} and "
+                f"{tolerance!r} came."
+            )
+        wiring = structure if isinstance(structure, Wiring) else Wiring(structure)
+        self._wiring = wiring
         if binding.binding.decimation != 1:
-            raise BindingError(said("coupling.decimation", binding=binding))
-        jacobi, plan = algorithm == "jacobi", wiring.schedule
-        if plan.loops and iterations == 1 and not jacobi:  # Jacobi delays every connection
-            raise CouplingError(loop_sentence(plan.loops))
-        system = system_description(wiring, wiring_hash(wiring, binding, algorithm, iterations, tolerance))
-        # Lines are drawn at the components.
+            raise BindingError(
+                f"The binding {binding.name} of several FMUs has a decimation, which only a "
+                "binding of one FMU can have; leave it out."
+            )
+        jacobi = algorithm == "jacobi"
+        loops = wiring.schedule.loops
+        if loops and iterations == 1 and not jacobi:  # Jacobi delays every connection
+            raise CouplingError(loop_sentence(loops))
+        # the system as one FMU
+        sha256 = wiring_hash(wiring, binding, algorithm, iterations, tolerance)
+        system = system_description(wiring, sha256)
+        # Inputs are interpolated at the components, not at the system.
         exchange = Exchange(system, binding.with_header(interpolation="zero-order"))
         if exchange.health_slots:
             names = ", ".join(exchange.health_slots)
             raise BindingError(
                 f"The binding {binding.name} has the health {names}, which the system "
-                f"{wiring.structure.name} takes at its start only; in a system a health must be an input "
+                f"{wiring.structure.name} takes at its start only; in a system a health must be an "
+                "input "
                 "or, in co-simulation, a tunable parameter."
             )
-        parts = parts_of(wiring, exchange, linear=binding.binding.interpolation == "linear")
-        tuned = system.of_components(exchange.settings(parameters or {}))
+        # its components
+        interpolates = binding.binding.interpolation == "linear"
+        components = stepped_components(wiring, exchange, linear=interpolates)
+        system_settings = exchange.settings(parameters or {})
+        parameters_of = system.settings_of_components(system_settings)
         assets = {}
-        for name, part in parts.items():
-            with naming(name):
+        for name, component in components.items():
+            with errors_of_component(name):
                 assets[name] = FmiAsset(
                     wiring.declared[name],
-                    part.binding,
+                    component.binding,
                     isolated=isolated,
                     step_timeout=step_timeout,
-                    parameters={**part.settings, **tuned.get(name, {})},
+                    parameters={**component.settings, **parameters_of.get(name, {})},
                 )
-        for name in (name for group in plan.circles if iterations > 1 for name in group):
-            if assets[name].state_method != "serialised":
-                raise CouplingError(said("coupling.no_state", name=name))
-        housing = CoupledFmus(
-            exchange, plan, parts, assets, jacobi=jacobi, iterations=iterations, tolerance=tolerance
+        if iterations > 1:
+            _check_states_can_be_saved(assets, wiring.schedule)
+        fmus = CoupledFmus(
+            exchange,
+            wiring.schedule,
+            components,
+            assets,
+            jacobi=jacobi,
+            iterations=iterations,
+            tolerance=tolerance,
         )
-        self._parts = parts
-        self._settle(exchange, housing, parameters or {})
+        self._settle(exchange, fmus, parameters or {})
 
     @property
     def schedule(self) -> Schedule:
@@ -418,8 +607,20 @@ class CoupledAsset(FmiAsset):
     @property
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMUs: status, and component with text."""
-        return tuple(
-            (status, f"{name}: {text}")
-            for name, asset in cast("CoupledFmus", self._housing).assets.items()
-            for status, text in asset.log
-        )
+        fmus = cast("CoupledFmus", self._housing)
+        messages = []
+        for name, asset in fmus.assets.items():
+            for status, text in asset.log:
+                messages.append((status, f"{name}: {text}"))
+        return tuple(messages)
+
+
+def _check_states_can_be_saved(assets: Mapping[str, FmiAsset], order: Schedule) -> None:
+    """Refuse components in a circle whose state cannot be saved, which iterations need."""
+    for group in order.circles:
+        for name in group:
+            if assets[name].state_method != "serialised":
+                raise CouplingError(
+                    f"The component {name!r} cannot save and restore its state, which iterations "
+                    "need; allow one iteration only, or delay a connection."
+                )

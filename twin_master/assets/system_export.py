@@ -9,10 +9,10 @@ from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.structure import (
     Component,
+    ComponentSetting,
     Connection,
     Connector,
     Endpoint,
-    Setting,
     SystemStructure,
 )
 from fmu_asset.coupling.system import system_description
@@ -126,9 +126,9 @@ def _with_values(
     for name, value in load.items():
         slot = exchange.slot("load", name)
         settings.append((slot.variable.kind, slot.variable.reference, slot.numbers(value).tolist()))
-    given: dict[str, dict[str, Setting]] = {
-        name: {key: Setting(number) for key, number in values.items()}
-        for name, values in system.of_components(settings).items()
+    given: dict[str, dict[str, ComponentSetting]] = {
+        name: {key: ComponentSetting(number) for key, number in values.items()}
+        for name, values in system.settings_of_components(settings).items()
     }
     components = tuple(
         replace(part, settings={**part.settings, **given.get(part.name, {})})
