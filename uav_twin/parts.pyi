@@ -119,9 +119,9 @@ from fmu_asset.door.experiment import read_histories as read_histories
 from fmu_asset.door.experiment import write_history as write_history
 from fmu_asset.door.layout import ObservationHistory as ObservationHistory
 from fmu_asset.door.session import FmiAsset as FmiAsset
-from fmu_asset.packing.contents import build_script_fmu as build_script_fmu
 from fmu_asset.packing.contents import checked_target as checked_target
 from fmu_asset.packing.patch_file import load_patch as load_patch
+from fmu_asset.packing.script import build_script_fmu as build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
 from fmu_asset.packing.structure_fmu import check_form as check_form
 from fmu_asset.packing.structure_fmu import pack_wing as pack_wing

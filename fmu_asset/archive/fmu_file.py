@@ -25,7 +25,8 @@ from fmu_asset.instances.plan import Interface
 from reporting.files import hash_file
 from reporting.words import one_line
 
-from .declared import FmuDescription, FmuFileFacts, read_declared
+from .declared import FmuDescription
+from .model_description import FmuFileFacts, read_declared
 
 LARGEST_EXTRACTED_BYTES = 4 * 1024**3
 """The largest FMU that is extracted; some of hundreds of megabytes exist."""

@@ -296,3 +296,11 @@ def expand_connection(
         )
         connections.append(connection)
     return tuple(connections)
+
+
+def two_sources_sentence(target: object, first_source: object, second_source: object) -> str:
+    """Return the message on a target that two connections lead to."""
+    return (
+        f"{target} has two sources, {first_source} and {second_source}; keep one of the two "
+        "connections."
+    )

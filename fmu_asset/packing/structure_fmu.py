@@ -24,15 +24,8 @@ from fe.runtime.transient import ModalIntegrator
 from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.compiled.package import (
-    DATA_FILE,
-    PLATFORM,
-    FmiVersion,
-    Platform,
-    compiled_binaries,
-    compiled_members,
-    find_compiler,
-)
+from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
+from fmu_asset.compiled.package import DATA_FILE, FmiVersion, compiled_binaries, compiled_members
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface

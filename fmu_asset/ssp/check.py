@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fmu_asset.coupling.asset import Algorithm, CoupledAsset
+from fmu_asset.coupling.schedule import loop_sentence
 from fmu_asset.coupling.structure import Connector, Endpoint, SystemStructure
 from fmu_asset.coupling.system import system_description
-from fmu_asset.coupling.wiring import Wiring, loop_sentence
+from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError

@@ -10,14 +10,11 @@ import os
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
-from math import isfinite
 from pathlib import Path
-from typing import NamedTuple
 
 from lxml import etree
 from lxml.etree import _Element as XmlElement
 
-from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.coupling.structure import (
     CONNECTOR_KINDS,
     Component,
@@ -25,50 +22,18 @@ from fmu_asset.coupling.structure import (
     Connection,
     Connector,
     Endpoint,
-    SettingValue,
     SystemStructure,
+    two_sources_sentence,
 )
-from fmu_asset.coupling.wiring import two_sources_sentence
 from fmu_asset.door.units import IDENTITY, Conversion
-from fmu_asset.errors import SspError
 from reporting.files import atomic_write_bytes
-from reporting.units import BASE_UNITS
 
-from .package import INTERFACES, NAMESPACES, OWN_NAMESPACE, SSD_NAME, SspPackage
+from .experiment import base_step_of, time_of
+from .package import INTERFACES, NAMESPACES, SSD_NAME, SspPackage
+from .parameters import ParameterReader, coupling_attributes, flag, package_error, unit_definitions
 
 _INWARD_KINDS = ("input", "parameter")
 """Kinds of connectors through which values come in; inside a system, values start from them."""
-
-
-class _RequiredAttribute(NamedTuple):
-    """An attribute of which one value is supported, and what a message says of the others."""
-
-    name: str
-    value: str
-    reason: str
-
-
-_NO_SOURCE_BASE = _RequiredAttribute(
-    "sourceBase", "SSD", "it lies inside a component, which is not supported; move it out"
-)
-_REQUIRED_ATTRIBUTES = {
-    "Component": [
-        _RequiredAttribute("type", "application/x-fmu-sharedlibrary", "only FMUs are supported")
-    ],
-    "ParameterBinding": [
-        _RequiredAttribute(
-            "type", "application/x-ssp-parameter-set", "only parameter sets are read"
-        ),
-        _NO_SOURCE_BASE,
-    ],
-    "ParameterMapping": [
-        _RequiredAttribute(
-            "type", "application/x-ssp-parameter-mapping", "only parameter mappings are read"
-        ),
-        _NO_SOURCE_BASE,
-    ],
-}
-"""The required attributes by element."""
 
 
 def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> SystemStructure:
@@ -113,10 +78,10 @@ def read_ssp(path: str | os.PathLike[str], folder: str | os.PathLike[str]) -> Sy
         components=tuple(components),
         connectors=tuple(system_connectors),
         connections=connections,
-        units=_unit_definitions(root, "ssd"),
+        units=unit_definitions(root, "ssd"),
         declared=component_connectors,
-        span=(_time(experiment, "startTime"), _time(experiment, "stopTime")),
-        base_step=_base_step(root, str(package.path)),
+        span=(time_of(experiment, "startTime"), time_of(experiment, "stopTime")),
+        base_step=base_step_of(root, str(package.path)),
         unused=tuple(reader.unused),
     )
 
@@ -137,59 +102,6 @@ def _extracted_component(
             settings[end.variable] = setting
     shown_as = f"{component.fmu} in {package.path}"
     return replace(component, fmu=file, settings=settings, shown_as=shown_as)
-
-
-def _time(experiment: XmlElement | None, attribute: str) -> float | None:
-    """Return a time of the default experiment [s]; None if it is not declared."""
-    if experiment is None or attribute not in experiment.attrib:
-        return None
-    return float(experiment.attrib[attribute])
-
-
-_STEP_ATTRIBUTES = {"FixedStepAlgorithm": "baseStepSize", "FixedStepMaster": "stepSize"}
-"""Annotations by which other tools declare the step of a system [s]: OSP and OMSimulator."""
-
-
-def _base_step(root: XmlElement, path: str) -> float | None:
-    """Return the step that annotations declare for the outermost system [s]; None if none does.
-
-    Parameters
-    ----------
-    root : XmlElement
-        The system structure.
-    path : str
-        The SSP file, for the message.
-
-    Raises
-    ------
-    SspError
-        If the step is not a positive number.
-    """
-    experiment = root.find("ssd:DefaultExperiment", NAMESPACES)
-    system = root.find("ssd:System", NAMESPACES)
-    for owner in (experiment, system, root):
-        annotations = None if owner is None else owner.find("ssd:Annotations", NAMESPACES)
-        if annotations is None:
-            continue
-        for element in annotations.iter(etree.Element):
-            attribute = _STEP_ATTRIBUTES.get(etree.QName(element).localname)
-            if attribute is not None and attribute in element.attrib:
-                return _positive_step(str(element.get(attribute)), attribute, path)
-    return None
-
-
-def _positive_step(text: str, attribute: str, path: str) -> float:
-    """Return a step size [s] that an attribute declares."""
-    try:
-        step = float(text)
-    except ValueError:
-        step = 0.0
-    if not (isfinite(step) and step > 0.0):
-        raise SspError(
-            f"{SSD_NAME} in {path}: {attribute} must be a positive number of seconds, and {text!r} "
-            "came."
-        )
-    return step
 
 
 class _SystemReader:
@@ -225,20 +137,8 @@ class _SystemReader:
         self.unused: list[str] = []
         self._element_paths = {""}
         self._connection_to: dict[Endpoint, Connection] = {}
+        self._parameters = ParameterReader(package)
         self._read_system(system, "")
-
-    def _error(self, sentence: str) -> SspError:
-        """Return the error for a fault of the system structure."""
-        return SspError(f"{SSD_NAME} in {self.package.path}: {sentence}")
-
-    def _check_required_attributes(self, element: XmlElement, label: str) -> None:
-        """Refuse an element with attributes that have values which are not supported."""
-        for attribute in _REQUIRED_ATTRIBUTES[etree.QName(element).localname]:
-            value = element.get(attribute.name, attribute.value)
-            if value != attribute.value:
-                raise self._error(
-                    f"{label} has the {attribute.name} {value!r}: {attribute.reason}."
-                )
 
     # ------------------------------------------------------------------ elements and connections
 
@@ -248,8 +148,9 @@ class _SystemReader:
         for element in system.iterfind("ssd:Elements/*", NAMESPACES):
             element_path = _joined_path(path, str(element.get("name")))
             if element_path in self._element_paths:
-                raise self._error(
-                    f"there are two elements named {element_path!r}; each needs a name of its own."
+                raise package_error(
+                    self.package,
+                    f"there are two elements named {element_path!r}; each needs a name of its own.",
                 )
             self._element_paths.add(element_path)
             if etree.QName(element).localname == "System":
@@ -264,14 +165,15 @@ class _SystemReader:
     def _read_component(self, element: XmlElement, path: str) -> None:
         """Read a component: its FMU, its number of steps, connectors and parameters."""
         label = f"the component {path!r}"
-        self._check_required_attributes(element, label)
+        self._parameters.check_required_attributes(element, label)
         source = self.package.resolve(str(element.get("source")), label)
-        substeps = _coupling_attributes(element).get("substeps", "1")
+        substeps = coupling_attributes(element).get("substeps", "1")
         is_whole_number = substeps.isascii() and substeps.isdigit()
         if not is_whole_number or int(substeps) == 0:
-            raise self._error(
+            raise package_error(
+                self.package,
                 f"{label} has the number of steps {substeps!r}, which must be a positive whole "
-                "number."
+                "number.",
             )
         self.components[path] = Component(
             name=path,
@@ -287,12 +189,13 @@ class _SystemReader:
         for connector in element.iterfind("ssd:Connectors/ssd:Connector", NAMESPACES):
             end = Endpoint(path, str(connector.get("name")))
             if end in self.connectors:
-                raise self._error(f"the connector {str(end)!r} is there twice.")
+                raise package_error(self.package, f"the connector {str(end)!r} is there twice.")
             kind = connector.get("kind")
             if not path and kind not in CONNECTOR_KINDS:
-                raise self._error(
+                raise package_error(
+                    self.package,
                     f"the connector {end.variable!r} of the system is of the kind {kind}, not "
-                    "supported."
+                    "supported.",
                 )
             type_element = connector.find("ssc:*", NAMESPACES)
             if type_element is None:
@@ -313,24 +216,28 @@ class _SystemReader:
         start_gives = self._gives_values(start, path)
         if start_gives == self._gives_values(end, path):
             verb = "give" if start_gives else "take"
-            raise self._error(
+            raise package_error(
+                self.package,
                 f"a connection joins {str(start)!r} and {str(end)!r}, which both {verb} a value; "
-                "connect what gives one to what takes one."
+                "connect what gives one to what takes one.",
             )
         source, target = (start, end) if start_gives else (end, start)
         if target in self._connection_to:
             first_source = self._connection_to[target].source
-            raise self._error(
-                two_sources_sentence(repr(str(target)), repr(str(first_source)), repr(str(source)))
+            raise package_error(
+                self.package,
+                two_sources_sentence(repr(str(target)), repr(str(first_source)), repr(str(source))),
             )
-        scale = self._transformation(element, f"the connection from {source} to {target}")
+        scale = self._parameters.transformation(
+            element, f"the connection from {source} to {target}"
+        )
         self._connection_to[target] = Connection(
             source=source,
             target=target,
             factor=scale.factor,
             offset=scale.offset,
-            convert_units=not _flag(element, "suppressUnitConversion"),
-            delayed=_flag(_coupling_attributes(element), "delayed"),
+            convert_units=not flag(element, "suppressUnitConversion"),
+            delayed=flag(coupling_attributes(element), "delayed"),
         )
 
     def _connection_end(self, element: XmlElement, side: str, path: str) -> Endpoint:
@@ -348,12 +255,14 @@ class _SystemReader:
         owner = element.get(f"{side}Element") or ""
         end = Endpoint(_joined_path(path, owner), str(element.get(f"{side}Connector")))
         if end.component not in self._element_paths:
-            raise self._error(
-                f"a connection names the element {owner!r}, which its system does not have."
+            raise package_error(
+                self.package,
+                f"a connection names the element {owner!r}, which its system does not have.",
             )
         if end not in self.connectors:
-            raise self._error(
-                f"a connection names the connector {str(end)!r}, which is not declared."
+            raise package_error(
+                self.package,
+                f"a connection names the connector {str(end)!r}, which is not declared.",
             )
         return end
 
@@ -366,22 +275,6 @@ class _SystemReader:
         is_inward = self.connectors[end].kind in _INWARD_KINDS
         return is_inward if is_of_system else not is_inward
 
-    def _transformation(self, element: XmlElement, label: str) -> Conversion:
-        """Return the linear transformation of a connection or mapping entry."""
-        linear = element.find("ssc:LinearTransformation", NAMESPACES)
-        if linear is None:
-            return IDENTITY
-        factor = self._finite(linear.get("factor", "1"), f"the factor of {label}")
-        offset = self._finite(linear.get("offset", "0"), f"the offset of {label}")
-        return Conversion(factor, offset)
-
-    def _finite(self, text: str, label: str) -> float:
-        """Return a number; the schemas allow NaN and INF, which are refused."""
-        value = float(text)
-        if not isfinite(value):
-            raise self._error(f"{label} must be a finite number, and {text} came.")
-        return value
-
     # ------------------------------------------------------------------ parameters
 
     def _read_parameter_bindings(self, element: XmlElement, path: str) -> None:
@@ -390,11 +283,13 @@ class _SystemReader:
         values: dict[str, ComponentSetting] = {}
         unmapped_names: list[str] = []
         for binding in element.iterfind("ssd:ParameterBindings/ssd:ParameterBinding", NAMESPACES):
-            values_of_set = self._parameter_set(binding, label)
+            values_of_set = self._parameters.parameter_set(binding, label)
             mapping = binding.find("ssd:ParameterMapping", NAMESPACES)
             # An empty mapping maps nothing and changes nothing.
             if mapping is not None and (mapping.get("source") or len(mapping)):
-                values_of_set = self._mapped_values(values_of_set, mapping, label, unmapped_names)
+                values_of_set = self._parameters.mapped_values(
+                    values_of_set, mapping, label, unmapped_names
+                )
             values |= values_of_set
         self.unused += [name for name in unmapped_names if name not in values]
         for name, setting in values.items():
@@ -424,114 +319,14 @@ class _SystemReader:
             elif end in self.connectors:
                 kind = self.connectors[end].kind
                 if kind not in _INWARD_KINDS:
-                    raise self._error(f"{str(end)!r} is set, but it is of the kind {kind}.")
+                    raise package_error(
+                        self.package, f"{str(end)!r} is set, but it is of the kind {kind}."
+                    )
                 ends.append(end)
         for end in ends:
             self.settings[end] = setting
         if not ends:
             self.unused.append(str(Endpoint(path, name)))
-
-    def _parameter_document(
-        self, element: XmlElement, inline: str, kind: str, label: str
-    ) -> XmlElement:
-        """Return the parameter set or mapping that an element refers to or contains.
-
-        Parameters
-        ----------
-        element : XmlElement
-            The parameter binding or mapping.
-        inline : str
-            The path of the document inside the element, where it is not in a file of its own.
-        kind : {"ssv", "ssm"}
-            The kind of document.
-        label : str
-            The name of the element in messages.
-        """
-        self._check_required_attributes(element, label)
-        source = element.get("source")
-        if source:
-            return self.package.parse(kind, self.package.resolve(source, label))
-        root = element.find(inline, NAMESPACES)
-        if root is None:
-            raise self._error(f"{label} has neither a source nor content.")
-        return self.package.parse(kind, label, etree.tostring(root))
-
-    def _parameter_set(self, binding: XmlElement, label: str) -> dict[str, ComponentSetting]:
-        """Return the values of a parameter set by name, with the prefix of its binding."""
-        root = self._parameter_document(
-            binding, "ssd:ParameterValues/ssv:ParameterSet", "ssv", label
-        )
-        units = _unit_definitions(root, "ssv")
-        prefix = binding.get("prefix", "")
-        values: dict[str, ComponentSetting] = {}
-        for parameter in root.iterfind("ssv:Parameters/ssv:Parameter", NAMESPACES):
-            name = prefix + parameter.get("name")
-            if name in values:
-                raise self._error(f"{label} gives {name!r} twice; keep one of the two.")
-            type_element = parameter.find("*")  # the schema puts it first
-            value = self._parameter_value(type_element, f"the value of {name!r} of {label}")
-            values[name] = ComponentSetting(value, type_element.get("unit"), units=units)
-        return values
-
-    def _parameter_value(self, type_element: XmlElement, label: str) -> SettingValue:
-        """Return the value of a parameter in a parameter set, by its type."""
-        kind = etree.QName(type_element).localname
-        text: str = type_element.get("value")
-        if kind == "Real":
-            return self._finite(text, label)
-        if kind == "Integer":
-            return int(text)
-        if kind == "Boolean":
-            return _flag(type_element, "value")
-        if kind == "Binary":
-            return bytes.fromhex(text)
-        return text
-
-    def _mapped_values(
-        self,
-        values: dict[str, ComponentSetting],
-        mapping: XmlElement,
-        binding_label: str,
-        unmapped_names: list[str],
-    ) -> dict[str, ComponentSetting]:
-        """Return the values of a parameter set by the names that a mapping gives them.
-
-        Values that the mapping does not name are not used.
-
-        Parameters
-        ----------
-        values : dict of str to ComponentSetting
-            The values of the parameter set.
-        mapping : XmlElement
-            The parameter mapping.
-        binding_label : str
-            The name of the parameter binding in messages.
-        unmapped_names : list of str
-            The names that the mapping gives to values which the set does not have are added to it:
-            one mapping may serve several sets.
-        """
-        label = f"the mapping of {binding_label}"
-        root = self._parameter_document(mapping, "ssm:ParameterMapping", "ssm", label)
-        mapped: dict[str, ComponentSetting] = {}
-        for entry in root.iterfind("ssm:MappingEntry", NAMESPACES):
-            source, target = entry.get("source"), entry.get("target")
-            scale = self._transformation(entry, f"{source!r} in {label}")
-            if source not in values:
-                unmapped_names.append(target)
-                continue
-            if target in mapped:
-                raise self._error(
-                    f"{label} maps two parameters to {target!r}; keep one of the two."
-                )
-            setting = values[source]
-            if scale != IDENTITY:
-                if isinstance(setting.value, bool | str | bytes):
-                    raise self._error(f"{label} scales {source!r}, which is no number.")
-                setting = replace(setting, scale=scale)
-            if _flag(entry, "suppressUnitConversion"):
-                setting = replace(setting, unit=None)
-            mapped[target] = setting
-        return mapped
 
     # ------------------------------------------------------------------ flat connections
 
@@ -565,8 +360,9 @@ class _SystemReader:
         while not self._is_flat_end(chain[0].source) and chain[0].source in self._connection_to:
             chain.insert(0, self._connection_to[chain[0].source])
             if len(chain) > len(self._connection_to) + 1:
-                raise self._error(
-                    f"the connections to {str(target)!r} go round in a circle of systems."
+                raise package_error(
+                    self.package,
+                    f"the connections to {str(target)!r} go round in a circle of systems.",
                 )
         return chain
 
@@ -581,9 +377,10 @@ class _SystemReader:
                 continue
             for later in chain[index:]:
                 if later.scale != IDENTITY or not later.convert_units:
-                    raise self._error(
+                    raise package_error(
+                        self.package,
                         f"{str(connector)!r} is set and transformed on its way to {str(target)!r}; "
-                        "set that instead."
+                        "set that instead.",
                     )
             self.settings[target] = self.settings[connector]
             return
@@ -596,10 +393,11 @@ class _SystemReader:
         all_convert = all(connection.convert_units for connection in chain)
         some_convert = any(connection.convert_units for connection in chain)
         if all_convert != some_convert or (scale != IDENTITY and has_units_on_the_way):
-            raise self._error(
+            raise package_error(
+                self.package,
                 f"the connection to {str(target)!r} through a nested system is transformed between "
                 "connectors with units of their own, which is not supported; leave out the units "
-                "of the nested system's connectors."
+                "of the nested system's connectors.",
             )
         return Connection(
             source=source,
@@ -611,33 +409,6 @@ class _SystemReader:
         )
 
 
-def _unit_definitions(root: XmlElement, kind: str) -> tuple[UnitInfo, ...]:
-    """Return the unit definitions of a document of a kind: "ssd" or "ssv"."""
-    units = []
-    for element in root.iterfind(f"{kind}:Units/ssc:Unit", NAMESPACES):
-        base = element.find("ssc:BaseUnit", NAMESPACES)
-        unit = UnitInfo(
-            name=element.get("name"),
-            exponents=tuple(int(base.get(symbol, "0")) for symbol in BASE_UNITS),
-            factor=float(base.get("factor", "1")),
-            offset=float(base.get("offset", "0")),
-        )
-        units.append(unit)
-    return tuple(units)
-
-
 def _joined_path(*names: str) -> str:
     """Return the path of an element from the names that lead to it; empty names are left out."""
     return ".".join(name for name in names if name)
-
-
-def _flag(attributes: XmlElement | dict[str, str], name: str) -> bool:
-    """Return a Boolean attribute; false if it is absent."""
-    return str(attributes.get(name, "false")).strip() in ("true", "1")
-
-
-def _coupling_attributes(element: XmlElement) -> dict[str, str]:
-    """Return the attributes of our annotation of a component or connection, if any."""
-    path = f"ssd:Annotations/ssc:Annotation/{{{OWN_NAMESPACE}}}Coupling"
-    annotation = element.find(path, NAMESPACES)
-    return {} if annotation is None else dict(annotation.attrib)

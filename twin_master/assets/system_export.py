@@ -21,7 +21,7 @@ from fmu_asset.door.binding import INPUT_ROLES, Binding, Parameter, load_binding
 from fmu_asset.door.exchange import Exchange
 from fmu_asset.folders import scratch_folder
 from fmu_asset.packing.structure_fmu import pack_wing
-from fmu_asset.ssp.package import write_ssp
+from fmu_asset.ssp.writer import write_ssp
 from reporting.progress import reporter
 from scenarios import binding_files
 from twin_master.assets.coupled_source import SeveralSource

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.asset import CoupledAsset
+from fmu_asset.coupling.schedule import algebraic_loops, schedule, strong_components
 from fmu_asset.coupling.structure import (
     Component,
     ComponentSetting,
@@ -23,7 +24,7 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
 )
 from fmu_asset.coupling.structure import expand_connection as expand
-from fmu_asset.coupling.wiring import Wiring, algebraic_loops, schedule, strong_components
+from fmu_asset.coupling.wiring import Wiring
 from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
 from tests.fmu_asset.door.kinds import BINDINGS
 from tests.fmu_asset.making import bound, changed, system, tables, watch

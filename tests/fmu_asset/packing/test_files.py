@@ -21,9 +21,9 @@ from fmu_asset import errors
 from fmu_asset.archive.fmu_file import inspect_fmu, read_fmu
 from fmu_asset.check import check_file, check_fmu
 from fmu_asset.companions import COMPANION_NAMES
-from fmu_asset.compiled.package import compile_library, find_compiler
+from fmu_asset.compiled.compiler import compile_library, find_compiler
 from fmu_asset.door.session import FmiAsset
-from fmu_asset.packing.contents import build_script_fmu
+from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts

@@ -32,8 +32,8 @@ from fmu_asset.door.experiment import default_experiment
 from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import CouplingError, SspError
 from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
-from fmu_asset.ssp.package import write_ssp
 from fmu_asset.ssp.reader import read_ssp
+from fmu_asset.ssp.writer import write_ssp
 from tests.fmu_asset.coupling.reference import PARTS, of_ours
 from tests.fmu_asset.door.kinds import BINDINGS
 from tests.fmu_asset.making import archive_of, bound, members, tables, watch

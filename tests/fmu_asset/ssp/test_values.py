@@ -12,8 +12,8 @@ from fmu_asset.coupling.structure import Component, ComponentSetting, SystemStru
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.errors import CouplingError
 from fmu_asset.ssp.check import check_ssp, join_ssp
-from fmu_asset.ssp.package import write_ssp
 from fmu_asset.ssp.reader import read_ssp
+from fmu_asset.ssp.writer import write_ssp
 from tests.fmu_asset.making import archive_of, watch
 
 SYSTEM = """<?xml version="1.0" encoding="UTF-8"?>

@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 from calibration.result.file import result_bytes
 from calibration.result.record import Calibration, ParameterPrior
 from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
-from fmu_asset.packing.contents import build_script_fmu
+from fmu_asset.packing.script import build_script_fmu
 from reporting.arrays import Float
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts
