@@ -5,11 +5,11 @@ With the latter campaigns are calibrated, and effects searched for: `docs/fmu_mo
 
 import numpy as np
 
-from fe.structure.design import Load, MatrixDesign, MatrixLoad, MeshDesign, NodeOutput, PointOutput
+from fe.structure.design import MatrixDesign, MatrixLoad, MeshDesign, MeshLoad, NodeOutput, PointOutput
 from fe.structure.tables import StructureDesign
 from fmu_asset.description import rendered
 from fmu_asset.door.binding import Binding, parse_binding
-from fmu_asset.errors import BindingError, FmuBuildError, said
+from fmu_asset.errors import BindingError, FmuBuildError
 from reporting.toml_file import parse_toml
 
 
@@ -38,9 +38,10 @@ def structure_binding(design: StructureDesign, frequencies: int = 0) -> Binding:
 def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     """Return the model file of a structure's FMU: forces, outputs, ports and parameters as its file has them.
 
-    A control in N is a force, and one of the name load_factor the load factor of flights, which stand for any
-    rest under it. Where a load of 1 N at a point meets a displacement output along it, there is a port. Ports
-    of the structure file are named in a comment alone: the FMU has no input for a force there.
+    A control in N is a force, and one of the name load_factor the load factor of flights, which
+    stand for any rest under it. Where a load of 1 N at a point meets a displacement output along
+    it, there is a port. Ports of the structure file are named in a comment alone: the FMU has no
+    input for a force there.
 
     Parameters
     ----------
@@ -57,7 +58,11 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     forces = [part.name for part in design.control if part.unit == "N"]
     flies = any(part.name == "load_factor" for part in design.control)
     if not forces and not flies:
-        raise FmuBuildError(said("packing.no_load", design=design))
+        raise FmuBuildError(
+            f"The structure {design.name} has no control in N and no load_factor, and a campaign "
+            'needs a load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 '
+            "N tied to it, or a [[control]] load_factor."
+        )
     ports = [
         (load.control, output.name)
         for load in design.load
@@ -68,7 +73,7 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     return text.decode().rstrip() + "\n"
 
 
-def _meet(load: Load | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
+def _meet(load: MeshLoad | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
     """Return whether a load is 1 N at the place of an output and along it."""
     place, read = (getattr(part, "point", getattr(part, "node", None)) for part in (load, output))
     if place is None or load.force is None or place != read or output.direction is None:

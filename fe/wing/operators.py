@@ -21,13 +21,13 @@ from fe.full.factorisation import most_compliant_modes
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE, Losses, losses_of
 from fe.structure.affine import (
+    AffineResponse,
     AffineStructure,
-    StaticResponse,
     natural_frequencies,
     static_response,
 )
 from fe.structure.affine_fields import OutputRows
-from fe.structure.body import Body, PointMass
+from fe.structure.body import Body, MassAtPoints
 from fe.structure.supports import RigidSet, Supports, supports
 
 from .design import WingDesign, wing_structure
@@ -187,8 +187,8 @@ def wing_body(mesh: WingMesh) -> Body[WingMesh]:
         part=mesh.stiffness_term,
         parts=stiffness_parts(design.regions),
         masses=(
-            PointMass("servo_mass", design.masses.servo, np.vstack(weights_of_servos)),
-            PointMass("pitot_mass", design.masses.pitot, np.vstack(weights_of_pitots)),
+            MassAtPoints("servo_mass", design.masses.servo, np.vstack(weights_of_servos)),
+            MassAtPoints("pitot_mass", design.masses.pitot, np.vstack(weights_of_pitots)),
         ),
         variation=modulus_variation(mesh),
     )
@@ -306,7 +306,7 @@ def solve_static(
     stiffness_loss: Losses = (),
     load_factor: float = 1.0,
     tip_force: float = 0.0,
-) -> StaticResponse:
+) -> AffineResponse:
     """Solve K(e, z) u = f, Kapteyn et al. 2021, eq. (13), and return the gauge strains, eq. (15).
 
     Parameters
@@ -322,7 +322,7 @@ def solve_static(
 
     Returns
     -------
-    StaticResponse
+    AffineResponse
         The response. Strains are positive in compression; the output is the upward displacement at
         the tip [m].
 
