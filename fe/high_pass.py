@@ -115,8 +115,7 @@ def high_pass(
     if not (time_constant > 0.0 and interval > 0.0):
         raise InvalidPatchError(
             "A high-pass needs a positive time constant and sampling interval, but has "
-            f"{time_constant} s "
-            f"and {interval} s."
+            f"{time_constant} s and {interval} s."
         )
     if not 0.0 <= order <= 4.0:
         raise InvalidPatchError(f"The order of a high-pass must be within 0 to 4, but is {order}.")

@@ -5,7 +5,8 @@ With the latter campaigns are calibrated, and effects searched for: `docs/fmu_mo
 
 import numpy as np
 
-from fe.structure.design import MatrixDesign, MatrixLoad, MeshDesign, MeshLoad, NodeOutput, PointOutput
+from fe.structure.design import MeshDesign, MeshLoad, PointOutput
+from fe.structure.matrix_design import MatrixDesign, MatrixLoad, NodeOutput
 from fe.structure.tables import StructureDesign
 from fmu_asset.description import rendered
 from fmu_asset.door.binding import Binding, parse_binding

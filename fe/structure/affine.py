@@ -427,8 +427,7 @@ def natural_frequencies(
     if not 1 <= count <= most:
         raise SolutionError(
             f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns "
-            "gives 1 to "
-            f"{most}."
+            f"gives 1 to {most}."
         )
     system = structure.system_at(values or {})
     if not system.mass.diagonal().any():

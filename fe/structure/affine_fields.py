@@ -126,8 +126,7 @@ def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array
         if not row.any():
             raise InvalidDesignError(
                 f"{label} ({port.name}): the supports hold all that a force there would move; put "
-                "the port "
-                "where the structure can move."
+                "the port where the structure can move."
             )
 
 

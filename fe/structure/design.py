@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from fe.elements.elasticity import (
     axes_of,
@@ -26,6 +26,7 @@ from fe.runtime.state import MOST_REGIONS
 from reporting.toml_file import Fault, read_toml, validate
 
 from . import tables
+from .matrix_design import MatrixDesign
 
 LEAST_SINE = 1e-3
 """Two axes whose angle has a smaller sine do not span a plane."""
@@ -268,140 +269,6 @@ class MeshDesign(tables.StructureDesign, Gauged):
     def files(self) -> tuple[str, ...]:
         """The mesh."""
         return (self.mesh,)
-
-
-FileName = Annotated[str, Field(min_length=1)]
-Files = Annotated[
-    tuple[FileName, ...],
-    Field(min_length=1),
-    BeforeValidator(lambda files: (files,) if isinstance(files, str) else files),
-]
-Node = Annotated[int, Field(ge=0)]
-
-
-class MatrixSupport(tables.DesignSection):
-    """Motions of nodes that are held: `rx`, `ry`, `rz` are the components 4, 5 and 6."""
-
-    nodes: Annotated[tuple[Node, ...], Field(min_length=1)]
-    hold: Annotated[tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...], Field(min_length=1)]
-
-
-class StiffnessPart(tables.Given):
-    """Share of the stiffness that a parameter scales, a region may lose, or both.
-
-    Either its own `matrix`, or that of the whole structure, `changed` by making the part's modulus
-    `times` what it is.
-    """
-
-    matrix: FileName | None = None
-    changed: FileName | None = None
-    times: float | None = Field(default=None, ge=0.0, lt=1.0)
-    scaled_by: tables.Name | None = None
-    damage: tables.Name | None = None
-
-    ways = (("matrix",), ("changed", "times"))
-
-
-class MatrixLoad(tables.Given, tables.Commanded):
-    """A load: its own `vector`, a `force` [N] at a node, or an `acceleration` [m/s^2]."""
-
-    vector: FileName | None = None
-    node: Node | None = None
-    force: tables.Direction | None = None
-
-    ways = (("vector",), ("node", "force"), ("acceleration",))
-
-
-class MatrixMass(tables.Given, tables.ChosenMass):
-    """Mass at a `node`, or times the `matrix` of 1 kg."""
-
-    node: Node | None = None
-    matrix: FileName | None = None
-
-    ways = (("node",), ("matrix",))
-
-
-class Extension(tables.Given, tables.Named):
-    """Strain: its own `vector`, or how far two nodes move apart along a direction over a length."""
-
-    vector: FileName | None = None
-    nodes: tuple[Node, Node] | None = None
-    direction: tables.Direction | None = None
-    length: float | None = Field(default=None, gt=0.0)
-
-    ways = (("vector",), ("nodes", "direction", "length"))
-
-
-class NodeOutput(tables.Given, tables.Named):
-    """Displacement, acceleration or port: a `vector` of its own, or of a node along a direction."""
-
-    vector: FileName | None = None
-    node: Node | None = None
-    direction: tables.Direction | None = None
-
-    ways = (("vector",), ("node", "direction"))
-
-
-class MatrixDesign(tables.StructureDesign):
-    """A structure from matrices.
-
-    `stiffness_matrix` and `mass_matrix` are those of the whole structure, undamaged and with
-    nominal parameters, or files whose matrices sum to them; `unknowns` says which node and
-    component each row is, where they do not.
-    """
-
-    stiffness_matrix: Files
-    mass_matrix: Files
-    unknowns: FileName | None = None
-    part: tuple[StiffnessPart, ...] = ()
-    support: tuple[MatrixSupport, ...] = ()
-    load: tuple[MatrixLoad, ...] = ()
-    damage: tuple[tables.Region, ...] = Field(default=(), max_length=MOST_REGIONS)
-    mass: tuple[MatrixMass, ...] = ()
-    gauge: tuple[Extension, ...] = ()
-    displacement: tuple[NodeOutput, ...] = ()
-    acceleration: tuple[NodeOutput, ...] = ()
-    port: tuple[NodeOutput, ...] = ()
-
-    what = "matrix"
-    scaled_table = "part"
-
-    def faults(self) -> Iterator[Fault]:
-        """Yield faults of tables that do not fit together, and of regions without parts."""
-        yield from super().faults()
-        yield from self.wrong_ties(
-            "part",
-            "damage",
-            "damage",
-            tied="is of the region",
-            untied="has no stiffness: no part names it",
-        )
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Every file that is named, once, in the order of the tables."""
-        names = [*self.stiffness_matrix, *self.mass_matrix]
-        if self.unknowns:
-            names.append(self.unknowns)
-        rows = [*self.part, *self.load, *self.mass]
-        rows += [*self.gauge, *self.displacement, *self.acceleration, *self.port]
-        for row in rows:
-            for key in _FILE_KEYS:
-                name = getattr(row, key, None)
-                if name:
-                    names.append(name)
-        files = [file_of(name)[0] for name in names]
-        return tuple(dict.fromkeys(files))
-
-
-_FILE_KEYS = ("matrix", "changed", "vector")
-"""Keys of the tables that name a file."""
-
-
-def file_of(name: str) -> tuple[str, str]:
-    """Return the file, and the matrix in it, that `FILE` or `FILE:MATRIX` names."""
-    file, _, matrix = name.partition(":")
-    return file, matrix
 
 
 def is_structure(content: Mapping[str, Any]) -> bool:

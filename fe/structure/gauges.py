@@ -136,8 +136,7 @@ def _averaging_points(
     width_words = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
     over_edge = (
         f"{where}: {gauge.length:g} {mesh.unit_name} long{width_words}, the gauge reaches over the "
-        "edge; its "
-        "point"
+        "edge; its point"
     )
 
     def project_grid(
@@ -178,8 +177,7 @@ def _projected_direction(direction: FloatArray, normal: FloatArray, where: str) 
         normal_words = ", ".join(f"{value + 0.0:.3g}" for value in normal)
         raise InvalidDesignError(
             f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal "
-            "there is "
-            f"({normal_words}); at most {STEEPEST:g} degrees are allowed."
+            f"there is ({normal_words}); at most {STEEPEST:g} degrees are allowed."
         )
     return unit_vector(direction - (direction @ normal) * normal)
 

@@ -19,7 +19,14 @@ from fe.runtime.errors import MeshError, SolutionError
 
 from .affine import AffineStructure, StiffnessTerm
 from .affine_fields import AffineFields, OutputRows, affine_fields
-from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput, StiffnessPart
+from .matrix_design import (
+    Extension,
+    MatrixDesign,
+    MatrixLoad,
+    MatrixMass,
+    NodeOutput,
+    StiffnessPart,
+)
 from .matrix_files import FORCE_WEIGHTS, READ_WEIGHTS, MatrixFiles, place_in_words
 from .matrix_tables import Place, read_matrix, read_unknowns
 from .tables import MOTIONS
@@ -89,8 +96,7 @@ def _places(design: MatrixDesign, folder: Path) -> list[Place]:
         if places_in_file is None:
             raise MeshError(
                 f"{folder / name} does not say which node and component each row is; name a file "
-                "with a line "
-                "for each row, such as `97.3`, by the key unknowns."
+                "with a line for each row, such as `97.3`, by the key unknowns."
             )
         places.update(places_in_file)
     return sorted(places)
@@ -319,6 +325,5 @@ def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
     raise MeshError(
         f"motions that the stiffness leaves free, or nearly: {free_count or 1}; in one "
         f"{place_in_words(places[largest])} moves most. Hold the structure by [[support]], or "
-        "before its "
-        "matrices are written."
+        "before its matrices are written."
     )

@@ -88,8 +88,8 @@ class MatrixFiles:
         known = f"its components {', '.join(components)}" if components else "no such node"
         raise MeshError(
             f"{where}: node {node} has no component {component} in the matrices, which know "
-            f"{known}; what is "
-            "held or tied when they are written is not among them: name another node."
+            f"{known}; what is held or tied when they are written is not among them: name another "
+            "node."
         )
 
     def unit_vector_at(
@@ -116,8 +116,8 @@ class MatrixFiles:
             node, component = place
             raise MeshError(
                 f"{where}: node {node} has {len(rows)} rows of component {component}, and how "
-                "these share "
-                "what acts on the node is not known; name another node, or give a vector."
+                "these share what acts on the node is not known; name another node, or give a "
+                "vector."
             )
         vector = np.zeros(len(self.places))
         vector[rows] = weights[len(rows)]
@@ -145,9 +145,8 @@ class MatrixFiles:
         if len(self.rows) < len(self.places):
             raise MeshError(
                 f"{where}: several rows of the matrices carry one name, as those of expanded "
-                "shells and "
-                "beams do, and rows that turn cannot be told from rows that shift; give the load "
-                "as a vector."
+                "shells and beams do, and rows that turn cannot be told from rows that shift; "
+                "give the load as a vector."
             )
         no_rotations = (0.0, 0.0, 0.0)
         values = (*field, *no_rotations)
@@ -190,8 +189,7 @@ class MatrixFiles:
         if matrix.shape[0] != size:
             raise MeshError(
                 f"{label} has {matrix.shape[0]} rows, but there are {size} unknowns; matrices and "
-                "unknowns "
-                "must be of the same run."
+                "unknowns must be of the same run."
             )
         self._check_finite_and_symmetric(matrix, label)
         return sparse.csr_array(0.5 * (matrix + matrix.T) / self.unit)
@@ -207,8 +205,6 @@ class MatrixFiles:
             row, column = (int(indices[worst]) for indices in asymmetry.coords)
             raise MeshError(
                 f"{label} is not symmetric: its entries between {place_in_words(self.places[row])} "
-                "and "
-                f"{place_in_words(self.places[column])} differ by {asymmetry.data[worst]:.3g}; "
-                "friction, "
-                "follower loads and gyroscopic terms cannot be taken."
+                f"and {place_in_words(self.places[column])} differ by {asymmetry.data[worst]:.3g}; "
+                "friction, follower loads and gyroscopic terms cannot be taken."
             )

@@ -22,7 +22,7 @@ from fe.runtime.errors import MeshError
 from reporting.text_file import read_text
 
 from .deck_text import fail
-from .design import file_of
+from .matrix_design import file_of
 from .nastran import cards
 
 Place = tuple[int, int]

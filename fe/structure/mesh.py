@@ -162,8 +162,7 @@ class StructureMesh(CellMesh):
         if loose_count:
             raise MeshError(
                 f"{where}: {loose_count} of the nodes of the set {name!r} of {self.source} touch "
-                "no cell; "
-                "take them out of the set."
+                "no cell; take them out of the set."
             )
         return nodes
 
@@ -207,8 +206,7 @@ class StructureMesh(CellMesh):
         if not len(surface):
             raise MeshError(
                 f"{where}: no face of the surface lies in the set {name!r} of {self.source}; a set "
-                "of faces, "
-                "or all nodes of the faces, is expected."
+                "of faces, or all nodes of the faces, is expected."
             )
         return surface
 

@@ -82,8 +82,8 @@ def _check_edges(mesh: StructureMesh) -> None:
             node = mesh.node_numbers[mesh.cells[cell, corner_count + edge]]
             raise MeshError(
                 f"{mesh.source}: node {node} of element {mesh.cell(cell)} lies far from the middle "
-                "of its edge; the nodes of the element stand in another order, or the edge is bent "
-                "too much."
+                "of its edge; the nodes of the element stand in another order, or the edge is "
+                "bent too much."
             )
 
 

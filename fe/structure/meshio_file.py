@@ -301,8 +301,8 @@ def _mesh_of_meshio(path: Path) -> Mesh:
         if "gmsh:physical" in reason:
             fail(
                 str(path),
-                "some elements are in a physical group and others in none, as Gmsh saves them with "
-                "Mesh.SaveAll = 1. Set Mesh.SaveAll = 0 and save the mesh anew.",
+                "some elements are in a physical group and others in none, as Gmsh saves them "
+                "with Mesh.SaveAll = 1. Set Mesh.SaveAll = 0 and save the mesh anew.",
             )
     reason = " ".join(reason[:_LONGEST_REASON].split()).rstrip(".")
     raise MeshError(

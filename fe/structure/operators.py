@@ -20,7 +20,6 @@ from .affine_fields import OutputRows
 from .body import Body, MassAtPoints
 from .design import (
     Damage,
-    MatrixDesign,
     MeshDesign,
     MeshMaterial,
     MeshPort,
@@ -30,6 +29,7 @@ from .design import (
 )
 from .gauges import gauge_rows
 from .matrices import assemble_matrices
+from .matrix_design import MatrixDesign
 from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
 from .nodal_loads import nodal_load, point_weights, port_row
@@ -121,8 +121,7 @@ def _part_of_cells(
             _, other = labelled[part_of_cell[shared[0]]]
             raise MeshError(
                 f"{label}: the {kind}s {part.name!r} and {other.name!r} share {len(shared)} "
-                "elements, such "
-                f"as {mesh.cell(shared[0])}; their sets must not overlap."
+                f"elements, such as {mesh.cell(shared[0])}; their sets must not overlap."
             )
         part_of_cell[cells] = number
     return part_of_cell
@@ -189,8 +188,7 @@ def load_and_assemble(
     if isinstance(design, MatrixDesign):
         raise InvalidDesignError(
             f"{file} is a structure from matrices: without a mesh there is no field to draw, and "
-            "nothing "
-            "that CalculiX could solve."
+            "nothing that CalculiX could solve."
         )
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
@@ -226,8 +224,7 @@ def _check_materials(mesh: StructureMesh, material_of: IntArray) -> None:
     if len(bare):
         raise MeshError(
             f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among "
-            "them "
-            f"{mesh.cell(bare[0])}."
+            f"them {mesh.cell(bare[0])}."
         )
 
 

@@ -168,8 +168,7 @@ def _check_no_shared_nodes(
             place = mesh.place(mesh.points[shared[0]])
             raise MeshError(
                 f"{label}: {len(shared)} nodes of the rigid set belong to another support, too, "
-                "such as that "
-                f"at {place}; say what holds it in its own table."
+                f"such as that at {place}; say what holds it in its own table."
             )
         is_supported[body.nodes] = True
 
@@ -241,8 +240,7 @@ def _check_rigid_motions(
     if len(free):
         raise MeshError(
             f"{mesh.source}: the supports leave {len(free)} of the six rigid motions free, among "
-            "them "
-            f"{_motion_in_words(free[0], mesh, centre)}; hold further directions."
+            f"them {_motion_in_words(free[0], mesh, centre)}; hold further directions."
         )
 
 
