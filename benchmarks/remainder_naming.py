@@ -39,6 +39,7 @@ from benchmarks.blind_naming import model_of
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.catalogue.library import library
 from discrepancy.errors import DiscrepancyError
+from discrepancy.proof_record import Proof
 from discrepancy.verdict import Verdict
 from discrepancy.workflow import investigate
 
@@ -219,10 +220,14 @@ def judge(out: Path, seed: int, number: int, *, colour: bool) -> dict[str, Any]:
         found = investigate(read_campaign(folder), model_of(folder), library(), thorough=False)
     except DiscrepancyError as error:
         return truth | {"kind": "error", "sentence": str(error), "outcome": "error", "seconds": 0.0}
-    return truth | scored(found.verdict, truth["identifiers"]) | {"seconds": time.perf_counter() - began}
+    return (
+        truth
+        | scored(found.verdict, truth["identifiers"], found.proof)
+        | {"seconds": time.perf_counter() - began}
+    )
 
 
-def scored(verdict: Verdict, true: list[str]) -> dict[str, Any]:
+def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, Any]:
     """Return what a verdict says and its outcome: its kind if right, else wrong; nothing where nothing is."""
     named = sorted(item.identifier for item in verdict.effects)
     families = {item.identifier: item.family for item in library()}
@@ -237,11 +242,11 @@ def scored(verdict: Verdict, true: list[str]) -> dict[str, Any]:
         outcome = kind if right else "wrong"
     else:
         outcome = kind if true or kind == "unexplained" else "nothing"
-    explained = verdict.explained
+    closed = None if proof is None else proof.closed
     return {
         "kind": kind, "named": named, "outcome": outcome, "sentence": verdict.sentence,
         "probability": verdict.probability,
-        "share": None if explained is None else [explained.low, explained.value, explained.high],
+        "share": None if closed is None else [closed.low, closed.value, closed.high],
         "hypotheses": [[list(item.identifiers), item.log_evidence] for item in verdict.hypotheses[:6]],
         "gates": [gate.reason for gate in verdict.gates if gate.passed is False],
     }  # fmt: skip

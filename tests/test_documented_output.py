@@ -10,14 +10,13 @@ from benchmarks.pictures.picture import PRINTED_NUMBER, agrees
 from tests import command_line
 from tests.conftest import REFERENCE
 
-PAGE = Path(__file__).parents[1] / "docs" / "real_wing.md"
+DOCS = Path(__file__).parents[1] / "docs"
 
 
-def block(language: str) -> list[str]:
-    """Return the lines of the first fenced block of the page in a language."""
-    match = re.search(
-        rf"^```{language}\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    )
+def block(page: str, language: str) -> list[str]:
+    """Return the lines of the first fenced block of a page in a language."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    match = re.search(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert match is not None
     return match[1].splitlines()
 
@@ -31,16 +30,26 @@ def same_line(printed: str, answered: str) -> bool:
 
 
 @pytest.mark.long
-def test_the_commands_for_the_real_wing_print_what_the_page_says(tmp_path):
-    published = REFERENCE / "uav_experimental_calibration"
-    if not published.is_dir():
-        pytest.skip(f"the authors' published data are not at {published}")
-    (tmp_path / "UAV-Experimental-Calibration").symlink_to(published)
-    commands = [line.split()[1:] for line in block("") if line.startswith("uav-twin ")]
+@pytest.mark.parametrize(
+    ("page", "folder", "published"),
+    [
+        ("real_wing.md", "UAV-Experimental-Calibration", "uav_experimental_calibration"),
+        ("measured_rigs.md", "FOLDER", "measured/two_tanks"),
+        ("discrepancy.md", "", ""),
+    ],
+)
+def test_the_commands_of_a_page_print_what_it_says(page, folder, published, tmp_path):
+    """`folder` is how the commands call the folder of the published records, where they need one."""
+    if folder:
+        records = REFERENCE / published
+        if not records.is_dir():
+            pytest.skip(f"the published records are not at {records}")
+        (tmp_path / folder).symlink_to(records)
+    commands = [line.split()[1:] for line in block(page, "") if line.startswith("uav-twin ")]
     with contextlib.chdir(tmp_path):
         answers = [command_line.said(*words) for words in commands]
-    answered = [line.rstrip() for line in answers[-1].splitlines()]
-    missing = [line for line in block("text") if not any(same_line(line, other) for other in answered)]
+    answered = [line.rstrip() for answer in answers for line in answer.splitlines()]
+    missing = [line for line in block(page, "text") if not any(same_line(line, other) for other in answered)]
     assert missing == []
 
 

@@ -127,6 +127,9 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
         "fmu build --patch patch.json --out wing_with_effects.fmu",
     ),
     "docs/inference.md": (linked("path/to/UAV-Digital-Twin", REFERENCE / "uav_digital_twin"),),
+    "docs/locating.md": (
+        "discrepancy example laboratory demo --model three_mass_chain --effect coulomb_friction@joint=0.004",
+    ),
     # The page packs the FMU itself.
     "docs/python.md": ("fmu build --out drafted.fmu", "fmu bind drafted.fmu --out wing.toml", *VERDICT),
     "docs/real_wing.md": (converted_wing,),

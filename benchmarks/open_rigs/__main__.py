@@ -50,7 +50,7 @@ def judge(out: Path, seed: int, number: int, variant: str) -> dict[str, Any]:
         found = investigate(read_campaign(folder), folder / "model.toml", library(), thorough=False)
     except DiscrepancyError as error:
         return facts | {"kind": "error", "sentence": str(error), "outcome": "error", "seconds": 0.0}
-    row = scored(found.verdict, facts["identifiers"]) | {"family": found.verdict.family}
+    row = scored(found.verdict, facts["identifiers"], found.proof) | {"family": found.verdict.family}
     row["outcome"] = outcome_of(row, facts)
     row["places"] = sorted({item.place for item in found.verdict.effects})
     right = row["outcome"] in ("named", "named in part") and not found.verdict.family

@@ -1,6 +1,6 @@
 """Every picture of docs/images by its name, with what README and docs say of it."""
 
-from benchmarks.pictures import front, measured, missions
+from benchmarks.pictures import examples, front, measured, missions
 from benchmarks.pictures.picture import Picture, Statement
 
 NOTEBOOK_FLEET, NOTEBOOK_EFFECT, REAL_WING = "fleet", "effect", "real wing"
@@ -36,6 +36,12 @@ PICTURES = {
             (Statement("docs/discrepancy.md", "a step of {step} N over the speed"),),
             minutes=True,
             source=NOTEBOOK_EFFECT,
+        ),
+        Picture(
+            "force_at_joint",
+            examples.draw_force_at_joint,
+            (Statement("docs/locating.md", "a force of {rms} N (rms), at most {largest} N"),),
+            minutes=True,
         ),
         Picture(
             "front_watch", front.draw_watch, (Statement("README.md", "at turn 10: alarm at turn {alarm},"),)

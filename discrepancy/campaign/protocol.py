@@ -148,3 +148,9 @@ class Event:
         ):
             if wrong:
                 raise CampaignFileError(said(f"campaign.{sentence}", event=self))
+
+    @property
+    def moments(self) -> dict[str, float]:
+        """Begin and end, where it has one, by the names that expressions use [s]."""
+        begin = {self.name: self.time}
+        return begin if self.until is None else {**begin, f"{self.name}_until": self.until}

@@ -1,7 +1,8 @@
 """Reading a campaign: a folder with `campaign.toml` and tables in, a checked `Campaign` in SI units out."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from math import inf
 from pathlib import Path, PurePosixPath
 
@@ -132,40 +133,81 @@ def _unused(section: schema.CampaignSection, tables: Mapping[str, TextTable]) ->
     ]
 
 
-def placed_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> Iterator[Event]:
-    """Yield the events in the trials in which they happened, once each and within their records in time.
+def placed_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
+    """Return the events with the trials in which they happened, within their records in time.
+
+    Parameters
+    ----------
+    events : iterable of Event
+        As a file has them: with one trial, several, or none, which means all with samples in time.
+    trials : tuple of Trial
+        Of the campaign.
+    source : str
+        The file, for refusals.
 
     Raises
     ------
-    CampaignFileError, CampaignDataError
-        A trial is not there or has no course, or a moment comes twice or lies outside its record; `source` is
-        named.
+    CampaignFileError
+        A trial of an event is not there or has no samples in time, two events have moments of one name, or
+        an event begins again before it was over.
+    CampaignDataError
+        A moment lies outside of its trial's record.
     """
-    known, seen = {trial.name: trial for trial in trials}, set[tuple[str, str]]()
-    courses = tuple(trial.name for trial in trials if trial.is_dynamic)
+    in_time = tuple(trial.name for trial in trials if trial.is_dynamic)
+    placed = []
     for event in events:
-        found = replace(event, trial=None, trials=(event.trial,) if event.trial else event.trials or courses)
-        for name in found.trials:
-            told = {"event": event, "trial": name, "known": ", ".join(known)}
-            if name not in courses:
-                wrong = "no_course" if name in known else "no_trial"
-                kind = known[name].kind.value if name in known else ""
-                raise CampaignFileError(f"{source}: {said(f'campaign.{wrong}', kind=kind, **told)}.")
-            first, last = known[name].time[[0, -1]].tolist()
-            # its end has a name, too, by which expressions know it
-            for key, word, moment in (
-                ("time", event.name, event.time), ("until", f"{event.name}_until", event.until)
-            ):  # fmt: skip
-                if moment is None:
-                    continue
-                if (word, name) in seen:
-                    twice = said("campaign.two_moments", word=word, trial=name)
-                    raise CampaignFileError(f"{source}: {twice}.")
-                if not first <= moment <= last:
-                    told |= {"key": key, "moment": moment, "first": first, "last": last}
-                    raise CampaignDataError(said("campaign.not_then", **told))
-                seen.add((word, name))
-        yield found
+        names = (event.trial,) if event.trial else event.trials or in_time
+        placed.append(replace(event, trial=None, trials=names))
+    for event in placed:
+        for name in event.trials:
+            _check_moments(event, name, trials, source)
+    for name in in_time:
+        _check_order([event for event in placed if name in event.trials], name, source)
+    return placed
+
+
+def _check_moments(event: Event, name: str, trials: tuple[Trial, ...], source: str) -> None:
+    """Refuse an event in a trial that is not there, that has no samples in time, or that ended before."""
+    trial = next((item for item in trials if item.name == name), None)
+    if trial is None:
+        known = ", ".join(item.name for item in trials)
+        raise CampaignFileError(
+            f"{source}: {said('campaign.no_trial', event=event, trial=name, known=known)}."
+        )
+    if not trial.is_dynamic:
+        words = said("campaign.no_course", event=event, trial=name, kind=trial.kind.value)
+        raise CampaignFileError(f"{source}: {words}.")
+    first, last = trial.time[[0, -1]].tolist()
+    for key, moment in (("time", event.time), ("until", event.until)):
+        if moment is not None and not first <= moment <= last:
+            raise CampaignDataError(
+                f"The event {event.name!r} has {key} = {moment:g} s, but the record of the trial {name!r} "
+                f"goes from {first:g} to {last:g} s: times count from the trial's start."
+            )
+
+
+def _check_order(events: list[Event], trial: str, source: str) -> None:
+    """Refuse moments of one name of different events, and an event that begins again before it was over."""
+    owners: dict[str, str] = {}
+    for event in events:
+        for word in event.moments:
+            if owners.setdefault(word, event.name) != event.name:
+                words = said("campaign.two_moments", word=word, trial=trial)
+                raise CampaignFileError(f"{source}: {words}.")
+    in_order = sorted(events, key=lambda event: (event.name, event.time))
+    for event, following in pairwise(in_order):
+        if event.name != following.name:
+            continue
+        if event.until is None:
+            raise CampaignFileError(
+                f"{source}: the event {event.name!r} happens several times in the trial {trial!r}, and that "
+                f"at {event.time:g} s has no end: give it `until`."
+            )
+        if following.time < event.until:
+            raise CampaignFileError(
+                f"{source}: the event {event.name!r} begins again at {following.time:g} s in the trial "
+                f"{trial!r}, before it is over at {event.until:g} s: its intervals must not overlap."
+            )
 
 
 def _read_table(folder: Path, name: str) -> TextTable:

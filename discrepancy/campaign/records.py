@@ -3,10 +3,11 @@
 `discrepancy.campaign.reading` reads one from a folder; strain is dimensionless here, displacement in metres.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
+from itertools import product
 from math import inf
 from typing import Annotated, Any, Literal
 
@@ -345,7 +346,7 @@ class Campaign:
     loggers : mapping of str to tuple of str
         Channels and inputs ("force": of forced trials) that share a clock, by logger; empty: one has all.
     events : tuple of Event
-        In the order of the file; those of one name are in different trials.
+        In the order of the file; those of one name follow each other in a trial, or are in different ones.
     accept : tuple of str
         Faults of the data that are no faults, in all channels and trials: words of `ACCEPTABLE`.
     """
@@ -373,11 +374,41 @@ class Campaign:
             words += item.accept if item.name == trial else ()
         return frozenset(words)
 
-    def event_times(self, trial: str) -> dict[str, float]:
-        """Return the moments in a trial [s] by the names that expressions use."""
-        there = [event for event in self.events if trial in event.trials]
-        ends = {f"{event.name}_until": event.until for event in there if event.until is not None}
-        return {event.name: event.time for event in there} | ends
+    def moment_names(self, trial: str) -> frozenset[str]:
+        """Return the names by which expressions know the moments of events in a trial."""
+        names: set[str] = set()
+        for event in self.events:
+            if trial in event.trials:
+                names |= event.moments.keys()
+        return frozenset(names)
+
+    def event_moments(self, trial: str, names: Collection[str]) -> list[dict[str, float]]:
+        """Return the moments of a trial's events, once for each time that the events happened.
+
+        Parameters
+        ----------
+        trial : str
+            Name of the trial.
+        names : collection of str
+            The moments that an expression uses: `pump_on`, `pump_on_until`.
+
+        Returns
+        -------
+        list of dict of str to float
+            Moments by name [s]. Where several events are used, every occurrence of the one is combined with
+            every occurrence of the other. Empty where a name has no moment in the trial.
+        """
+        occurrences: dict[str, list[dict[str, float]]] = {}
+        for event in self.events:
+            wanted = event.moments.keys() & set(names)
+            if trial in event.trials and wanted:
+                occurrences.setdefault(event.name, []).append(event.moments)
+        combined = []
+        for combination in product(*occurrences.values()):
+            moments = {name: time for event in combination for name, time in event.items()}
+            if moments.keys() >= set(names):
+                combined.append(moments)
+        return combined
 
     def records(self, channel: str) -> Iterator[tuple[Trial, FloatArray, BoolArray]]:
         """Yield each trial that has a channel, what it read there (N,), and which readings count."""

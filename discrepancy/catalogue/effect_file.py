@@ -281,7 +281,7 @@ class _Recipe:
         return bool({"begin", "end"} & self.when.keys())
 
     def built(self, here: Here) -> Iterator[Primitive]:
-        """Yield the primitive: once, or for each trial that has its events; not at all where `if` is zero."""
+        """Yield the primitive, once for each time that its events happened; none where `if` is zero."""
         known = {**here.values, **{name: SCALES[name](here) for name in self.scales}}
         if "if" in self.when and self.when["if"].value(known) == 0.0:
             return
@@ -289,8 +289,9 @@ class _Recipe:
             yield self._primitive(known, here.target, ())
             return
         for trial in here.setting.campaign.trials:
-            moments = here.setting.campaign.event_times(trial.name)
-            if trial.is_dynamic and self.moments <= moments.keys():
+            if not trial.is_dynamic:
+                continue
+            for moments in here.setting.campaign.event_moments(trial.name, self.moments):
                 there = {**known, **moments}
                 times = [
                     self.when[key].value(there) if key in self.when else None for key in ("begin", "end")

@@ -293,10 +293,10 @@ def _trial(asked: Asked, kinds: Kinds = frozenset()) -> str | None:
 
 def _event(asked: Asked) -> str | None:
     campaign = asked.setting.campaign
-    fitted = [campaign.event_times(trial.name) for trial in campaign.fitted]
-    if not asked.moments or any(asked.moments <= times.keys() for times in fitted):
+    fitted = [campaign.moment_names(trial.name) for trial in campaign.fitted]
+    if not asked.moments or any(asked.moments <= names for names in fitted):
         return None
-    there = ", ".join(sorted({name for times in fitted for name in times})) or "none"
+    there = ", ".join(sorted(frozenset[str]().union(*fitted))) or "none"
     return said("needs.event", events=" and ".join(sorted(asked.moments)), there=there)
 
 

@@ -64,10 +64,13 @@ def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
 
 
 def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
-    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end."""
+    """Return the colour scale of sizes of residuals: logarithmic, with 1 (noise) near its dark end.
+
+    Sizes below the scale have the colour of its end: a window whose readings are all missing has the size 0.
+    """
     found = np.asarray(values, dtype=float)
     largest = float(np.nanmax(found, initial=1.0))
-    return LogNorm(0.7, max(largest, 3.0))
+    return LogNorm(0.7, max(largest, 3.0), clip=True)
 
 
 def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:

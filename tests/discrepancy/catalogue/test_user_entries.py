@@ -13,7 +13,7 @@ from discrepancy.campaign.protocol import Event
 from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.writing import write_campaign
 from discrepancy.catalogue.effect_file import effects_of_file
-from discrepancy.catalogue.library import effect_by_identifier, library, load_catalogue
+from discrepancy.catalogue.library import effect_by_identifier, in_events, library, load_catalogue
 from discrepancy.errors import CatalogueError
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -172,9 +172,45 @@ def test_an_effect_acts_from_a_parameter_after_an_event_on(pump, write):
 
 def test_events_survive_the_files(pump, tmp_path):
     assert pump.events == (Event("pump_on", ("pumping",), time=2.5, until=8.0),)
-    assert pump.event_times("pumping") == {"pump_on": 2.5, "pump_on_until": 8.0}
-    assert pump.event_times("quiet") == {}
+    assert pump.event_moments("pumping", ["pump_on"]) == [{"pump_on": 2.5, "pump_on_until": 8.0}]
+    assert pump.event_moments("quiet", ["pump_on"]) == []
     assert read_campaign(write_campaign(pump, tmp_path / "again")).events == pump.events
     every = ("campaign.toml", 'trial = "pumping", time', "time")
     (event,) = read_campaign(campaign_folder(tmp_path / "a", "pump", every)).events
     assert event.trials == ("quiet", "pumping")
+
+
+TWICE = (
+    Event("pump_on", ("pumping",), time=1.0, until=3.0),
+    Event("pump_on", ("pumping",), time=6.0, until=8.0),
+)
+
+
+def test_an_event_may_happen_several_times_in_a_trial(tmp_path):
+    again = 'until = 8.0 }, { name = "pump_on", trial = "pumping", time = 9.0'
+    campaign = read_campaign(campaign_folder(tmp_path, "pump", ("campaign.toml", "until = 8.0", again)))
+    assert [event.time for event in campaign.events] == [2.5, 9.0]
+
+
+def test_a_pull_of_ones_own_acts_anew_each_time_that_its_event_happens(pump, write):
+    (effect,) = effects_of_file(write(PUMP_PULL))
+    campaign = replace(pump, events=TWICE)
+    patch = effect.patch(setting_of(campaign, MODEL), {"slope": 0.4}, "slide")
+    moved = observe(MODEL, campaign, campaign.trials[1], patch, Conditions(np.zeros(0))).values[:, 0]
+    expected = np.zeros_like(TIME)
+    for event in TWICE:  # 2 x'' = 0.4 (t - begin) until the end, then it coasts
+        since, after = np.clip(TIME - event.time, 0.0, 2.0), np.maximum(TIME - event.until, 0.0)
+        expected += 0.2 * since**3 / 6.0 + 0.2 * 2.0**2 / 2.0 * after
+    np.testing.assert_allclose(moved, expected, atol=1e-6 * expected.max())
+
+
+def test_an_effect_during_an_event_acts_in_all_of_its_intervals(pump, write):
+    text = PUMP_PULL.replace('kind = "port_load"', 'kind = "channel_offset"').replace("port = ", "channel = ")
+    text = text.replace('events = ["pump_on"]', "").replace('places = "ports"', 'places = "channels"')
+    text = re.sub("force = .*\n(begin|end) = .*\n((begin|end) = .*\n)?", 'offset = "slope"\n', text)
+    campaign = replace(pump, events=TWICE)
+    (during,) = in_events(effects_of_file(write(text)), setting_of(campaign, MODEL))
+    patch = during.patch(setting_of(campaign, MODEL), {"slope": 0.75}, "x")
+    shown = observe(MODEL, campaign, campaign.trials[1], patch, Conditions(np.zeros(0))).values[:, 0]
+    is_on = ((TIME >= 1.0) & (TIME < 3.0)) | ((TIME >= 6.0) & (TIME < 8.0))
+    np.testing.assert_array_equal(shown, np.where(is_on, 0.75, 0.0))

@@ -295,6 +295,16 @@ def test_begin_and_end_of_what_acts_for_a_while_are_found(tmp_path, kind, seed):
     assert when_sentence(told) in verdict.sentence
 
 
+def test_a_window_whose_readings_are_all_missing_is_drawn():
+    """Its residual has the size 0, which has no logarithm."""
+    moments = (Moment(1.0, 0.9, 1.1), Moment(2.0, 1.9, 2.1))
+    windows = [
+        GapWindow("release 1", ("g1",), *moments, first=0.0, last=5.0, size=size) for size in (0.0, 8.0)
+    ]
+    figure = time_line_figure(windows)
+    assert len(figure.axes[0].collections) >= len(windows)
+
+
 def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
     """Where none can be weighed (the filter breaks down beside millions of noises), it is told as a whole."""
     event = np.zeros((300, 4))
