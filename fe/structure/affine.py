@@ -90,7 +90,7 @@ class AffineStructure:
     control_units : dict of str to str
         Unit of each control.
     ranges : dict of str to (float, float)
-        Least and largest value for which a reduced model is to hold, of parameters, losses, free
+        Least and largest value for which a reduced model is valid, of parameters, losses, free
         masses and controls, by name.
     regions : tuple of str
         Names of the damage regions.

@@ -49,6 +49,7 @@ class Gauge(tables.Named, Spot):
 def _span_a_plane(
     axes: tuple[tables.Direction, tables.Direction],
 ) -> tuple[tables.Direction, tables.Direction]:
+    """Return two axes; refuse them if they are parallel."""
     first, second = axes
     product_of_lengths = np.linalg.norm(first) * np.linalg.norm(second)
     if np.linalg.norm(np.cross(first, second)) <= LEAST_SINE * product_of_lengths:
@@ -86,7 +87,7 @@ class Gauged(tables.DesignSection):
     rosette: tuple[Rosette, ...] = Field(default=(), exclude=True)
 
     @model_validator(mode="after")
-    def _with_those_of_rosettes(self) -> "Gauged":
+    def _add_gauges_of_rosettes(self) -> "Gauged":
         gauges = list(self.gauge)
         for rosette in self.rosette:
             gauges += rosette.gauges()
@@ -114,7 +115,7 @@ class NamedSet(tables.DesignSection):
         yield is_reversed, "box must give its lower corner first, then its upper one"
 
 
-class MeshMaterial(tables.Given):
+class MeshMaterial(tables.AlternativeKeys):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.
 
     An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13
@@ -132,7 +133,7 @@ class MeshMaterial(tables.Given):
     shear_moduli: tuple[tables.Modulus, tables.Modulus, tables.Modulus] | None = None
     axes: Axes | None = None
     scaled_by: tables.Name | None = None
-    ways = (
+    alternatives = (
         ("young_modulus", "poisson_ratio"),
         ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
     )
@@ -160,10 +161,13 @@ class MeshMaterial(tables.Given):
     @property
     def elasticity(self) -> FloatArray:
         """Elasticity (6, 6) [Pa] in space."""
-        local = np.asarray(np.linalg.inv(self.compliance), dtype=np.float64)
+        local_elasticity = np.asarray(np.linalg.inv(self.compliance), dtype=np.float64)
         if self.axes is None:
-            return local
-        return np.asarray(rotate_elasticity(local[None], axes_of(*self.axes)[None])[0])
+            return local_elasticity
+        first_vector, second_vector = self.axes
+        axes = axes_of(first_vector, second_vector)
+        (elasticity,) = rotate_elasticity(local_elasticity[None], axes[None])
+        return np.asarray(elasticity)
 
 
 class Support(tables.DesignSection):
@@ -185,10 +189,10 @@ class Support(tables.DesignSection):
         translations = tables.MOTIONS[:3]
         has_springs = any(springs)
         has_rotations = len(springs) > 3 or any(name not in translations for name in self.hold)
-        is_of_one_way = bool(self.hold) != has_springs
+        has_either = bool(self.hold) != has_springs
         is_rigid = self.rigid_about is not None
         yield (
-            not is_rigid and (has_rotations or not is_of_one_way),
+            not is_rigid and (has_rotations or not has_either),
             'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
             "too, is a rigid set, with the point `rigid_about`",
         )
@@ -198,7 +202,7 @@ class Support(tables.DesignSection):
             yield is_held_twice, f"the motion {motion} is held, so that no spring can act on it"
 
 
-class MeshLoad(tables.Given, tables.Commanded):
+class MeshLoad(tables.AlternativeKeys, tables.ControlledLoad):
     """A load, constant or times the value of a control.
 
     Either a `force` [N] on a set (shared by area where it holds faces, else equally among its
@@ -211,39 +215,39 @@ class MeshLoad(tables.Given, tables.Commanded):
     force: tables.Direction | None = None
     pressure: float | None = None
 
-    ways = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
+    alternatives = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
 
 
 class Damage(tables.Region):
-    """Region of the cells of a set."""
+    """A region that may lose stiffness: the cells of a set."""
 
     set: SetName
 
 
 class MeshMass(tables.ChosenMass):
-    """Mass at a point of the structure."""
+    """A mass at a point of the structure."""
 
     point: tables.Vector
 
 
 class PointOutput(tables.Named):
-    """Displacement, or acceleration, of a point along a direction."""
+    """An output of the structure: displacement or acceleration of a point along a direction."""
 
     point: tables.Vector
     direction: tables.Direction
 
 
-class MeshPort(tables.Given, tables.Named):
-    """Where a force that the model lacks may act: on a set, or at a point.
+class MeshPort(tables.AlternativeKeys, tables.Named):
+    """A port: a set or a point where a force that the model lacks may act.
 
-    It acts along `direction`, on the mean displacement of the set, or on that of the point.
+    The force acts along `direction`, on the mean displacement of the set, or on that of the point.
     """
 
     direction: tables.Direction
     set: SetName | None = None
     point: tables.Vector | None = None
 
-    ways = (("set",), ("point",))
+    alternatives = (("set",), ("point",))
 
 
 class MeshDesign(tables.StructureDesign, Gauged):
@@ -281,10 +285,18 @@ def parse_structure(
 ) -> MeshDesign | MatrixDesign:
     """Return the structure that the content of a file describes, from a mesh or from matrices.
 
+    Parameters
+    ----------
+    content : dict
+        The content of the TOML file.
+    source : str
+        The name of the file in messages.
+
     Raises
     ------
     InvalidDesignError
-        One sentence that names `source`, the place, what came and what was expected.
+        If the content is not a structure; one sentence names the place, what came and what was
+        expected.
     """
     if "stiffness_matrix" in content:
         return validate(

@@ -30,7 +30,7 @@ class MatrixSupport(tables.DesignSection):
     hold: Annotated[tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...], Field(min_length=1)]
 
 
-class StiffnessPart(tables.Given):
+class StiffnessPart(tables.AlternativeKeys):
     """Share of the stiffness that a parameter scales, a region may lose, or both.
 
     Either its own `matrix`, or that of the whole structure, `changed` by making the part's modulus
@@ -43,29 +43,29 @@ class StiffnessPart(tables.Given):
     scaled_by: tables.Name | None = None
     damage: tables.Name | None = None
 
-    ways = (("matrix",), ("changed", "times"))
+    alternatives = (("matrix",), ("changed", "times"))
 
 
-class MatrixLoad(tables.Given, tables.Commanded):
+class MatrixLoad(tables.AlternativeKeys, tables.ControlledLoad):
     """A load: its own `vector`, a `force` [N] at a node, or an `acceleration` [m/s^2]."""
 
     vector: FileName | None = None
     node: Node | None = None
     force: tables.Direction | None = None
 
-    ways = (("vector",), ("node", "force"), ("acceleration",))
+    alternatives = (("vector",), ("node", "force"), ("acceleration",))
 
 
-class MatrixMass(tables.Given, tables.ChosenMass):
+class MatrixMass(tables.AlternativeKeys, tables.ChosenMass):
     """Mass at a `node`, or times the `matrix` of 1 kg."""
 
     node: Node | None = None
     matrix: FileName | None = None
 
-    ways = (("node",), ("matrix",))
+    alternatives = (("node",), ("matrix",))
 
 
-class Extension(tables.Given, tables.Named):
+class Extension(tables.AlternativeKeys, tables.Named):
     """Strain: its own `vector`, or how far two nodes move apart along a direction over a length."""
 
     vector: FileName | None = None
@@ -73,17 +73,17 @@ class Extension(tables.Given, tables.Named):
     direction: tables.Direction | None = None
     length: float | None = Field(default=None, gt=0.0)
 
-    ways = (("vector",), ("nodes", "direction", "length"))
+    alternatives = (("vector",), ("nodes", "direction", "length"))
 
 
-class NodeOutput(tables.Given, tables.Named):
+class NodeOutput(tables.AlternativeKeys, tables.Named):
     """Displacement, acceleration or port: a `vector` of its own, or of a node along a direction."""
 
     vector: FileName | None = None
     node: Node | None = None
     direction: tables.Direction | None = None
 
-    ways = (("vector",), ("node", "direction"))
+    alternatives = (("vector",), ("node", "direction"))
 
 
 class MatrixDesign(tables.StructureDesign):

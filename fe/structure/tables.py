@@ -1,6 +1,6 @@
 """The tables that every structure file has, for a mesh as for matrices.
 
-Also how well its reduced model is to hold.
+They also say how accurate its reduced model must be, and where.
 """
 
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ Modulus = Annotated[float, Field(ge=1e6, le=1e13, description="Pa")]
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 """Units of length and their size [m]."""
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
-"""Of a rigid set: along the axes, then about them."""
+"""Motions of a rigid set of nodes: along the axes, then about them."""
 
 
 class DesignSection(Section):
@@ -36,7 +36,7 @@ class DesignSection(Section):
 
 
 def _tuples(item: object) -> object:
-    """Return the lists of a file as the tuples that a strict section takes."""
+    """Return a value of a TOML file with its lists as tuples, which a strict section takes."""
     if isinstance(item, list):
         return tuple(_tuples(entry) for entry in item)
     return item
@@ -52,46 +52,46 @@ Direction = Annotated[Vector, AfterValidator(_points_somewhere)]
 
 
 class Named(DesignSection):
-    """Something that is chosen or read by its name."""
+    """A table with a name, by which it is chosen or read."""
 
     name: Name
 
 
-class Given(DesignSection):
-    """A table that is given in one of several ways, each a few keys."""
+class AlternativeKeys(DesignSection):
+    """A table that has one of several alternative groups of keys."""
 
-    ways: ClassVar[tuple[tuple[str, ...], ...]]
+    alternatives: ClassVar[tuple[tuple[str, ...], ...]]
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a fault if the table is not given in exactly one way."""
+        """Yield a fault if the table has not exactly the keys of one group."""
         yield from super().faults()
         keys_present: set[str] = set()
-        for way in self.ways:
+        for way in self.alternatives:
             keys_present.update(key for key in way if getattr(self, key) is not None)
-        is_one_way = any(keys_present == set(way) for way in self.ways)
-        expected = ", or ".join(" and ".join(way) for way in self.ways)
+        is_one_way = any(keys_present == set(way) for way in self.alternatives)
+        expected = ", or ".join(" and ".join(way) for way in self.alternatives)
         yield not is_one_way, f"either {expected} is expected"
 
 
 class Ranged(Named):
-    """A quantity that can be chosen, and from where to where the reduced model is to hold."""
+    """A quantity that can be chosen, with the range in which the reduced model is valid."""
 
     minimum: float | None = None
     maximum: float | None = None
 
     usual: ClassVar[tuple[float, float]]
-    """Ends of the range where none are given, as multiples of the nominal value."""
+    """The default ends of the range, as multiples of the nominal value."""
     nominal_key: ClassVar[str] = "nominal"
-    """Which of its numbers is the nominal value."""
+    """The key that holds the nominal value."""
 
     @property
     def middle(self) -> float:
-        """Nominal value."""
+        """The nominal value."""
         return float(getattr(self, self.nominal_key))
 
     @property
     def range(self) -> tuple[float, float]:
-        """Least and largest value."""
+        """The least and the largest value for which the reduced model is valid."""
         low, high = sorted(factor * self.middle for factor in self.usual)
         if self.minimum is not None:
             low = self.minimum
@@ -110,7 +110,7 @@ class Ranged(Named):
 
 
 class StiffnessParameter(Ranged):
-    """Factor on the stiffness of materials, to be calibrated; 1 unless `nominal` says otherwise."""
+    """A factor on the stiffness of materials, to be calibrated; by default 1."""
 
     nominal: float = Field(default=1.0, gt=0.0, le=1e3)
     minimum: float | None = Field(default=None, gt=0.0)
@@ -119,7 +119,7 @@ class StiffnessParameter(Ranged):
 
 
 class LoadControl(Ranged):
-    """What commands loads; a load is its numbers times the value of its control."""
+    """A control, which scales loads: a load is its numbers times the value of its control."""
 
     unit: str = Field(default="1", pattern=r"^\S+$")
     nominal: float = 1.0
@@ -136,7 +136,7 @@ class LoadControl(Ranged):
         )
 
 
-class Commanded(Named):
+class ControlledLoad(Named):
     """A load, constant or times the value of a control."""
 
     control: Name | None = None
@@ -144,18 +144,18 @@ class Commanded(Named):
 
 
 class Region(Named):
-    """Region that may lose stiffness, up to `largest_loss`; `name` is that of its loss."""
+    """A region that may lose stiffness, up to `largest_loss`; its loss has its name."""
 
     largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
 
     @property
     def range(self) -> tuple[float, float]:
-        """Least and largest loss."""
+        """The least and the largest loss."""
         return (0.0, self.largest_loss)
 
 
 class ChosenMass(Ranged):
-    """Mass [kg]; `free` where it is to be calibrated or chosen later."""
+    """A mass [kg]; a `free` one is calibrated or chosen later."""
 
     mass: float = Field(ge=0.0, lt=1e6)
     free: bool = False
@@ -173,7 +173,7 @@ class RayleighDamping(DesignSection):
 
 
 class ReductionLimits(DesignSection):
-    """How well the reduced model is to hold, and how many full solutions it may take."""
+    """The accuracy of the reduced model, and the number of full solutions that it may take."""
 
     tolerance: float = Field(default=6e-4, ge=1e-5, le=0.1, description="of the largest output")
     most_solutions: int = Field(default=401, ge=1, le=2000)
@@ -192,7 +192,7 @@ class StructureDesign(DesignSection):
     length_unit: Literal["m", "cm", "mm", "um", "in", "ft"]
     parameter: tuple[StiffnessParameter, ...] = ()
     control: tuple[LoadControl, ...] = ()
-    load: tuple[Commanded, ...] = ()
+    load: tuple[ControlledLoad, ...] = ()
     damage: tuple[Region, ...] = Field(default=(), max_length=MOST_REGIONS)
     mass: tuple[ChosenMass, ...] = ()
     gauge: tuple[Named, ...] = ()
@@ -203,15 +203,15 @@ class StructureDesign(DesignSection):
     reduction: ReductionLimits = ReductionLimits()
 
     what: ClassVar[str]
-    """What its files hold."""
+    """The content of its files: "mesh" or "matrix"."""
     scaled_table: ClassVar[str] = ""
-    """Name of the tables that a parameter may scale."""
+    """The tables whose stiffness a parameter may scale."""
     own_names: ClassVar[tuple[str, ...]] = ()
     """Further tables whose names must differ from one another."""
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the files that it is made of, seen from its own."""
+        """The names of the files with mesh or matrices, relative to the structure file."""
         raise NotImplementedError
 
     @field_validator("name", "mesh", check_fields=False)
@@ -282,13 +282,13 @@ class StructureDesign(DesignSection):
             yield name not in place_of_name, f"the {named_table} {name!r} {untied}"
 
     def numbered(self, key: str) -> Iterator[tuple[str, Any]]:
-        """Yield the parts of a table, each behind its place in the file, such as `load[1]`."""
+        """Yield each entry of a table with its place in the file, such as `load[1]`."""
         for number, part in enumerate(getattr(self, key), start=1):
             yield f"{key}[{number}]", part
 
     @property
     def unit(self) -> float:
-        """Metres in the unit of length."""
+        """The unit of length [m]."""
         return UNITS[self.length_unit]
 
     @property
@@ -314,7 +314,8 @@ class StructureSettings:
     mode_count : int
         Modes that the reduced model returns.
     ranges : dict of str to (float, float)
-        Least and largest value where it is to hold elsewhere than the design says, by name.
+        Least and largest values for which the reduced model is valid, by name, where they differ
+        from those of the design.
     """
 
     bound_tolerance: float = ReductionLimits().tolerance
