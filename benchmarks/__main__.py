@@ -16,13 +16,21 @@ from benchmarks.measurement import Measurement
 def main(names: list[str]) -> int:
     """Run the benchmarks whose module name contains one of `names` (all without names)."""
     console = Console()
-    modules = [m.name for m in pkgutil.iter_modules(benchmarks.__path__) if m.name.startswith("bench_")]
+    modules = [
+        m.name for m in pkgutil.iter_modules(benchmarks.__path__) if m.name.startswith("bench_")
+    ]
     chosen = [m for m in modules if not names or any(name in m for name in names)]
     if not chosen:
         console.print(f"no benchmark matches {', '.join(names)}; there are: {', '.join(modules)}")
         return 2
     table = Table(
-        "benchmark", "measured", "target", "reached", "beside it", "ratio", title="uav-twin benchmarks"
+        "benchmark",
+        "measured",
+        "target",
+        "reached",
+        "beside it",
+        "ratio",
+        title="uav-twin benchmarks",
     )
     missed = 0
     for module in sorted(chosen):
@@ -31,11 +39,17 @@ def main(names: list[str]) -> int:
         for m in measurements:
             ratio = "" if not m.reference_value else f"{m.value / m.reference_value:.3g}"
             reference = (
-                "" if m.reference_value is None else f"{m.reference_name}: {m.reference_value:.3g} {m.unit}"
+                ""
+                if m.reference_value is None
+                else f"{m.reference_name}: {m.reference_value:.3g} {m.unit}"
             )
             reached = {None: "", True: "yes", False: "NO"}[m.reached]
             missed += m.reached is False
-            target = "" if m.target is None else f"{'≥' if m.larger_is_better else '≤'} {m.target:g} {m.unit}"
+            target = (
+                ""
+                if m.target is None
+                else f"{'≥' if m.larger_is_better else '≤'} {m.target:g} {m.unit}"
+            )
             table.add_row(m.name, f"{m.value:.3g} {m.unit}", target, reached, reference, ratio)
     console.print(table)
     console.print("every target is reached" if not missed else f"{missed} target(s) missed")

@@ -1,4 +1,4 @@
-"""What the master is measured against: bare ctypes calls, fmpy's simulation, an FMU that computes nothing."""
+"""References for the speed of the master: bare ctypes calls, fmpy, and an empty FMU."""
 
 import ctypes
 import itertools
@@ -20,13 +20,19 @@ from fmu_asset.compiled.package import fmi_headers
 LEVELS = 400
 """How many levels of damage follow one another."""
 
-OUTPUTS = (*(f"strain[{gauge}]" for gauge in range(1, 25)), "tip_displacement", "strain_error_bound")
+OUTPUTS = (
+    *(f"strain[{gauge}]" for gauge in range(1, 25)),
+    "tip_displacement",
+    "strain_error_bound",
+)
 _INPUTS = ("load_factor", "health.z1", "health.z2", "tip_force")
 
 
 @contextmanager
-def bare_step(path: Path, *, response: int = 1, levels: int = LEVELS) -> Iterator[Callable[[], None]]:
-    """Give a function that sets, steps and gets through ctypes alone, with blocks that are allocated once.
+def bare_step(
+    path: Path, *, response: int = 1, levels: int = LEVELS
+) -> Iterator[Callable[[], None]]:
+    """Give a function that makes one FMU step by bare ctypes calls on preallocated arrays.
 
     Parameters
     ----------
@@ -44,15 +50,20 @@ def bare_step(path: Path, *, response: int = 1, levels: int = LEVELS) -> Iterato
     outputs = (ctypes.c_uint * len(OUTPUTS))(*(references[name] for name in OUTPUTS))
     request, reply = (ctypes.c_double * 4)(3.0, 0.0, 0.2, 0.0), (ctypes.c_double * len(OUTPUTS))()
     slave = FMU2Slave(
-        guid=description.guid, modelIdentifier=description.model_identifier, unzipDirectory=str(folder)
+        guid=description.guid,
+        modelIdentifier=description.model_identifier,
+        unzipDirectory=str(folder),
     )
     slave.instantiate()
     slave.setupExperiment(startTime=0.0)
     slave.enterInitializationMode()
     slave.setInteger([references["response"]], [response])
     slave.exitInitializationMode()
-    put, do, get = slave.dll.fmi2SetReal, slave.dll.fmi2DoStep, slave.dll.fmi2GetReal
-    component, count = slave.component, itertools.count()
+    put = slave.dll.fmi2SetReal
+    do = slave.dll.fmi2DoStep
+    get = slave.dll.fmi2GetReal
+    component = slave.component
+    count = itertools.count()
 
     def step() -> None:
         index = next(count)
@@ -79,7 +90,8 @@ def fmpy_simulation(path: Path, steps: int) -> Any:
     """
     moments = np.arange(steps + 1)
     course = np.zeros(len(moments), dtype=[(name, "f8") for name in ("time", *_INPUTS)])
-    course["time"], course["load_factor"] = moments, 3.0
+    course["time"] = moments
+    course["load_factor"] = 3.0
     course["health.z1"] = 0.001 * (moments % LEVELS)
     return simulate_fmu(
         str(path),

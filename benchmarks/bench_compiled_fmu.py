@@ -1,4 +1,4 @@
-"""A step of the compiled FMU: in process, through the worker, bare, beside an FMU that computes nothing."""
+"""Steps of the compiled FMU in process and in its worker, beside an FMU without computation."""
 
 import itertools
 import tempfile
@@ -20,7 +20,7 @@ SIMULATED_STEPS = 10_000
 
 
 def run() -> list[Measurement]:
-    """Measure steps in turns, most with another health each; the least times, since other work only adds."""
+    """Measure the least time of each kind of step; most steps have another health than the last."""
     try:
         find_compiler()
     except FmuBuildError as error:
@@ -76,7 +76,9 @@ def run() -> list[Measurement]:
         beside("the same, health unchanged", "same health", "empty", empty),
         beside("the same, transient, health unchanged", "transient, same health", "empty", empty),
         beside("the same, transient, other health", "transient", "empty", empty),
-        ratio("the same, times that of unchanged health", "transient", "transient, same health", 10.0),
+        ratio(
+            "the same, times that of unchanged health", "transient", "transient, same health", 10.0
+        ),
         Measurement(
             f"fmpy.simulate_fmu, {SIMULATED_STEPS} steps",
             simulated[compiled],
@@ -97,5 +99,5 @@ def _stepper(asset: FmiAsset) -> Callable[[], object]:
 
 
 def _simulate(path: Path) -> float:
-    """Time fmpy's own simulation with an input that changes at every step, extraction and start included."""
+    """Return seconds of fmpy's own simulation, with an input that changes at every step."""
     return median_seconds(lambda: fmpy_simulation(path, SIMULATED_STEPS), repeats=3)

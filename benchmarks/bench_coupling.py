@@ -1,4 +1,4 @@
-"""A step of three coupled FMUs (damage growth, wing, gauges) beside the same three stepped one by one."""
+"""A step of three coupled FMUs (damage, wing, gauges) beside the three stepped one by one."""
 
 import itertools
 import tempfile
@@ -26,13 +26,14 @@ from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import binding_files
+from twin_master.assets.coupled_source import CoupledSection
 from twin_master.scenario.reading import load_scenario
 
 REPEATS, INNER = 300, 5
 
 
 def run() -> list[Measurement]:
-    """Measure a macro step, its overhead over the steps of the FMUs, and what a saved state costs."""
+    """Measure a macro step, its overhead over the steps of the FMUs, and the saving of a state."""
     binding = load_binding(binding_files()["three_fmus"])
     with tempfile.TemporaryDirectory() as folder:
         wiring = three_fmus(Path(folder))
@@ -56,6 +57,7 @@ def run() -> list[Measurement]:
 def three_fmus(folder: Path) -> Wiring:
     """Return the system of the shipped scenario, its noise included."""
     asset = load_scenario("three_fmus").scenario.asset
+    assert isinstance(asset, CoupledSection)
     fmus = {
         "damage": atomic_write_bytes(folder / "damage.fmu", companion_bytes("damage_growth")),
         "wing": build_fmu(reduced_model(), folder / "wing.fmu").path,
@@ -71,7 +73,11 @@ def three_fmus(folder: Path) -> Wiring:
         + [Connector(c.target.variable, "output") for c in connections if not c.target.component]
     )
     components = tuple(
-        Component(c.name, fmus[c.name], {key: ComponentSetting(value) for key, value in c.parameters.items()})
+        Component(
+            c.name,
+            fmus[c.name],
+            {key: ComponentSetting(value) for key, value in c.parameters.items()},
+        )
         for c in asset.component
     )
     return Wiring(SystemStructure("three_fmus", components, tuple(connectors), connections))
@@ -80,7 +86,8 @@ def three_fmus(folder: Path) -> Wiring:
 def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, int]:
     """Time the coupled step and the three FMUs alone in turn, so that other work meets both alike.
 
-    The FMUs alone have the bindings and inputs that they have in the system, and nothing passes between them.
+    The FMUs alone have the bindings and inputs that they have in the system, and nothing passes
+    between them.
     """
     parts = stepped_components(wiring, Exchange(system_description(wiring), binding))
     loads = itertools.cycle((2.0, 3.0))
@@ -89,7 +96,9 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
         try:
             for component in wiring.structure.components:
                 part = parts[component.name]
-                asset = FmiAsset(component.fmu, part.binding, isolated=False, parameters=part.settings)
+                asset = FmiAsset(
+                    component.fmu, part.binding, isolated=False, parameters=part.settings
+                )
                 asset.reset()
                 assets.append(asset)
                 inputs.append(dict.fromkeys(part.binding.load, 0.0))

@@ -44,7 +44,12 @@ def run() -> list[Measurement]:
             seconds.append(time.perf_counter() - begin)
         rows.append(
             Measurement(
-                f"all effects, {name}", sorted(seconds)[ROUNDS // 2], "s", 10.0, "one ring-down", single
+                f"all effects, {name}",
+                sorted(seconds)[ROUNDS // 2],
+                "s",
+                10.0,
+                "one ring-down",
+                single,
             )
         )
     problem = _problem(model, cases["compliant root hidden"], SEED)
@@ -55,10 +60,14 @@ def run() -> list[Measurement]:
     pairs = len(usable) * (len(usable) - 1) // 2
     rows.append(
         Measurement(
-            f"all {pairs} pairs, compliant root hidden", time.perf_counter() - begin, "s", 60.0,
-            "one ring-down", single,
+            f"all {pairs} pairs, compliant root hidden",
+            time.perf_counter() - begin,
+            "s",
+            60.0,
+            "one ring-down",
+            single,
         )
-    )  # fmt: skip
+    )
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2.0**20
     return [*rows, Measurement("largest memory of the process", memory, "GiB", 2.0)]
 
@@ -73,14 +82,18 @@ def _problem(model: WingModel, patch: ModelPatch, seed: int) -> Problem:
 def _one_ringdown(model: WingModel) -> float:
     """Return milliseconds of one ring-down with a force law, as the scan asks for it."""
     problem = _problem(model, ModelPatch(), SEED)
-    number = next(n for n, data in enumerate(problem.trials) if data.trial.kind is TrialKind.RINGDOWN)
+    number = next(
+        n for n, data in enumerate(problem.trials) if data.trial.kind is TrialKind.RINGDOWN
+    )
     data = problem.trials[number]
     patch = ModelPatch((PowerDamping("planform", 2.0, 2.0, 0.0, 1.0, 1.0),))
     point = problem.start(Candidate())
     conditions = data.unknowns.conditions(
         data.trial, problem.shared.parameters(point.shared), point.local[number]
     )
-    return 1e3 * median_seconds(lambda: observe(model, problem.campaign, data.trial, patch, conditions))
+    return 1e3 * median_seconds(
+        lambda: observe(model, problem.campaign, data.trial, patch, conditions)
+    )
 
 
 if __name__ == "__main__":

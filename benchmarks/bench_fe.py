@@ -12,7 +12,8 @@ import numpy as np
 
 from benchmarks.measurement import Measurement, median_seconds
 
-# A build from nothing in a process and a cache folder of its own: wall time, processor time, peak memory.
+# A build from nothing in a process and a cache folder of its own: wall time, processor time, peak
+# memory.
 _BUILD = """
 import json, resource, time
 begin = time.perf_counter()
@@ -67,23 +68,35 @@ def _against_the_full_model() -> list[Measurement]:
     from fe.reduction.model_cache import reduced_model
     from fe.runtime.state import TIP_FORCE
     from fe.runtime.transient import ModalIntegrator
+    from fe.structure.affine import natural_frequencies, static_response
     from fe.wing.design import load_design
-    from fe.wing.operators import assemble, eigenmodes, solve_static
+    from fe.wing.operators import assemble, point_masses, wing_values
 
     model = reduced_model()
     begin = time.perf_counter()
     operators = assemble(load_design())
     assembly_time = time.perf_counter() - begin
     random = np.random.default_rng(2021)
-    errors, bounds, effectivities, tip_errors, frequency_errors, full_times = [], [], [], [], [], []
+    errors = []
+    bounds = []
+    effectivities = []
+    tip_errors = []
+    frequency_errors = []
+    full_times = []
     for number in range(STATES):
         # the corners of the box first
         corner = number < 8
         e = (0.9, 1.1)[number % 2] if corner else random.uniform(0.9, 1.1)
-        z = (0.8 * (number // 2 % 2), 0.8 * (number // 4)) if corner else tuple(random.uniform(0, 0.8, 2))
+        z = (
+            (0.8 * (number // 2 % 2), 0.8 * (number // 4))
+            if corner
+            else tuple(random.uniform(0, 0.8, 2))
+        )
         load = (1.0, 0.0) if number % 3 else (0.0, 1.0)
+        load_factor, tip_force = load
+        values = wing_values(operators, e, z, load_factor=load_factor, tip_force=tip_force)
         begin = time.perf_counter()
-        full = solve_static(operators, e, z, *load)
+        full = static_response(operators, values)
         full_times.append(time.perf_counter() - begin)
         vector = model.vector(stiffness_loss=z, young_modulus_factor=e)
         reduced = model.static_response(vector, load=np.array(load))
@@ -94,10 +107,11 @@ def _against_the_full_model() -> list[Measurement]:
         effectivities.append(reduced.strain_error_bound / error)
         tip_errors.append(abs(reduced.displacement[0] / full.output[0] - 1.0))
         if number % 2:
-            masses = random.uniform((0.05, 0.0), (0.30, 0.30))
-            frequency = eigenmodes(operators, e, z, *masses, count=6).frequency
-            named = dict(zip(("servo_mass", "pitot_mass"), masses, strict=True))
-            found = model.modes(named, z, young_modulus_factor=e).frequency
+            servo_mass, pitot_mass = random.uniform((0.05, 0.0), (0.30, 0.30)).tolist()
+            values = wing_values(operators, e, z, **point_masses(servo_mass, pitot_mass))
+            frequency = natural_frequencies(operators, 6, values).frequency
+            masses = {"servo_mass": servo_mass, "pitot_mass": pitot_mass}
+            found = model.modes(masses, z, young_modulus_factor=e).frequency
             frequency_errors.append(np.abs(found / frequency - 1.0).max())
     assert min(effectivities) >= 1.0, "the certified bound does not hold"
 
@@ -107,9 +121,11 @@ def _against_the_full_model() -> list[Measurement]:
     vectors = model.vectors({"z1": losses[0], "z2": losses[1], "load_factor": 3.0})
     many = median_seconds(lambda: model.static_outputs(vectors)) / len(vectors)
     modes = median_seconds(lambda: model.modes(state), inner=50)
-    integrator = ModalIntegrator(model, model.nominal, *model.damping)
-    at = integrator.released(0.02, (0.0, 0.0), TIP_FORCE)
-    step = median_seconds(lambda: integrator.outputs(integrator.advance(at, 0.01, (3.0, 0.0))), inner=200)
+    integrator = ModalIntegrator(model.structure_at(model.nominal), *model.damping)
+    at = integrator.state_after_release(0.02, (0.0, 0.0), TIP_FORCE)
+    step = median_seconds(
+        lambda: integrator.outputs(integrator.advance(at, 0.01, (3.0, 0.0))), inner=200
+    )
     full_time = float(np.median(full_times))
     return [
         Measurement(
@@ -120,11 +136,20 @@ def _against_the_full_model() -> list[Measurement]:
             larger_is_better=True,
         ),
         Measurement(
-            "the same, with mesh and assembly of the full model", (assembly_time + full_time) / one, "x"
+            "the same, with mesh and assembly of the full model",
+            (assembly_time + full_time) / one,
+            "x",
         ),
-        Measurement("24 strains with certified bound", one * 1e6, "us", None, "full model", full_time * 1e6),
         Measurement(
-            "24 strains, 1,000 states at once, each", many * 1e6, "us", None, "one by one", one * 1e6
+            "24 strains with certified bound", one * 1e6, "us", None, "full model", full_time * 1e6
+        ),
+        Measurement(
+            "24 strains, 1,000 states at once, each",
+            many * 1e6,
+            "us",
+            None,
+            "one by one",
+            one * 1e6,
         ),
         Measurement("six modes", modes * 1e6, "us"),
         Measurement("transient step with outputs", step * 1e6, "us"),

@@ -19,7 +19,9 @@ from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.side_by_side import fly_one_by_one, fly_side_by_side
 from twin_master.scenario.reading import load_scenario
 
-TWINS, ALONE, POINTS = 256, 8, 49
+TWINS = 256
+ALONE = 8
+POINTS = 49
 SCENARIO = "growing_damage"
 
 
@@ -37,10 +39,13 @@ def run() -> list[Measurement]:
     seen = flown.row, flown.control_index
     sensors = knowledge.sensor_model
     likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *seen)) / turns
-    worsening, scaled = Worsening.of(scenario), scaled_likelihood(sensors, *seen)[0]
+    worsening = Worsening.of(scenario)
+    scaled = scaled_likelihood(sensors, *seen)[0]
     points = np.full((POINTS, 2), 0.1)
     transition_evidence(worsening, points[:1], scaled[:1], flown.control_index[:1])
-    learning = cpu_seconds(lambda: transition_evidence(worsening, points, scaled, flown.control_index))
+    learning = cpu_seconds(
+        lambda: transition_evidence(worsening, points, scaled, flown.control_index)
+    )
     with tempfile.TemporaryDirectory() as place:
         folder, text = Path(place), scenario_files()[SCENARIO].read_text(encoding="utf-8")
         quiet = str(atomic_write_text(folder / "quiet.toml", f"notice = false\n{text}"))
@@ -50,17 +55,29 @@ def run() -> list[Measurement]:
         whole = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
     to_ten_thousand = 10_000 / (4 * TWINS)
     return [
-        Measurement("turn of a twin, side by side", 1e6 * together, "us", None, "alone", 1e6 * alone),
-        Measurement("likelihood of a turn in it", 1e6 * likelihood, "us", None, "all", 1e6 * together),
         Measurement(
-            "10,000 twins stored, beside start-up (from 1,024)", to_ten_thousand * whole, "s", 8.0,
-            "likelihoods alone", likelihood * 500_000,
+            "turn of a twin, side by side", 1e6 * together, "us", None, "alone", 1e6 * alone
         ),
         Measurement(
-            "evidence of a turn at a point of a grid", 1e6 * learning / (turns * POINTS), "us", None,
-            "likelihood of a turn", 1e6 * likelihood,
+            "likelihood of a turn in it", 1e6 * likelihood, "us", None, "all", 1e6 * together
         ),
-    ]  # fmt: skip
+        Measurement(
+            "10,000 twins stored, beside start-up (from 1,024)",
+            to_ten_thousand * whole,
+            "s",
+            8.0,
+            "likelihoods alone",
+            likelihood * 500_000,
+        ),
+        Measurement(
+            "evidence of a turn at a point of a grid",
+            1e6 * learning / (turns * POINTS),
+            "us",
+            None,
+            "likelihood of a turn",
+            1e6 * likelihood,
+        ),
+    ]
 
 
 def cpu_seconds(function: Callable[[], object]) -> float:

@@ -1,4 +1,4 @@
-"""An FMU step as the master makes it: inputs set with another health each time, step, 24 strains read."""
+"""An FMU step as the master makes it: set inputs with a new health, step, read 24 strains."""
 
 import itertools
 import shutil
@@ -69,7 +69,9 @@ def _fmpy_lists(path: Path) -> float:
     outputs = [references[f"strain[{gauge}]"] for gauge in range(1, 25)]
     outputs += [references["tip_displacement"], references["strain_error_bound"]]
     slave = FMU2Slave(
-        guid=description.guid, modelIdentifier=description.model_identifier, unzipDirectory=str(folder)
+        guid=description.guid,
+        modelIdentifier=description.model_identifier,
+        unzipDirectory=str(folder),
     )
     slave.instantiate()
     slave.setupExperiment(startTime=0.0)

@@ -1,4 +1,4 @@
-"""Sampling an FMU into an observation library with one process and with two, their start included."""
+"""Sampling of an FMU into an observation library by one process and by two."""
 
 import resource
 import tempfile
@@ -54,17 +54,19 @@ unit = "1"
 
 
 def run() -> list[Measurement]:
-    """Measure wing and pump; runs with one and two processes alternate, and the least disturbed ones count.
+    """Measure wing and pump by the least disturbed of alternating runs with one and two processes.
 
-    Beside the wall clock stands what the processor time of the processes says: the speed-up on two processors
-    that nobody else uses.
+    Beside the wall clock stands what the processor time of the processes says: the speed-up on two
+    processors that nobody else uses.
     """
     found = []
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         for name, grid in (
-            ("wing", _wing(place)), ("gear pump", _pump(place)), ("FMU that waits", _waiting(place))
-        ):  # fmt: skip
+            ("wing", _wing(place)),
+            ("gear pump", _pump(place)),
+            ("FMU that waits", _waiting(place)),
+        ):
             wall: dict[int, list[float]] = {1: [], 2: []}
             free: dict[int, list[float]] = {1: [], 2: []}
             contents = set()
@@ -80,12 +82,18 @@ def run() -> list[Measurement]:
             label = f"{name}, {grid.size} points"
             found += [
                 Measurement(
-                    f"{label}: speed-up by a second process", min(wall[1]) / min(wall[2]), "x", 1.7,
-                    "from processor time", None if name == "FMU that waits" else min(free[1]) / min(free[2]),
+                    f"{label}: speed-up by a second process",
+                    min(wall[1]) / min(wall[2]),
+                    "x",
+                    1.7,
+                    "from processor time",
+                    None if name == "FMU that waits" else min(free[1]) / min(free[2]),
                     larger_is_better=True,
                 ),
-                Measurement(f"{label}: two processes, per point", 1e6 * min(wall[2]) / grid.size, "us"),
-            ]  # fmt: skip
+                Measurement(
+                    f"{label}: two processes, per point", 1e6 * min(wall[2]) / grid.size, "us"
+                ),
+            ]
     return found
 
 

@@ -1,4 +1,4 @@
-"""What the master adds to an FMU: a step in process and through the worker, a simulation beside fmpy's."""
+"""Overhead of the master over an FMU: a step in process and in its worker, and a simulation."""
 
 import itertools
 import tempfile
@@ -42,7 +42,9 @@ def run() -> list[Measurement]:
             for kind in ("in process", "worker"):
                 asset = stack.enter_context(FmiAsset(path, binding, isolated=kind == "worker"))
                 steps[f"{kind} {name}"] = _stepper(asset)
-        least = {name: 1e6 * value for name, value in least_seconds(steps, repeats=400, inner=25).items()}
+        least = {
+            name: 1e6 * value for name, value in least_seconds(steps, repeats=400, inner=25).items()
+        }
         simulations: dict[str, Callable[[], object]] = {
             "fmpy": lambda: fmpy_simulation(wing, STEPS),
             "in process": lambda: _simulation(wing, binding, isolated=False),
@@ -54,38 +56,69 @@ def run() -> list[Measurement]:
             for kind in ("in process", "worker")
         }
         running = least_seconds(
-            {kind: partial(_simulate, asset, SHORT) for kind, asset in opened.items()}, repeats=200, inner=1
+            {kind: partial(_simulate, asset, SHORT) for kind, asset in opened.items()},
+            repeats=200,
+            inner=1,
         )
     bare, nothing = "bare ctypes calls", "an FMU that computes nothing"
     return [
         Measurement(
-            "compiled FMU step in process", least["in process wing"], "us", 8.0, bare, least["bare wing"]
+            "compiled FMU step in process",
+            least["in process wing"],
+            "us",
+            8.0,
+            bare,
+            least["bare wing"],
         ),
         Measurement(
-            "the same, through the worker", least["worker wing"], "us", 60.0, nothing, least["worker empty"]
+            "the same, through the worker",
+            least["worker wing"],
+            "us",
+            60.0,
+            nothing,
+            least["worker empty"],
         ),
         Measurement(
-            "master, over bare calls", least["in process empty"] - least["bare empty"], "us", 3.0,
-            bare, least["bare empty"],
+            "master, over bare calls",
+            least["in process empty"] - least["bare empty"],
+            "us",
+            3.0,
+            bare,
+            least["bare empty"],
         ),
         Measurement(
-            "the same, the compiled wing", least["in process wing"] - least["bare wing"], "us", 3.0,
-            bare, least["bare wing"],
+            "the same, the compiled wing",
+            least["in process wing"] - least["bare wing"],
+            "us",
+            3.0,
+            bare,
+            least["bare wing"],
         ),
         Measurement(
-            f"simulate, {STEPS} steps, times faster than fmpy", whole["fmpy"] / whole["in process"], "x", 2.0,
+            f"simulate, {STEPS} steps, times faster than fmpy",
+            whole["fmpy"] / whole["in process"],
+            "x",
+            2.0,
             larger_is_better=True,
         ),
         Measurement(
-            "the same, through the worker", whole["fmpy"] / whole["worker"], "x", larger_is_better=True
+            "the same, through the worker",
+            whole["fmpy"] / whole["worker"],
+            "x",
+            larger_is_better=True,
         ),
         *(
             Measurement(
-                f"a step of simulate, {kind}", 1e6 / SHORT * seconds, "us", None, bare, least["bare wing"]
+                f"a step of simulate, {kind}",
+                1e6 / SHORT * seconds,
+                "us",
+                None,
+                bare,
+                least["bare wing"],
             )
             for kind, seconds in running.items()
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _stepper(asset: FmiAsset) -> Callable[[], object]:

@@ -15,7 +15,7 @@ MEBIBYTE = 1024.0
 
 
 def fly(folder: Path, cache: Path) -> tuple[float, float]:
-    """Fly the shipped mission in a process of its own; return its seconds and the turns' seconds."""
+    """Return the seconds of the shipped mission in a process of its own, and those of its turns."""
     begin = time.perf_counter()
     subprocess.run(
         [sys.executable, "-m", "twin_master", "level_turns", "--quiet", "--out", str(folder)],
@@ -37,7 +37,9 @@ def run() -> list[Measurement]:
     whole = min(seconds for seconds, _ in warm)
     turns = min(seconds for _, seconds in warm)
     return [
-        Measurement("mission from nothing, design to report", cold, "s", 90.0, "the same, cache warm", whole),
+        Measurement(
+            "mission from nothing, design to report", cold, "s", 90.0, "the same, cache warm", whole
+        ),
         Measurement("largest process of it", largest, "MiB", 2048.0),
         Measurement("mission with the cache warm", whole, "s", 10.0, "its 50 turns", turns),
         Measurement("50 turns through the worker, checkpoints included", turns, "s", 1.0),

@@ -1,4 +1,4 @@
-"""The full model's solver at about 40,000 unknowns, beside SciPy's SuperLU and CalculiX on the same mesh.
+"""The solver of the full wing (40,000 unknowns) beside SuperLU and CalculiX on the same mesh.
 
 Processor seconds, so that another job on the machine does not count; each the least of a few.
 """
@@ -87,7 +87,7 @@ def _run(code: str, *arguments: str) -> str:
 
 
 def _calculix_seconds(program: str) -> float:
-    """Processor seconds of CalculiX for the same load on the same mesh: input, assembly, solution, output."""
+    """Return processor seconds of a whole run of CalculiX with the same load on the same mesh."""
     times = []
     with tempfile.TemporaryDirectory() as folder:
         _run(_CALCULIX, str(REFINEMENT), str(Path(folder) / "static.inp"))
@@ -111,13 +111,25 @@ def run() -> list[Measurement]:
     size = f"{int(found['unknowns']):,} unknowns"
     measured = [
         Measurement(
-            f"factorisation and solution, {size}", found["first"], "s", 2.0, "SuperLU", found["superlu"]
+            f"factorisation and solution, {size}",
+            found["first"],
+            "s",
+            2.0,
+            "SuperLU",
+            found["superlu"],
         ),
-        Measurement("the same, a pattern met before", found["again"], "s", 2.0, "SuperLU", found["superlu"]),
+        Measurement(
+            "the same, a pattern met before", found["again"], "s", 2.0, "SuperLU", found["superlu"]
+        ),
         Measurement("its backward error", found["backward_error"], "1", 1e-12),
         Measurement("its difference to SuperLU, of the largest", found["difference"], "1"),
         Measurement(
-            "its peak memory, with the operators", found["peak"], "MB", None, "operators", found["before"]
+            "its peak memory, with the operators",
+            found["peak"],
+            "MB",
+            None,
+            "operators",
+            found["before"],
         ),
         Measurement("mesh and assembly of all operators", found["assembly"], "s"),
     ]

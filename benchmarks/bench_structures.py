@@ -1,7 +1,8 @@
-"""Structures from a mesh at 30 and 100 thousand unknowns, beside SuperLU and CalculiX on the same mesh.
+"""Structures from meshes of 30 and 100 thousand unknowns, beside SuperLU and CalculiX.
 
-A beam of 10-node tetrahedra with three damage regions, two loads and a free mass. Processor seconds, each run
-once in a process of its own. With UAV_TWIN_BENCH_LARGE=1 also 300 thousand unknowns, without SuperLU.
+A beam of 10-node tetrahedra with three damage regions, two loads and a free mass. Processor
+seconds, each run once in a process of its own. With UAV_TWIN_BENCH_LARGE=1 also 300 thousand
+unknowns, without SuperLU.
 """
 
 import json
@@ -41,7 +42,11 @@ load = [
     { name = "weight", control = "load_factor", acceleration = [0, 0, -9.81] },
     { name = "pushed", control = "push", set = "end", force = [0, 0, 1] },
 ]
-damage = [{ name = "z1", set = "inner" }, { name = "z2", set = "middle" }, { name = "z3", set = "outer" }]
+damage = [
+    { name = "z1", set = "inner" },
+    { name = "z2", set = "middle" },
+    { name = "z3", set = "outer" },
+]
 mass = [{ name = "pump", point = [80, 10, 10], mass = 0.05, free = true }]
 gauge = [
     { name = "g1", point = [20, 10, 10], direction = [1, 0, 0] },
@@ -74,7 +79,9 @@ from fe.elements.kinds import KINDS
 from fe.structure.operators import load_and_assemble
 from fe.verification.calculix_deck import structure_deck
 
-folder, divisions, with_superlu = Path(sys.argv[1]), json.loads(sys.argv[2]), sys.argv[3] == "superlu"
+folder = Path(sys.argv[1])
+divisions = json.loads(sys.argv[2])
+with_superlu = sys.argv[3] == "superlu"
 mesh = MeshTet.init_tensor(*(np.linspace(0.0, 1.0, count + 1) for count in divisions))
 points, cells = mesh.p.T, mesh.t.T.astype(np.int64)
 sides = points[cells[:, 1:]] - points[cells[:, :1]]
@@ -105,7 +112,9 @@ if with_superlu:
     columns = stiffness.tocsc()
     options = {"SymmetricMode": True}
     found["superlu"], other = timed(
-        lambda: splu(columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve(load)
+        lambda: splu(
+            columns, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+        ).solve(load)
     )
     found["difference"] = float(np.abs(ours - other).max() / np.abs(other).max())
 print(json.dumps(found))
@@ -118,8 +127,17 @@ def _measured(divisions: tuple[int, int, int], *, superlu: bool) -> dict[str, fl
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "beam.toml").write_text(STRUCTURE, encoding="utf-8")
-        command = [sys.executable, "-c", _MEASURE, name, json.dumps(divisions), "superlu" if superlu else ""]
-        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=one_thread)
+        command = [
+            sys.executable,
+            "-c",
+            _MEASURE,
+            name,
+            json.dumps(divisions),
+            "superlu" if superlu else "",
+        ]
+        done = subprocess.run(
+            command, stdout=subprocess.PIPE, text=True, check=True, env=one_thread
+        )
         found: dict[str, float] = json.loads(done.stdout)
         program = calculix_program()
         if program is not None:
@@ -132,7 +150,7 @@ def _measured(divisions: tuple[int, int, int], *, superlu: bool) -> dict[str, fl
 
 
 def run() -> list[Measurement]:
-    """Measure assembly, factorisation with solution, and reduction; the exponents of their growth."""
+    """Measure assembly, factorisation with solution, and reduction, and how they grow with size."""
     sizes = [_measured(divisions, superlu=True) for divisions in DIVISIONS]
     if os.environ.get("UAV_TWIN_BENCH_LARGE"):
         sizes.append(_measured(LARGE, superlu=False))
@@ -156,7 +174,11 @@ def run() -> list[Measurement]:
         ]
         if "calculix" in found:
             name = f"structure: CalculiX's run with two loads, {size}"
-            rows.append(Measurement(name, found["calculix"], "s", None, "assembly, factors, one load", whole))
+            rows.append(
+                Measurement(
+                    name, found["calculix"], "s", None, "assembly, factors, one load", whole
+                )
+            )
     first, second = sizes[:2]
     growth = log(second["unknowns"] / first["unknowns"])
     for name in ("assembly", "solution", "reduction", "superlu", "calculix"):

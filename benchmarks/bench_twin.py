@@ -1,7 +1,7 @@
 """The twin: one online step, a whole history, a thousand twins, planning, quantities of interest.
 
-The model is that of the mission: two regions of five levels, two controls, 24 gauges, 30 draws of Young's
-modulus, 50 steps. The strains come from a closed form, so that nothing needs to be read.
+The model is that of the mission: two regions of five levels, two controls, 24 gauges, 30 draws of
+Young's modulus, 50 steps. The strains come from a closed form, so that nothing needs to be read.
 """
 
 import logging
@@ -68,10 +68,14 @@ def eliminate_variables(
         tables = [TabularCPD("D0", size, model.prior[:, None])]
         for t in range(1, STEPS + HORIZON):
             if t <= STEPS:
-                tables.append(TabularCPD(f"D{t}", size, matrix[control[t - 1]].T, [f"D{t - 1}"], [size]))
+                tables.append(
+                    TabularCPD(f"D{t}", size, matrix[control[t - 1]].T, [f"D{t - 1}"], [size])
+                )
             else:
                 flat = matrix.transpose(2, 1, 0).reshape(size, -1)
-                tables.append(TabularCPD(f"D{t}", size, flat, [f"D{t - 1}", f"U{t - 1}"], [size, 2]))
+                tables.append(
+                    TabularCPD(f"D{t}", size, flat, [f"D{t - 1}", f"U{t - 1}"], [size, 2])
+                )
             if t >= STEPS:
                 tables.append(TabularCPD(f"U{t}", 2, policy.T, [f"D{t}"], [size]))
         for t in range(STEPS):
@@ -83,10 +87,13 @@ def eliminate_variables(
         network.add_cpds(*tables)
         inference = VariableElimination(network)
         evidence = {f"O{t}": 1 for t in range(STEPS)}
-        names = [f"D{t}" for t in range(STEPS + HORIZON)] + [f"U{STEPS + h}" for h in range(HORIZON)]
+        names = [f"D{t}" for t in range(STEPS + HORIZON)] + [
+            f"U{STEPS + h}" for h in range(HORIZON)
+        ]
         begin = time.perf_counter()
         beliefs = {
-            name: inference.query([name], evidence=evidence, show_progress=False).values for name in names
+            name: inference.query([name], evidence=evidence, show_progress=False).values
+            for name in names
         }
         seconds = time.perf_counter() - begin
     return seconds, beliefs[f"D{STEPS - 1}"]
@@ -109,16 +116,20 @@ def toolbox_seconds(model: GraphicalModel, reward: np.ndarray) -> float:
 
 def many_states() -> list[Measurement]:
     """Six regions of five levels, 15,625 states, as blocks of regions."""
-    levels, regions = (0.0, 0.2, 0.4, 0.6, 0.8), [f"z{number}" for number in range(1, 7)]
+    levels = (0.0, 0.2, 0.4, 0.6, 0.8)
+    regions = [f"z{number}" for number in range(1, 7)]
     tables = {
-        name: {region: worsening_table(5, p) for region in regions} for name, p in (("2g", 0.05), ("3g", 0.1))
+        name: {region: worsening_table(5, p) for region in regions}
+        for name, p in (("2g", 0.05), ("3g", 0.1))
     }
     model = GraphicalModel.from_tables(dict.fromkeys(regions, levels), tables)
     rng = np.random.default_rng(3)
     span = np.linspace(0.0, 1.0, 24)
     place = np.exp(-(((span[:, None] - np.linspace(0.05, 0.8, 6)) / 0.15) ** 2))
     strain = (
-        1e-3 * (1.0 - 0.7 * span) / np.prod(1.0 - 0.6 * model.states.coordinates[:, None, :] * place, axis=2)
+        1e-3
+        * (1.0 - 0.7 * span)
+        / np.prod(1.0 - 0.6 * model.states.coordinates[:, None, :] * place, axis=2)
     )
     sensors = GaussianSensorModel(np.stack([2.0 * strain, 3.0 * strain], axis=1)[None], 125e-6)
     control = np.where(np.arange(STEPS) < 30, 1, 0)
@@ -128,7 +139,9 @@ def many_states() -> list[Measurement]:
     history = filter_sequence(model, control, rows)
 
     def step() -> None:
-        filter_sequence(model, control[-1:], rows[-1:], (history.log_filtered[-2], int(control[-2])))
+        filter_sequence(
+            model, control[-1:], rows[-1:], (history.log_filtered[-2], int(control[-2]))
+        )
 
     def likelihood() -> None:
         sensors.log_likelihood(seen[-1], int(control[-1]))
@@ -147,13 +160,23 @@ def many_states() -> list[Measurement]:
     alone = "forecast of the joint transitions, scipy.sparse, linear domain"
     return [
         Measurement(
-            "filter step, 15,625 states", 1e3 * median_seconds(step, repeats=25), "ms", 1.0, alone, lists
+            "filter step, 15,625 states",
+            1e3 * median_seconds(step, repeats=25),
+            "ms",
+            1.0,
+            alone,
+            lists,
         ),
         Measurement(
-            "likelihood of 24 sensors, 15,625 states", 1e3 * median_seconds(likelihood, repeats=25), "ms"
+            "likelihood of 24 sensors, 15,625 states",
+            1e3 * median_seconds(likelihood, repeats=25),
+            "ms",
         ),
         Measurement(
-            "filter and smooth 50 steps, 15,625 states", median_seconds(mission, repeats=5), "s", 10.0
+            "filter and smooth 50 steps, 15,625 states",
+            median_seconds(mission, repeats=5),
+            "s",
+            10.0,
         ),
     ]
 
@@ -217,8 +240,12 @@ def run() -> list[Measurement]:
     toolbox = toolbox_seconds(model, reward)
     return [
         Measurement("online step at step 50", 1e3 * online, "ms", 1.0, per_twin, 1e3 * elimination),
-        Measurement("smooth and predict 50 steps", 1e3 * whole, "ms", 0.5, per_twin, 1e3 * elimination),
-        Measurement("smooth 1,000 twins of 50 steps", 1e3 * batch, "ms", 60.0, "one by one", 1e3 * single),
+        Measurement(
+            "smooth and predict 50 steps", 1e3 * whole, "ms", 0.5, per_twin, 1e3 * elimination
+        ),
+        Measurement(
+            "smooth 1,000 twins of 50 steps", 1e3 * batch, "ms", 60.0, "one by one", 1e3 * single
+        ),
         Measurement("value iteration", 1e3 * planning, "ms", 0.5, "pymdptoolbox", 1e3 * toolbox),
         Measurement("quantities of 550 beliefs x 24 sensors, 95 % bands", 1e3 * mixture, "ms"),
         *many_states(),

@@ -31,22 +31,28 @@ def record(watch: Watch, path: Path, turns: int) -> None:
     """Write what a sound wing shows, with noise."""
     scenario = watch.scenario
     values = watch.models[0].knowledge.sensor_model.value_per_draw[:, 0, 1].mean(axis=0)
-    rng, count = np.random.default_rng(1), scenario.observation.count
+    rng = np.random.default_rng(1)
+    count = scenario.observation.count
     with path.open("w") as file:
-        file.write("turn,control," + ",".join(f"strain_{number + 1}" for number in range(count)) + "\n")
+        file.write(
+            "turn,control," + ",".join(f"strain_{number + 1}" for number in range(count)) + "\n"
+        )
         for turn in range(turns):
             row = values + rng.normal(0.0, 1.2e-4, count)
-            file.write(f"{turn},{scenario.control_names[1]}," + ",".join(map(repr, row.tolist())) + "\n")
+            file.write(
+                f"{turn},{scenario.control_names[1]}," + ",".join(map(repr, row.tolist())) + "\n"
+            )
 
 
 def taken_up(folder: Path, log: Path) -> tuple[float, float]:
-    """Return seconds of the processor up to the next decision, and those without preparing the model."""
+    """Return processor seconds until the next decision, with and without preparing the model."""
 
     def told(_decision: Mapping[str, object]) -> None:
         raise _Told
 
     journal = folder / JOURNAL_NAME
-    size, begin = journal.stat().st_size, time.process_time()
+    size = journal.stat().st_size
+    begin = time.process_time()
     with resumed_watch(folder, None, SilentProgress()) as watch:
         prepared = time.process_time()
         try:
@@ -59,7 +65,7 @@ def taken_up(folder: Path, log: Path) -> tuple[float, float]:
 
 
 def in_a_process(folder: Path, log: Path) -> list[float]:
-    """Return the seconds of the processor that a new process takes, and of these what `taken_up` tells."""
+    """Return processor seconds of a new process, and the part of them that `taken_up` measures."""
     command = [sys.executable, "-m", "benchmarks.bench_watch", str(folder), str(log)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     return [float(word) for word in done.stdout.split()]
@@ -68,7 +74,8 @@ def in_a_process(folder: Path, log: Path) -> list[float]:
 def run() -> list[Measurement]:
     """Measure after one turn, after as many as are filtered again, and after years."""
     with tempfile.TemporaryDirectory() as name:
-        place, seconds = Path(name), {}
+        place = Path(name)
+        seconds = {}
         log = place / "log.csv"
         for turns in (1, 99, TURNS + 19):  # 32 turns between two lines with all that is needed
             folder = place / str(turns)
@@ -77,15 +84,21 @@ def run() -> list[Measurement]:
                 if not log.exists():
                     record(watch, log, TURNS + 20)
                 watch.run(file_feed(log, watch.scenario), lambda _decision: None, turns=turns)
-            seconds[turns] = np.median([in_a_process(folder, log) for _ in range(REPETITIONS)], axis=0)
+            seconds[turns] = np.median(
+                [in_a_process(folder, log) for _ in range(REPETITIONS)], axis=0
+            )
     return [
         Measurement(
-            f"a watch taken up after {TURNS + 19} turns{what}", float(seconds[TURNS + 19][kind]), "s", None,
-            f"after {turns}", float(seconds[turns][kind]),
+            f"a watch taken up after {TURNS + 19} turns{what}",
+            float(seconds[TURNS + 19][kind]),
+            "s",
+            None,
+            f"after {turns}",
+            float(seconds[turns][kind]),
         )
         for turns in (1, 99)
         for kind, what in ((0, ", all of its process"), (2, ", what depends on the journal"))
-    ]  # fmt: skip
+    ]
 
 
 if __name__ == "__main__":

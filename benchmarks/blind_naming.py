@@ -1,7 +1,7 @@
 """Name what is hidden in blind campaigns: `python -m benchmarks.blind_naming DIR [--jobs 2]`.
 
-DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/campaigns and DIR/leave_out.json
-are read; a verdict for each campaign goes to DIR/verdicts.
+DIR is what `python -m benchmarks.blind generate --out DIR` wrote. Only DIR/campaigns and
+DIR/leave_out.json are read; a verdict for each campaign goes to DIR/verdicts.
 """
 
 import argparse
@@ -50,7 +50,11 @@ def name_case(folder: Path, left_out: dict[str, list[str]]) -> dict[str, Any]:
     try:
         found = investigate(read_campaign(folder), model_of(folder), effects, thorough=False)
     except DiscrepancyError as error:
-        return {"kind": "data error", "sentence": str(error), "seconds": time.perf_counter() - started}
+        return {
+            "kind": "data error",
+            "sentence": str(error),
+            "seconds": time.perf_counter() - started,
+        }
     row = verdict_row(found)
     row["seconds"] = time.perf_counter() - started
     return row
@@ -62,13 +66,17 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
     row: dict[str, Any] = {
         "kind": verdict.kind.value,
         "sentence": verdict.sentence,
-        "identifiers": sorted(item.identifier for item in verdict.effects) if verdict.kind in NAMING else [],
+        "identifiers": sorted(item.identifier for item in verdict.effects)
+        if verdict.kind in NAMING
+        else [],
         "places": {item.identifier: item.place for item in verdict.effects},
         "group": list(verdict.group),
         "family": verdict.family,
         "probability": _finite(verdict.probability),
         "log_bayes_factor": _finite(verdict.log_bayes_factor),
-        "gates": [[gate.name, gate.passed, _finite(gate.statistic), gate.reason] for gate in verdict.gates],
+        "gates": [
+            [gate.name, gate.passed, _finite(gate.statistic), gate.reason] for gate in verdict.gates
+        ],
         "stages": found.seconds,
         "hypotheses": [
             [list(item.identifiers), round(item.log_evidence, 2), round(item.probability, 5)]
@@ -78,11 +86,15 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
         "parameters": {},
     }
     if proof is not None and proof.held_out_after is not None:
-        row["held_out_chi_square_per_sample_after"] = _finite(proof.held_out_after.chi_square_per_sample)
+        row["held_out_chi_square_per_sample_after"] = _finite(
+            proof.held_out_after.chi_square_per_sample
+        )
         row["share_closed"] = None if proof.closed is None else _finite(proof.closed.value)
     if verdict.kind in NAMING:
         row["parameters"] = {
-            effect.identifier: {item.name: [item.low, item.value, item.high] for item in effect.parameters}
+            effect.identifier: {
+                item.name: [item.low, item.value, item.high] for item in effect.parameters
+            }
             for effect in verdict.effects
         }
         row["estimates"] = estimates(found)
@@ -90,20 +102,22 @@ def verdict_row(found: Investigation) -> dict[str, Any]:
 
 
 def estimates(found: Investigation) -> dict[str, list[float]]:
-    """Return the 90 % intervals of a verdict's effects in SI: low, value and high by effect and field."""
+    """Return low, value and high of each parameter of a verdict's effects: 90 % intervals, SI."""
     rows: dict[str, list[float]] = {}
     if found.problem is None or found.fit is None:
         return rows
     draws = patch_draws(found.problem, found.fit, seed=1)
     for effect, patches in zip(found.verdict.effects, draws, strict=True):
-        for item in primitive_intervals(at_unit(effect.patch), [at_unit(patch) for patch in patches]):
+        for item in primitive_intervals(
+            at_unit(effect.patch), [at_unit(patch) for patch in patches]
+        ):
             if math.isfinite(item.low) and item.low < item.high:
                 rows[f"{effect.identifier}.{item.parameter}"] = [item.low, item.value, item.high]
     return rows
 
 
 def at_unit(patch: ModelPatch) -> ModelPatch:
-    """Return the patch with coefficients of power laws at unit speed and displacement, as the truth is."""
+    """Return a patch whose power laws have coefficients at unit speed and displacement."""
     primitives = []
     for item in patch:
         if isinstance(item, PowerDamping):
@@ -112,7 +126,10 @@ def at_unit(patch: ModelPatch) -> ModelPatch:
                 * item.reference_displacement**item.displacement_exponent
             )
             item = replace(
-                item, coefficient=item.coefficient / scale, reference_velocity=1.0, reference_displacement=1.0
+                item,
+                coefficient=item.coefficient / scale,
+                reference_velocity=1.0,
+                reference_displacement=1.0,
             )
         elif isinstance(item, PowerStiffness):
             item = replace(

@@ -16,7 +16,9 @@ from typing import Any
 from tornado.httpclient import AsyncHTTPClient
 from tornado.websocket import WebSocketClientConnection, websocket_connect
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+CHROMIUM = (
+    shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+)
 _MOST = 256 * 2**20
 _PATIENCE = 60.0
 
@@ -38,11 +40,15 @@ class Tab:
         try:
             return self._loop.run_until_complete(answer)
         except TimeoutError:
-            raise AssertionError(f"no answer to {method} {parameters}; errors: {self.errors}") from None
+            raise AssertionError(
+                f"no answer to {method} {parameters}; errors: {self.errors}"
+            ) from None
 
     async def _send(self, method: str, parameters: dict[str, Any]) -> dict[str, Any]:
         number = next(self._numbers)
-        await self._socket.write_message(json.dumps({"id": number, "method": method, "params": parameters}))
+        await self._socket.write_message(
+            json.dumps({"id": number, "method": method, "params": parameters})
+        )
         while True:
             text = await self._socket.read_message()
             assert text is not None, "the browser went away"
@@ -79,7 +85,9 @@ class Tab:
 
     def value(self, expression: str) -> Any:
         """Return the value of a JavaScript expression; promises are awaited."""
-        found = self.send("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        found = self.send(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
@@ -99,7 +107,9 @@ class Tab:
 
     def picture(self, path: Path, *, whole: bool = True) -> bytes:
         """Write a picture of the page and return it as PNG."""
-        content = base64.b64decode(self.send("Page.captureScreenshot", captureBeyondViewport=whole)["data"])
+        content = base64.b64decode(
+            self.send("Page.captureScreenshot", captureBeyondViewport=whole)["data"]
+        )
         path.write_bytes(content)
         return content
 
@@ -120,10 +130,14 @@ class Browser:
         whole = await websocket_connect(version["webSocketDebuggerUrl"])
         # In a window of its own: what lies behind another tab is not painted.
         wanted = {"url": "about:blank", "newWindow": True}
-        await whole.write_message(json.dumps({"id": 1, "method": "Target.createTarget", "params": wanted}))
+        await whole.write_message(
+            json.dumps({"id": 1, "method": "Target.createTarget", "params": wanted})
+        )
         target = json.loads(str(await whole.read_message()))["result"]["targetId"]
         whole.close()
-        return await websocket_connect(f"ws://{root}/devtools/page/{target}", max_message_size=_MOST)
+        return await websocket_connect(
+            f"ws://{root}/devtools/page/{target}", max_message_size=_MOST
+        )
 
 
 @contextmanager
@@ -131,10 +145,24 @@ def open_browser() -> Iterator[Browser]:
     """Start a browser of its own, and end it."""
     assert CHROMIUM is not None, "these tests need Chromium: apt-get install chromium"
     loop = asyncio.new_event_loop()
-    with tempfile.TemporaryDirectory(prefix="uav_twin_browser_", ignore_cleanup_errors=True) as profile:
-        options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run"]
+    with tempfile.TemporaryDirectory(
+        prefix="uav_twin_browser_", ignore_cleanup_errors=True
+    ) as profile:
+        options = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+        ]
         process = subprocess.Popen(
-            [CHROMIUM, *options, "--remote-debugging-port=0", f"--user-data-dir={profile}", "about:blank"],
+            [
+                CHROMIUM,
+                *options,
+                "--remote-debugging-port=0",
+                f"--user-data-dir={profile}",
+                "about:blank",
+            ],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,

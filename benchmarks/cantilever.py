@@ -1,7 +1,7 @@
-"""A uniform cantilever as a `Model`: quick, for the pictures of docs/effects and the catalogue's tests.
+"""A uniform cantilever as a quick `Model`, for the pictures of docs/effects and for tests.
 
-Euler-Bernoulli elements on a root that turns in a spring; shear strain of the skin follows the torque of a
-load behind the elastic line. About the size of the wing that this project flies.
+Euler-Bernoulli elements on a root that turns in a spring; shear strain of the skin follows the
+torque of a load behind the elastic line. About the size of the wing that this project flies.
 """
 
 from dataclasses import replace
@@ -23,7 +23,6 @@ from discrepancy.system.response import ACROSS, Conditions, Outputs, Response
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.sensing import observe
 from discrepancy.system.time_history import RecordedHistory
-from fe.runtime.motion import laws_of
 from fe.runtime.patch import (
     INTERNAL_FORCES,
     InertiaRelief,
@@ -37,6 +36,7 @@ from fe.runtime.patch import (
     RootCompliance,
     Washout,
 )
+from fe.runtime.port_laws import port_laws
 
 FloatArray = NDArray[np.float64]
 
@@ -65,7 +65,12 @@ def displacement_row(station: float) -> FloatArray:
     """Return the row (n,) of the upward displacement at a station [m]."""
     element = min(int(station / STEP), ELEMENTS - 1)
     s = station / STEP - element
-    shape = (1 - 3 * s**2 + 2 * s**3, STEP * (s - 2 * s**2 + s**3), 3 * s**2 - 2 * s**3, STEP * (s**3 - s**2))
+    shape = (
+        1 - 3 * s**2 + 2 * s**3,
+        STEP * (s - 2 * s**2 + s**3),
+        3 * s**2 - 2 * s**3,
+        STEP * (s**3 - s**2),
+    )
     row = np.zeros(SIZE)
     for degree, value in zip(_degrees(element), shape, strict=True):
         if degree is not None:
@@ -97,12 +102,16 @@ PORTS = {"root": ROOT, "tip": TIP, "span": SPAN}
 def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
     """Return the structure with its modulus scaled and masses, root and losses of a patch."""
     loss = np.zeros(ELEMENTS)
-    mass, extra, compliance = np.zeros((SIZE, SIZE)), np.zeros((SIZE, SIZE)), 1.0 / ROOT_STIFFNESS
+    mass = np.zeros((SIZE, SIZE))
+    extra = np.zeros((SIZE, SIZE))
+    compliance = 1.0 / ROOT_STIFFNESS
     ends = np.arange(ELEMENTS) * STEP
     for item in structural:
         if isinstance(item, LocalStiffnessLoss):
             inner = np.clip(
-                np.minimum(ends + STEP, item.start + item.length) - np.maximum(ends, item.start), 0, None
+                np.minimum(ends + STEP, item.start + item.length) - np.maximum(ends, item.start),
+                0,
+                None,
             )
             loss += item.loss * inner / STEP
         elif isinstance(item, PointMass):
@@ -112,14 +121,29 @@ def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
             compliance += item.compliance
     stiffness = np.zeros((SIZE, SIZE))
     h = STEP
-    k = np.array(
-        [[12, 6 * h, -12, 6 * h], [6 * h, 4 * h**2, -6 * h, 2 * h**2],
-         [-12, -6 * h, 12, -6 * h], [6 * h, 2 * h**2, -6 * h, 4 * h**2]]
-    ) / h**3  # fmt: skip
-    m = np.array(
-        [[156, 22 * h, 54, -13 * h], [22 * h, 4 * h**2, 13 * h, -3 * h**2],
-         [54, 13 * h, 156, -22 * h], [-13 * h, -3 * h**2, -22 * h, 4 * h**2]]
-    ) * h / 420  # fmt: skip
+    k = (
+        np.array(
+            [
+                [12, 6 * h, -12, 6 * h],
+                [6 * h, 4 * h**2, -6 * h, 2 * h**2],
+                [-12, -6 * h, 12, -6 * h],
+                [6 * h, 2 * h**2, -6 * h, 4 * h**2],
+            ]
+        )
+        / h**3
+    )
+    m = (
+        np.array(
+            [
+                [156, 22 * h, 54, -13 * h],
+                [22 * h, 4 * h**2, 13 * h, -3 * h**2],
+                [54, 13 * h, 156, -22 * h],
+                [-13 * h, -3 * h**2, -22 * h, 4 * h**2],
+            ]
+        )
+        * h
+        / 420
+    )
     for element in range(ELEMENTS):
         pairs = [(i, d) for i, d in enumerate(_degrees(element)) if d is not None]
         for i, a in pairs:
@@ -135,10 +159,11 @@ def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
 
 
 class Cantilever(Model):
-    """The cantilever; outputs "tip_displacement" and "strain[0]" to "strain[2]", ports root, tip and span."""
+    """A cantilever with outputs of tip displacement and three strains; ports root, tip and span."""
 
     name = "cantilever"
-    ports, shows_ports = tuple(PORTS), False
+    ports = tuple(PORTS)
+    shows_ports = False
     stations = 0.0, LENGTH
     parameters = (ParameterPrior("young_modulus_factor", "1", 1.0, 0.01, 0.5, 2.0),)
 
@@ -184,9 +209,12 @@ class Cantilever(Model):
             ports=ports,
         )
 
-    def _respond(self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions) -> Response:
+    def _respond(
+        self, trial: Trial, outputs: Outputs, patch: ModelPatch, conditions: Conditions
+    ) -> Response:
         """Return the response of a trial."""
-        across, along = ACROSS[0], {name: SKIN * curvature_row(place) for name, place in GAUGES.items()}
+        across = ACROSS[0]
+        along = {name: SKIN * curvature_row(place) for name, place in GAUGES.items()}
         rows = along | {name + across: -POISSON * row for name, row in along.items()}
         chosen = np.array([rows.get(name, TIP) for name, _ in outputs])
         values, rates, torque = _motion(trial, chosen, patch, conditions)
@@ -203,7 +231,11 @@ def _motion(
     softening = sum(item.coefficient for item in patch if isinstance(item, ModulusTemperature))
     modulus = float(conditions.parameters[0]) * (1.0 - softening * trial.temperature)
     place = LOAD_STATION if isinstance(trial.load_place, str) else trial.load_place[0]
-    gain, tare, behind, washout, relief = 1.0, 0.0, 0.05, np.zeros(len(POINTS)), 0.0
+    gain = 1.0
+    tare = 0.0
+    behind = 0.05
+    washout = np.zeros(len(POINTS))
+    relief = 0.0
     for item in patch:
         if isinstance(item, LoadPlace):
             place, behind = place + item.along_span, behind + item.along_chord
@@ -215,7 +247,7 @@ def _motion(
             relief += item.fraction
     row = displacement_row(min(place, LENGTH))
     force = np.where(trial.force != 0.0, gain * trial.force + tare, 0.0)
-    laws = laws_of(patch.of(*INTERNAL_FORCES), PORTS)
+    laws = port_laws(patch.of(*INTERNAL_FORCES), PORTS)
     if trial.is_dynamic:
         system = _system(float(modulus[0]), structural)
         excitation = Excitation(trial.time, conditions.stamps(trial.time))
@@ -232,13 +264,15 @@ def _motion(
     for n in range(len(force)):
         factor = trial.load_factor[n]
         lift = 20.0 * factor * (1.0 - washout * factor)  # N/m: about the aircraft's weight
-        loads[n] += ((lift - relief * factor * MASS_PER_LENGTH * GRAVITY)[:, None] * SHARES).sum(axis=0) * (
-            LENGTH / len(POINTS)
-        )
+        loads[n] += ((lift - relief * factor * MASS_PER_LENGTH * GRAVITY)[:, None] * SHARES).sum(
+            axis=0
+        ) * (LENGTH / len(POINTS))
     values = np.empty((len(force), len(rows)))
     for level in np.unique(modulus):
         chosen = modulus == level
-        values[chosen] = (_system(float(level), structural).static_path(loads, laws).values @ rows.T)[chosen]
+        values[chosen] = (
+            _system(float(level), structural).static_path(loads, laws).values @ rows.T
+        )[chosen]
     return values, None, behind * force
 
 
@@ -248,7 +282,9 @@ def channel_list() -> dict[str, Channel]:
     rows = [("tip", Quantity.DISPLACEMENT, "tip_displacement")]
     rows += [(f"g{n}", Quantity.STRAIN, name) for n, name in enumerate(GAUGES)]
     return {
-        name: Channel(name, quantity, output, NoiseRecord(noise[quantity], 200.0), 0.005, noise[quantity])
+        name: Channel(
+            name, quantity, output, NoiseRecord(noise[quantity], 200.0), 0.005, noise[quantity]
+        )
         for name, quantity, output in rows
     }
 
@@ -263,19 +299,30 @@ def campaign() -> Campaign:
     Two ring-downs, one forced trial, three static ones (up, down, warm) and one flight.
     """
     levels = np.array([5.0, 10.0, 20.0, 30.0, 20.0, 10.0, 5.0])
-    minutes = 60.0 * np.arange(1, 8)
-    samples = np.arange(2000) / 250.0
+    minutes = 60.0 * np.arange(1, 8, dtype=np.float64)
+    samples = np.arange(2000, dtype=np.float64) / 250.0
     trials = (
         _trial("up", TrialKind.STATIC, minutes, force=levels),
         _trial("down", TrialKind.STATIC, 600.0 + minutes, force=-levels, run="B"),
-        _trial("warm", TrialKind.STATIC, 1200.0 + minutes, force=levels, run="B",
-               temperature=np.full(7, 15.0)),
+        _trial(
+            "warm",
+            TrialKind.STATIC,
+            1200.0 + minutes,
+            force=levels,
+            run="B",
+            temperature=np.full(7, 15.0),
+        ),
         _trial("release", TrialKind.RINGDOWN, samples, start=2000.0, release=Release(0.08)),
         _trial("half", TrialKind.RINGDOWN, samples, start=2100.0, release=Release(0.04)),
-        _trial("pushed", TrialKind.FORCED, samples[:1000], start=2200.0,
-               force=8.0 * np.sin(2.0 * np.pi * (2.0 + samples[:1000]) * samples[:1000])),
+        _trial(
+            "pushed",
+            TrialKind.FORCED,
+            samples[:1000],
+            start=2200.0,
+            force=8.0 * np.sin(2.0 * np.pi * (2.0 + samples[:1000]) * samples[:1000]),
+        ),
         _trial("flight", TrialKind.FLIGHT, 3000.0 + minutes, load_factor=np.linspace(1.0, 3.0, 7)),
-    )  # fmt: skip
+    )
     bare = Campaign("Cantilever", channel_list(), trials, 20.0, {}, "")
     model = Cantilever()
     for trial in trials:

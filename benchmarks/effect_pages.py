@@ -1,6 +1,7 @@
-"""The pages of docs/effects: from the catalogue's records, the paragraphs beside them, and the pictures.
+"""Write the pages of docs/effects from the catalogue, hand-written paragraphs, and pictures.
 
-``python -m benchmarks.effect_pages`` writes them all; ``--no-pictures`` leaves the pictures as they are.
+``python -m benchmarks.effect_pages`` writes them all; ``--no-pictures`` leaves the pictures as they
+are.
 """
 
 import argparse
@@ -21,7 +22,7 @@ LETTERS = {"static": "S", "ring-down": "R", "forced": "O", "driven": "D", "fligh
 
 
 def paragraphs() -> dict[str, Any]:
-    """Return the hand-written parts by effect, and the "overview" with @names@ of what is put in."""
+    """Return the hand-written paragraphs by effect, and the "overview" with its @placeholders@."""
     return tomllib.loads((FOLDER / "paragraphs.toml").read_text(encoding="utf-8"))
 
 
@@ -42,7 +43,8 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         unit = "" if p.unit == "1" else f", {p.unit}"
         rows.append(f"- {p.symbol} (`{p.name}`{unit}): {p.description}; {range_of(p.prior)}.")
     free = [
-        f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, in the family {range_of(s.prior)}."
+        f"- {s.symbol} (`{s.name}`): {s.description}; {s.canonical:g}, "
+        f"in the family {range_of(s.prior)}."
         for s in effect.shape
     ]
     shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
@@ -78,7 +80,9 @@ def readme() -> str:
     """Return the list of all effects."""
     rows = []
     for effect in library():
-        letters = "".join(LETTERS[name] for kind, name in KIND_NAMES.items() if kind in effect.acts_on)
+        letters = "".join(
+            LETTERS[name] for kind, name in KIND_NAMES.items() if kind in effect.acts_on
+        )
         rows.append(f"- [{effect.name}]({effect.identifier}.md), {letters}: {effect.signature}")
     families = len({effect.family for effect in library()})
     numbers = {"count": len(library()), "families": families, "rows": "\n".join(rows)}
@@ -93,7 +97,9 @@ def pages() -> dict[str, str]:
     texts, beam = paragraphs(), picture_setting()
     made = {
         f"{effect.identifier}.md": page(
-            effect, texts[effect.identifier], picture_setting(effect) if effect.identifier in FLOWS else beam
+            effect,
+            texts[effect.identifier],
+            picture_setting(effect) if effect.identifier in FLOWS else beam,
         )
         for effect in library()
     }

@@ -69,7 +69,9 @@ class View:
 Panel = Callable[[View, Axes], None]
 
 
-def ringdown(channel: str = "tip", begin: float = 0.0, end: float = 2.0, trial: str = "release") -> Panel:
+def ringdown(
+    channel: str = "tip", begin: float = 0.0, end: float = 2.0, trial: str = "release"
+) -> Panel:
     """Return the panel of a record over time."""
 
     def draw(view: View, axes: Axes) -> None:
@@ -82,8 +84,10 @@ def ringdown(channel: str = "tip", begin: float = 0.0, end: float = 2.0, trial: 
     return draw
 
 
-def cycles(time: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the middle time, amplitude, frequency and damping ratio of each cycle of a ring-down."""
+def cycles(
+    time: FloatArray, values: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return middle time, amplitude, frequency and damping ratio of each cycle of a ring-down."""
     at = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
     crossing = time[at] - values[at] * (time[at + 1] - time[at]) / (values[at + 1] - values[at])
     half = [0.5 * np.ptp(values[(time >= a) & (time <= b)]) for a, b in pairwise(crossing)]
@@ -108,9 +112,14 @@ def backbone(of: str, over: str = "amplitude", trials: tuple[str, ...] = ("relea
                 across = amplitude if over == "amplitude" else time
                 shown = frequency if of == "frequency" else 100.0 * ratio
                 axes.plot(
-                    across[large], shown[large], ".-" if number == 0 else "x", color=colour, ms=3, lw=0.8,
+                    across[large],
+                    shown[large],
+                    ".-" if number == 0 else "x",
+                    color=colour,
+                    ms=3,
+                    lw=0.8,
                     label=label if number == 0 else None,
-                )  # fmt: skip
+                )
         axes.set_xlabel("amplitude [mm]" if over == "amplitude" else "time [s]")
         axes.set_ylabel("frequency [Hz]" if of == "frequency" else "damping [%]")
         low, high = axes.get_ylim()
@@ -133,9 +142,17 @@ def load_line(
             if change:
                 axes.plot(record.force, moved - plain, "o-", color=colour, ms=3, lw=0.9)
             else:
-                axes.plot(record.force, plain, "-", color=grey, lw=2.0, label=None if number else before)
                 axes.plot(
-                    record.force, moved, "o-", color=colour, ms=3, lw=0.9, label=None if number else after
+                    record.force, plain, "-", color=grey, lw=2.0, label=None if number else before
+                )
+                axes.plot(
+                    record.force,
+                    moved,
+                    "o-",
+                    color=colour,
+                    ms=3,
+                    lw=0.9,
+                    label=None if number else after,
                 )
         if change:
             axes.axhline(0.0, color=REFERENCE, lw=0.8)
@@ -146,18 +163,27 @@ def load_line(
 
 
 def ratios(*trials: str) -> Panel:
-    """Return the panel of each channel's readings over those without the effect, summed over a trial."""
+    """Return a panel of each channel's readings over those without the effect, summed by trial."""
 
     def draw(view: View, axes: Axes) -> None:
         for number, name in enumerate(trials):
             record = view.trial(name)
             names = record.channels
             values = [
-                np.sum(view.read(record, c)) / np.sum(view.read(record, c, ModelPatch())) for c in names
+                np.sum(view.read(record, c)) / np.sum(view.read(record, c, ModelPatch()))
+                for c in names
             ]
             label = f"trial {name!r}" if len(trials) > 1 else "with the effect"
             fill = PREDICTION if number == 0 else "none"
-            axes.plot(range(len(names)), values, "os"[number], color=PREDICTION, ms=5, mfc=fill, label=label)
+            axes.plot(
+                range(len(names)),
+                values,
+                "os"[number],
+                color=PREDICTION,
+                ms=5,
+                mfc=fill,
+                label=label,
+            )
         axes.axhline(1.0, color=REFERENCE, lw=0.8, label="model")
         axes.set_xticks(range(len(names)), names)
         axes.set(ylabel="reading over model's", xlim=(-0.5, len(names) - 0.5))
@@ -169,7 +195,7 @@ def ratios(*trials: str) -> Panel:
 
 
 def flight(channels: tuple[str, ...], *, share: bool = False) -> Panel:
-    """Return the panel of the change in flight over the load factor, or of a ratio of two channels."""
+    """Return a panel of the change in flight, or of a ratio of two channels, over load factor."""
 
     def draw(view: View, axes: Axes) -> None:
         record = view.trial("flight")
@@ -181,7 +207,14 @@ def flight(channels: tuple[str, ...], *, share: bool = False) -> Panel:
         else:
             for channel, marker in zip(channels, "os^", strict=False):
                 (plain, _, _), (moved, colour, _) = view.both(record, channel)
-                axes.plot(record.load_factor, moved - plain, marker + "-", color=colour, ms=3, label=channel)
+                axes.plot(
+                    record.load_factor,
+                    moved - plain,
+                    marker + "-",
+                    color=colour,
+                    ms=3,
+                    label=channel,
+                )
             axes.axhline(0.0, color=REFERENCE, lw=0.8)
             axes.set_ylabel(f"change [{view.unit(channels[0])[1]}]")
         axes.set_xlabel("load factor")
@@ -215,8 +248,15 @@ def change_over(what: str, channels: tuple[str, ...]) -> Panel:
                 record = view.trial(name)
                 across.append(record.temperature if what == "temperature" else record.time / 60.0)
                 change.append(view.read(record, channel) - view.read(record, channel, ModelPatch()))
-            axes.plot(np.concatenate(across), np.concatenate(change), marker, color=PREDICTION, ms=4,
-                      mfc="none", label=channel)  # fmt: skip
+            axes.plot(
+                np.concatenate(across),
+                np.concatenate(change),
+                marker,
+                color=PREDICTION,
+                ms=4,
+                mfc="none",
+                label=channel,
+            )
         axes.axhline(0.0, color=REFERENCE, lw=0.8)
         axes.set_xlabel("temperature less reference [K]" if what == "temperature" else "time [min]")
         axes.set_ylabel(f"change [{view.unit(channels[0])[1]}]")
@@ -226,7 +266,7 @@ def change_over(what: str, channels: tuple[str, ...]) -> Panel:
 
 @dataclass(frozen=True)
 class Picture:
-    """What a picture shows: parameters of the effect, its place (the first if left out), two panels."""
+    """Content of a picture: parameters of the effect, its place, and two panels."""
 
     values: Mapping[str, float]
     panels: tuple[Panel, Panel]
@@ -238,7 +278,9 @@ FREQUENCY, DAMPING = backbone("frequency"), backbone("damping")
 FILLED = ringdown("level", 0.0, 300.0, "filled and drained")
 
 PICTURES: dict[str, Picture] = {
-    "point_mass": Picture({"mass_ratio": 0.1, "station_ratio": 1.0}, (ringdown(end=1.2), load_line())),
+    "point_mass": Picture(
+        {"mass_ratio": 0.1, "station_ratio": 1.0}, (ringdown(end=1.2), load_line())
+    ),
     "root_compliance": Picture({"compliance_share": 0.15}, (load_line("tip"), load_line("g0"))),
     "local_stiffness_loss": Picture(
         {"loss": 0.3, "start_ratio": 0.4, "length_ratio": 0.15}, (ratios("up"), load_line("g1"))
@@ -253,7 +295,9 @@ PICTURES: dict[str, Picture] = {
     "breathing_crack": Picture(
         {"stiffness_loss": 0.4}, (load_line(change=True), spectrum("tip", 20.0)), "root, lower skin"
     ),
-    "free_play": Picture({"gap_ratio": 0.05, "stiffness_share": 0.6}, (FREQUENCY, load_line(change=True))),
+    "free_play": Picture(
+        {"gap_ratio": 0.05, "stiffness_share": 0.6}, (FREQUENCY, load_line(change=True))
+    ),
     "seating_offset": Picture(
         {"offset_ratio": 0.03}, (load_line(change=True), load_line("g0", change=True)), "B"
     ),
@@ -266,7 +310,8 @@ PICTURES: dict[str, Picture] = {
     ),
     "joint_micro_slip": Picture({"stiffness_share": 0.7, "slip_ratio": 0.3}, (FREQUENCY, DAMPING)),
     "bouc_wen_hysteresis": Picture(
-        {"stiffness_share": 0.6, "yield_ratio": 0.3}, (FREQUENCY, load_line(trials=("up",), change=True))
+        {"stiffness_share": 0.6, "yield_ratio": 0.3},
+        (FREQUENCY, load_line(trials=("up",), change=True)),
     ),
     "thermal_strain": Picture(
         {"coefficient": 5e-6},
@@ -274,32 +319,41 @@ PICTURES: dict[str, Picture] = {
         "g0",
     ),
     "gauge_zero_drift": Picture(
-        {"drift_ratio": 0.1}, (change_over("time", ("g0", "g1")), load_line("g0", change=True)), "g0"
+        {"drift_ratio": 0.1},
+        (change_over("time", ("g0", "g1")), load_line("g0", change=True)),
+        "g0",
     ),
     "gauge_gain": Picture({"gain_error": 0.1}, (ratios("up", "flight"), load_line("g1")), "g1"),
     "sensor_saturation": Picture(
         {"lost_share": 0.2}, (load_line("g0", change=True), spectrum("g0", 20.0)), "g0"
     ),
     "gauge_misalignment": Picture({"angle": 0.26}, (ratios("up", "flight"), load_line("g1")), "g1"),
-    "high_pass": Picture({"corner_ratio": 0.2}, (ringdown("g0", end=1.5), spectrum("g0", 10.0)), "g0"),
+    "high_pass": Picture(
+        {"corner_ratio": 0.2}, (ringdown("g0", end=1.5), spectrum("g0", 10.0)), "g0"
+    ),
     "load_place": Picture(
         {"along_span_ratio": -0.05, "along_chord_ratio": 0.0}, (ratios("up"), load_line("g2"))
     ),
     "load_cell": Picture(
-        {"gain_error": 0.05, "tare_ratio": 0.03}, (load_line(change=True), load_line("g0", change=True))
+        {"gain_error": 0.05, "tare_ratio": 0.03},
+        (load_line(change=True), load_line("g0", change=True)),
     ),
     "washout": Picture({"washout": 0.1}, (flight(("g2", "g0"), share=True), flight(("g0", "g2")))),
     "inertia_relief": Picture({"relief": 0.2}, (flight(("g0", "g2")), ratios("up", "flight"))),
-    "outflow": Picture({"flow_ratio": 0.3}, (FILLED, ringdown("level", 240.0, 300.0, "filled and drained"))),
+    "outflow": Picture(
+        {"flow_ratio": 0.3}, (FILLED, ringdown("level", 240.0, 300.0, "filled and drained"))
+    ),
     "overflow": Picture(
         {"level_ratio": 0.7, "flow_ratio": 0.3},
         (FILLED, ringdown("level", 40.0, 100.0, "filled and drained")),
     ),
     "clock_error": Picture(
-        {"rate_error": 5e-3, "phase_zero": 0.0}, (ringdown(begin=6.0, end=8.0), backbone("frequency", "time"))
+        {"rate_error": 5e-3, "phase_zero": 0.0},
+        (ringdown(begin=6.0, end=8.0), backbone("frequency", "time")),
     ),
     "logger_clock": Picture(
-        {"rate_error": 5e-3}, (ringdown(begin=7.0, end=8.0), ringdown(begin=3.2, end=4.0, trial="pushed"))
+        {"rate_error": 5e-3},
+        (ringdown(begin=7.0, end=8.0), ringdown(begin=3.2, end=4.0, trial="pushed")),
     ),
     "mains_hum": Picture(
         {"cosine_ratio": 0.02, "sine_ratio": 0.0, "frequency_error": 0.0},
@@ -315,7 +369,7 @@ PICTURES: dict[str, Picture] = {
 
 
 def picture_of(effect: Effect) -> Picture:
-    """Return what the picture of an effect shows; by default a ring-down and a load line at large values."""
+    """Return the content of an effect's picture; by default a ring-down and a load line."""
     values = {parameter.name: parameter.prior.high for parameter in effect.parameters}
     return PICTURES.get(effect.identifier, Picture(values, (ringdown(), load_line())))
 
@@ -350,7 +404,10 @@ def draw(effect: Effect, setting: Setting) -> bytes:
             if labels and labels != shown:
                 wave = axis.get_xlabel() == "time [s]" and axis is axes[0]
                 axis.legend(
-                    loc="upper right" if wave else "best", fontsize=6.5, frameon=wave, framealpha=0.85
+                    loc="upper right" if wave else "best",
+                    fontsize=6.5,
+                    frameon=wave,
+                    framealpha=0.85,
                 )
                 shown = labels
         figure.tight_layout(pad=0.4)

@@ -1,10 +1,10 @@
-"""Begin and end of events of known truth: `python -m benchmarks.event_moments [--count 200] [--seed 1]`.
+"""Accuracy of begin and end of events: `python -m benchmarks.event_moments [--count 200]`.
 
-Records of 300 to 2,000 samples of noise, white or of correlation 0.5, half of them with a jitter of 2 % of
-the interval. In each an event of 5 to 20 noise deviations (rms) begins at any moment, also between samples,
-and ends in half of them: an offset, a random motion, a line of 8 to 30 samples a period, or a scatter.
-Counted are moments within 1 % of the record, 90 % intervals that hold the truth, and events in records
-without one. The size of the noise comes from a record of 100 samples.
+Records of 300 to 2,000 samples of noise, white or of correlation 0.5, half of them with a jitter of
+2 % of the interval. In each an event of 5 to 20 noise deviations (rms) begins at any moment, also
+between samples, and ends in half of them: an offset, a random motion, a line of 8 to 30 samples a
+period, or a scatter. Counted are moments within 1 % of the record, 90 % intervals that hold the
+truth, and events in records without one. The size of the noise comes from a record of 100 samples.
 """
 
 import argparse
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from discrepancy.missing_force.events import Events, events
-from discrepancy.missing_force.windows import of_series
+from discrepancy.missing_force.windows import pattern_of_residuals
 
 FloatArray = NDArray[np.float64]
 
@@ -33,21 +33,23 @@ def noise(generator: np.random.Generator, count: int, colour: float) -> FloatArr
 def event(generator: np.random.Generator, kind: str, count: int, size: float) -> FloatArray:
     """Return what an event adds (count,), of the root mean square `size`."""
     if kind == "offset":
-        return np.full(count, size * generator.choice([-1.0, 1.0]))
+        return np.full(count, size * float(generator.choice([-1.0, 1.0])))
     if kind == "random motion":
         return size * noise(generator, count, 0.8)
     if kind == "line":
-        phase = 2.0 * np.pi * (np.arange(count) / generator.uniform(8.0, 30.0) + generator.uniform())
-        return size * np.sqrt(2.0) * np.sin(phase)
+        phase = (
+            2.0 * np.pi * (np.arange(count) / generator.uniform(8.0, 30.0) + generator.uniform())
+        )
+        return np.asarray(size * np.sqrt(2.0) * np.sin(phase))
     return size * generator.standard_normal(count)
 
 
 def record(
     generator: np.random.Generator, kind: str | None
 ) -> tuple[FloatArray, FloatArray, tuple[float, ...]]:
-    """Return stamps (N,) and residuals (N,) of a record, and the true begin and end of its event."""
+    """Return times (N,) and residuals (N,) of a record, and the true begin and end of its event."""
     count = int(generator.integers(300, 2001))
-    time = np.arange(count) * 0.01
+    time = np.arange(count, dtype=np.float64) * 0.01
     if generator.random() < 0.5:
         time = np.sort(time + generator.normal(0.0, 0.0002, count))
     values = noise(generator, count, generator.choice([0.0, 0.5]))
@@ -59,12 +61,13 @@ def record(
     end = begin + generator.uniform(0.1, 0.25) * time[-1] if generator.random() < 0.5 else np.inf
     inside = (time >= begin) & (time < end)
     values[inside] += event(generator, kind, int(inside.sum()), generator.uniform(5.0, 20.0))
-    return time, values, (begin, end) if np.isfinite(end) else (begin,)
+    moments = (begin, end) if np.isfinite(end) else (begin,)
+    return time, values, moments
 
 
 def found_in(time: FloatArray, values: FloatArray) -> Events:
     """Return the events of a record."""
-    one, _ = of_series("record", time, values[:, None], np.ones((len(values), 1), bool))
+    one, _ = pattern_of_residuals("record", time, values[:, None], np.ones((len(values), 1), bool))
     return events(one.view, 0, one.processes[0])
 
 
@@ -73,13 +76,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=1)
-    chosen = parser.parse_args()
-    generator = np.random.default_rng(chosen.seed)
+    arguments = parser.parse_args()
+    generator = np.random.default_rng(arguments.seed)
     began = clock.perf_counter()
     print(f"{'event':16s} {'within 1 %':>10s} {'90 % holds':>10s} {'missed':>7s} {'others':>7s}")
     for kind in KINDS:
         found: dict[str, int] = defaultdict(int)
-        for _ in range(chosen.count):
+        for _ in range(arguments.count):
             time, values, truth = record(generator, kind)
             moments = found_in(time, values).moments(0)
             for true in truth:
@@ -97,10 +100,10 @@ def main() -> None:
             f"{found['missed']:7d} {found['others']:7d}  of {total} moments"
         )
     false = 0
-    for _ in range(2 * chosen.count):
+    for _ in range(2 * arguments.count):
         time, values, _ = record(generator, None)
         false += bool(found_in(time, values).paths[0].any())
-    print(f"quiet records with an event: {false} of {2 * chosen.count}")
+    print(f"quiet records with an event: {false} of {2 * arguments.count}")
     print(f"{clock.perf_counter() - began:.0f} s")
 
 

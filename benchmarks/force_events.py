@@ -1,10 +1,11 @@
-"""Begin and end of forces that act at times: `python -m benchmarks.force_events DIR [--count 20] [--seed 1]`.
+"""Accuracy of begin and end of temporary forces: `python -m benchmarks.force_events DIR`.
 
-Rigs of three kinds by equations written out here and a general integrator: a heated block, two tanks, a mass
-on a spring. In each record something acts for a while, once or twice: a brief power or flow, a leak in
-proportion to what is stored, a push, dry friction, or nothing; `always` is friction throughout. The model
-knows masses, stores and losses to 3 to 10 %. Counted are begins and ends within 1 % of the record, 90 %
-intervals that hold the truth, events that are missed, and those that were not there.
+Rigs of three kinds by equations written out here and a general integrator: a heated block, two
+tanks, a mass on a spring. In each record something acts for a while, once or twice: a brief power
+or flow, a leak in proportion to what is stored, a push, dry friction, or nothing; `always` is
+friction throughout. The model knows masses, stores and losses to 3 to 10 %. Counted are begins and
+ends within 1 % of the record, 90 % intervals that hold the truth, events that are missed, and those
+that were not there.
 """
 
 import argparse
@@ -62,9 +63,13 @@ def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
         windows.append((begin, begin + length * generator.uniform(0.03, 0.15)))
     if kind in ("always", "nothing"):
         windows = []
-    time = step * np.arange(count)
-    sizes = np.exp(generator.uniform(*np.log((0.15, 1.0)), 2))
-    levels = generator.uniform(0.3, 1.4, count // 10 + 1) if slow else generator.uniform(-1.0, 1.0, count)
+    time = step * np.arange(count, dtype=np.float64)
+    sizes = np.exp(generator.uniform(np.log(0.15), np.log(1.0), 2))
+    levels = (
+        generator.uniform(0.3, 1.4, count // 10 + 1)
+        if slow
+        else generator.uniform(-1.0, 1.0, count)
+    )
     hold = 10 if slow else 5
     moments = [float(t) for t in time[hold::hold]]
     breaks = sorted({*moments, *(t for window in windows for t in window)})
@@ -74,7 +79,9 @@ def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
 
     def during(t: float) -> float:
         return float(
-            sum(size for size, (begin, end) in zip(sizes, windows, strict=False) if begin <= t < end)
+            sum(
+                size for size, (begin, end) in zip(sizes, windows, strict=False) if begin <= t < end
+            )
         )
 
     def heated(t: float, y: FloatArray) -> list[float]:
@@ -97,18 +104,35 @@ def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
     if kind == "nothing":
         slope = (heated, tanks, moved)[int(generator.integers(3))]
         if slope is not moved:
-            time, breaks, length = 250.0 * time, [250.0 * t for t in moments], 250.0 * length
+            time = 250.0 * time
+            breaks = [250.0 * t for t in moments]
+            length = 250.0 * length
             moments = breaks
     course = Course(lambda t, order: drive(t), lambda t: 0.0, tuple(breaks))
     states = solved(slope, [0.0, 0.0][: 1 if slope is heated else 2], course, time)
     model, channels, unit, size, parameters = {
-        "heated": (HEATED, {"block": ("temperature", "K", 0.02)}, "heat W", 80.0,
-                   {"capacity": ("capacity", 0.05), "loss": ("conductance", 0.1)}),
-        "tanks": (STORES, {"upper": ("level", "m", 1e-3), "lower": ("level", "m", 1e-3)}, "flow m3/s", 0.016,
-                  {"upper outlet": ("upper outlet", 0.05), "lower outlet": ("lower outlet", 0.05)}),
-        "moved": (MASS, {"x": ("displacement", "m", 2e-4)}, "force N", 12.0,
-                  {"mass": ("mass", 0.03), "spring": ("stiffness", 0.03), "damper": ("damping", 0.1)}),
-    }[slope.__name__]  # fmt: skip
+        "heated": (
+            HEATED,
+            {"block": ("temperature", "K", 0.02)},
+            "heat W",
+            80.0,
+            {"capacity": ("capacity", 0.05), "loss": ("conductance", 0.1)},
+        ),
+        "tanks": (
+            STORES,
+            {"upper": ("level", "m", 1e-3), "lower": ("level", "m", 1e-3)},
+            "flow m3/s",
+            0.016,
+            {"upper outlet": ("upper outlet", 0.05), "lower outlet": ("lower outlet", 0.05)},
+        ),
+        "moved": (
+            MASS,
+            {"x": ("displacement", "m", 2e-4)},
+            "force N",
+            12.0,
+            {"mass": ("mass", 0.03), "spring": ("stiffness", 0.03), "damper": ("damping", 0.1)},
+        ),
+    }[slope.__name__]
     deviations = noise * np.array([item[2] for item in channels.values()])
     names = list(channels)
     readings = states[:, : len(names)] + deviations * generator.standard_normal((count, len(names)))
@@ -168,17 +192,20 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    print(f"{'what acts':10s} {'moments':>8s} {'close':>6s} {'held':>6s} {'missed':>7s} {'others':>7s}")
+    arguments = parser.parse_args()
+    print(
+        f"{'what acts':10s} {'moments':>8s} {'close':>6s} {'held':>6s} "
+        f"{'missed':>7s} {'others':>7s}"
+    )
     for number, kind in enumerate(KINDS):
         counts: Counter[str] = Counter()
         began = clock.process_time()
-        for k in range(given.count):
+        for k in range(arguments.count):
             with threadpool_limits(1):
-                case = drawn(given.out / f"{kind}-{k}", kind, (given.seed, k, number))
+                case = drawn(arguments.out / f"{kind}-{k}", kind, (arguments.seed, k, number))
                 counts += counted(case, found_in(case))
         row = [counts[name] for name in ("moments", "close", "held", "missed", "others")]
-        took = (clock.process_time() - began) / given.count
+        took = (clock.process_time() - began) / arguments.count
         print(
             f"{kind:10s} {row[0]:8d} {row[1]:6d} {row[2]:6d} {row[3]:7d} {row[4]:7d}  {took:.1f} s",
             flush=True,

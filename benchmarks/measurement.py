@@ -1,4 +1,4 @@
-"""What a benchmark hands on: a measured figure beside its target and beside a reference of the same run."""
+"""Measured figures with their targets and references, and timers of function calls."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -45,7 +45,7 @@ class Measurement:
 
 
 def median_seconds(function: Callable[[], object], *, repeats: int = 15, inner: int = 1) -> float:
-    """Return the median wall-clock time of one call in seconds, over `repeats` batches of `inner` calls."""
+    """Return the median wall-clock seconds of one call, over `repeats` batches of `inner` calls."""
     function()
     times = []
     for _ in range(repeats):
@@ -59,7 +59,7 @@ def median_seconds(function: Callable[[], object], *, repeats: int = 15, inner: 
 def least_seconds(
     functions: Mapping[str, Callable[[], object]], *, repeats: int, inner: int
 ) -> dict[str, float]:
-    """Return the least time of one call of each function in seconds, over batches of `inner` calls in turns.
+    """Return the least seconds of one call of each function, over alternating batches of calls.
 
     On a busy machine the least of many short batches is one that nothing has interrupted.
     """

@@ -1,7 +1,7 @@
 """What the published ring-downs and loading runs of the real wing say about the wing model.
 
-`python -m benchmarks.study_real_wing DATA` investigates them with several windows of the ring-downs, and the
-loading runs alone. DATA is the authors' calibration folder.
+`python -m benchmarks.study_real_wing DATA` investigates them with several windows of the
+ring-downs, and the loading runs alone. DATA is the authors' calibration folder.
 """
 
 import argparse
@@ -33,22 +33,28 @@ def wing_campaign(data: Path, begin: float) -> Campaign:
 
 def report(found: Investigation, table: Table, label: str) -> None:
     proof = found.proof
-    scores = [] if proof is None else [item for item in (proof.held_out_before, proof.held_out_after) if item]
+    scores = (
+        []
+        if proof is None
+        else [item for item in (proof.held_out_before, proof.held_out_after) if item]
+    )
     rms = " to ".join(f"{1e3 * score.rms[SIGNAL]:.3f}" for score in scores if SIGNAL in score.rms)
     chi = " to ".join(f"{score.chi_square_per_sample:.2f}" for score in scores)
     table.add_row(label, found.verdict.kind.value, found.verdict.sentence, rms, chi)
 
 
 def alone(runs: Sequence[Investigation], begins: Sequence[float]) -> Table:
-    """Return what single effects and their families leave and how probable they make the data, by window."""
-    table = Table("one effect alone", *(f"ln evidence from {begin:g} s" for begin in begins), "left, uV")
+    """Return unexplained error and log evidence of single effects and their families, by window."""
+    table = Table(
+        "one effect alone", *(f"ln evidence from {begin:g} s" for begin in begins), "left, uV"
+    )
     rows: dict[str, list[str]] = {}
     left: dict[str, str] = {}
     for number, found in enumerate(runs):
         if found.search is None or found.problem is None:
             continue
         best: dict[str, CandidateFit] = {}
-        for item in found.search.all().values():  # of all places the most probable
+        for item in found.search.compared_fits().values():  # of all places the most probable
             label = " ".join(item.candidate.identifiers) or "none"
             if len(item.candidate.terms) < 2 and (
                 label not in best or found.search.score(best[label]) < found.search.score(item)
@@ -74,13 +80,16 @@ def alone(runs: Sequence[Investigation], begins: Sequence[float]) -> Table:
 
 
 def by_the_others(campaign: Campaign) -> dict[str, float]:
-    """Return what the mean of the other ring-downs leaves of each held-out one, rms in V, by its name.
+    """Return the rms [V] that the mean of other ring-downs leaves of each held-out one, by name.
 
-    No model: all releases are alike, so that the others predict a record as far as the wing repeats itself.
+    No model: all releases are alike, so that the others predict a record as far as the wing repeats
+    itself.
     """
     records = [trial for trial in campaign.trials if trial.is_dynamic]
     values = np.array([trial.values[:, 0] for trial in records])
-    left = (values * len(values) - values.sum(axis=0)) / (len(values) - 1)  # less the mean of the others
+    left = (values * len(values) - values.sum(axis=0)) / (
+        len(values) - 1
+    )  # less the mean of the others
     return {
         trial.name: float(np.sqrt((rest**2).mean()))
         for trial, rest in zip(records, left, strict=True)
@@ -89,15 +98,18 @@ def by_the_others(campaign: Campaign) -> dict[str, float]:
 
 
 def held_out_rms(campaign: Campaign, found: Investigation) -> str:
-    """Return what is left of each held-out trial: by the mean of the others, and by what was found."""
+    """Return the residual of each held-out trial: after the mean of the others, and of the fit."""
     fitted = () if found.after is None else found.after.trials
     ours = {
-        item.trial.name: float(np.sqrt((item.residual[:, item.trial.channels.index(SIGNAL)] ** 2).mean()))
+        item.trial.name: float(
+            np.sqrt((item.residual[:, item.trial.channels.index(SIGNAL)] ** 2).mean())
+        )
         for item in fitted
         if item.trial.held_out and SIGNAL in item.trial.channels
     }
     return ", ".join(
-        f"{name} {1e6 * rms:.1f} uV by the others, {1e6 * ours.get(name, float('nan')):.1f} uV by the model"
+        f"{name} {1e6 * rms:.1f} uV by the others, "
+        f"{1e6 * ours.get(name, float('nan')):.1f} uV by the model"
         for name, rms in by_the_others(campaign).items()
     )
 
@@ -105,22 +117,24 @@ def held_out_rms(campaign: Campaign, found: Investigation) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
-    parser.add_argument("--begin", type=float, nargs="+", default=BEGINS, help="windows of the ring-downs, s")
-    given = parser.parse_args()
+    parser.add_argument(
+        "--begin", type=float, nargs="+", default=BEGINS, help="windows of the ring-downs, s"
+    )
+    arguments = parser.parse_args()
     model = WingModel.of_design()
     table = Table("records", "verdict", "", "held out: rms, mV", "χ²/dof")
     console = Console(width=160)
     runs = []
-    for begin in given.begin:
-        campaign = wing_campaign(given.data, begin)
+    for begin in arguments.begin:
+        campaign = wing_campaign(arguments.data, begin)
         runs.append(investigate(campaign, model))
         console.print(f"From {begin:g} s, held-out trials, rms: {held_out_rms(campaign, runs[-1])}")
         report(runs[-1], table, f"all, ring-downs from {begin:g} s")
     console.print(table)
-    console.print(alone(runs, given.begin))
+    console.print(alone(runs, arguments.begin))
     first = runs[0]
     table = Table("records", "verdict", "", "held out: rms, mV", "χ²/dof")
-    whole = wing_campaign(given.data, BEGINS[0])
+    whole = wing_campaign(arguments.data, BEGINS[0])
     still = replace(
         whole,
         channels={name: channel for name, channel in whole.channels.items() if name != SIGNAL},
@@ -132,7 +146,9 @@ def main() -> int:
     console.print("Loading runs alone:", static.verdict.probability)
     for row in static.verdict.hypotheses[:6]:
         console.print(
-            [effect.identifier for effect in row.effects], f"{row.probability:.3f}", f"{row.chi_square:.1f}"
+            [effect.identifier for effect in row.effects],
+            f"{row.probability:.3f}",
+            f"{row.chi_square:.1f}",
         )
     if first.location is not None:
         for item in first.location.disagreements:

@@ -50,8 +50,10 @@ high = 10.0
 def tank_setting() -> Setting:
     """Return a driven trial of a tank as it is, without noise."""
     model = LumpedModel(LumpedDescription.parse(tomllib.loads(MODEL)))
-    time = np.arange(0.0, 300.0, 2.0)
-    pump = RecordedInput("pump", Quantity.FLOW, 0.15 * (np.sin(0.04 * time) > 0.0), Hold.ZERO_ORDER)
+    time = np.arange(0.0, 300.0, 2.0, dtype=np.float64)
+    pump = RecordedInput(
+        "pump", Quantity.FLOW, np.where(np.sin(0.04 * time) > 0.0, 0.15, 0.0), Hold.ZERO_ORDER
+    )
     trial = Trial.plain(
         "filled and drained", TrialKind.DRIVEN, ("level",), time, begins=Start.STILL, inputs=(pump,)
     )

@@ -1,8 +1,9 @@
-"""The recorded mission that is shipped: a gauge comes loose, then skin softens where the twin has no region.
+"""Record the shipped mission: a gauge comes loose, then skin softens outside the regions.
 
-`python -m benchmarks.watched_wing` makes `scenarios/recordings/watched_wing.csv` again, bit for bit from its
-seed. The wing is the full finite element model with a third region and an e of its own; the controls are
-those of the twin of the scenario `watched_wing`, which sees nothing but the gauges.
+`python -m benchmarks.watched_wing` makes `scenarios/recordings/watched_wing.csv` again, bit for bit
+from its seed. The wing is the full finite element model with a third region and an e of its own;
+the controls are those of the twin of the scenario `watched_wing`, which sees nothing but the
+gauges.
 """
 
 from functools import cache
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
+from fe.structure.affine import static_response
 from fe.wing.design import load_design
-from fe.wing.operators import assemble, solve_static
+from fe.wing.operators import assemble, wing_values
 from reporting.files import atomic_write_text
 from scenarios import RECORDING_FOLDER
 from twin_master.assets.asset_source import AssetReading, StatelessAsset
@@ -30,10 +32,15 @@ YOUNG_MODULUS_FACTOR = 0.97
 NOISE = 150e-6
 THIRD_REGION = {"span_start": 0.5, "span_end": 0.9, "chord_start": 0.03, "chord_end": 0.6}
 """Upper skin between the two regions of the twin's model [m, fraction of the chord]."""
-LOOSE_GAUGE, LOOSE_FROM, LOOSER, LOOSEST = 4, 10, 0.1, 0.3
+LOOSE_GAUGE = 4
+LOOSE_FROM = 10
+LOOSER = 0.1
+LOOSEST = 0.3
 """Gauge, first turn, and the gain that it loses in each turn until it has lost so much."""
-SOFT_FROM, SOFTER, SOFTEST = 25, 0.025, 0.3
-"""First turn, and the stiffness that the third region loses in each turn until it has lost so much."""
+SOFT_FROM = 25
+SOFTER = 0.025
+SOFTEST = 0.3
+"""First turn, loss of stiffness of the third region per turn, and its largest loss."""
 DAMAGE = {"z1": {20: 0.2}, "z2": {5: 0.2}}
 """Losses of the two regions of the model, from a turn on."""
 
@@ -49,7 +56,8 @@ class _Wing:
         self._strain = cache(self._solved)
 
     def _solved(self, health: tuple[float, ...]) -> Float:
-        return np.asarray(solve_static(self._operators, YOUNG_MODULUS_FACTOR, health, 1.0).strain)
+        values = wing_values(self._operators, YOUNG_MODULUS_FACTOR, health, load_factor=1.0)
+        return static_response(self._operators, values).strain
 
     def observe(self, control: object, health: object) -> AssetReading:
         """Return the strains of the next turn."""
@@ -74,9 +82,13 @@ def recorded() -> str:
     table["mission"] |= {"steps": TURNS, "seed": SEED}
     table["truth"] = {"kind": "scripted", "gains": gains, "noise": {"standard_deviation": NOISE}}
     scenario = type(loaded).model_validate(table)
-    knowledge = prepare_knowledge(scenario, ReducedModelSource(scenario, reduced_model(load_design())), SEED)
+    knowledge = prepare_knowledge(
+        scenario, ReducedModelSource(scenario, reduced_model(load_design())), SEED
+    )
     flight = fly(
-        scenario, knowledge.twin(), knowledge.plant(knowledge.truth(SEED), StatelessAsset(_Wing().observe))
+        scenario,
+        knowledge.twin(),
+        knowledge.plant(knowledge.truth(SEED), StatelessAsset(_Wing().observe)),
     )
     lines = ["turn,control," + ",".join(f"strain_{g}_microstrain" for g in range(1, 25))]
     for turn, (row, control) in enumerate(zip(flight.observed, flight.control_index, strict=True)):

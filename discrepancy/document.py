@@ -62,7 +62,7 @@ def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
     """Return the JSON Schema of one kind of primitive, from its own fields."""
     units = PRIMITIVE_UNITS[primitive.kind]
     columns: dict[str, Any] = {"kind": {"const": primitive.kind, "type": "string"}}
-    for name, kind in primitive.values().items():
+    for name, kind in primitive.value_types().items():
         columns[name] = {"type": _JSON_TYPES[kind]}
         if name in units:
             columns[name]["description"] = f"[{units[name]}]"
@@ -70,7 +70,7 @@ def _primitive_schema(primitive: type[Primitive]) -> dict[str, Any]:
         "type": "object",
         "title": primitive.__name__,
         "description": (primitive.__doc__ or "").split("\n")[0],
-        "properties": {**columns, **({"windows": _WINDOWS} if primitive.in_windows else {})},
+        "properties": {**columns, **({"windows": _WINDOWS} if primitive.can_act_in_windows else {})},
         "required": list(columns),
         "additionalProperties": False,
     }

@@ -14,7 +14,7 @@ from discrepancy.system.interface import Model
 from discrepancy.system.lumped_file import SHIPPED_MODELS
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.structures import StructureModel, WingModel
-from fe.reduction.model_cache import reduced_structure
+from fe.reduction.model_cache import reduced_model
 from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure, load_structure, structure_hash
 from fe.wing.design import SHIPPED_DESIGN, WingDesign
@@ -210,7 +210,7 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
 
 def _structure(path: Path, progress: Progress | None) -> ModelChoice:
     with ModelError.instead_of(FiniteElementError):
-        reduced = reduced_structure(path, progress=progress, with_ports=True)
+        reduced = reduced_model(path, progress=progress, with_ports=True)
         source_hash = structure_hash(load_structure(path), path.parent, with_ports=True)
     model = StructureModel(reduced)
     design_hash = reduced.design_hash

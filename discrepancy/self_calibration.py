@@ -26,11 +26,11 @@ from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Trial
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.document import Origin, plain
 from discrepancy.errors import DiscrepancyError, ModelError
-from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
-from discrepancy.judgement.separability import DETECTED, as_predicted, began_before, usable
+from discrepancy.judgement.separability import DETECTED, as_predicted, has_free_initial_state, usable_effects
 from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import checked, investigate
@@ -46,7 +46,7 @@ REFINEMENT = 2
 class Hidden:
     """An effect to hide: the term, its scaled parameters, its d^2."""
 
-    term: Term
+    term: EffectTerm
     normal: FloatArray
     distance: float
 
@@ -82,10 +82,10 @@ class Simulator:
         """Return a detectable draw of an effect's prior, or None if there was none."""
         places = effect.places(self.setting)
         for _ in range(TRIES):
-            term = Term(effect, places[int(generator.integers(len(places)))])
+            term = EffectTerm(effect, places[int(generator.integers(len(places)))])
             normal = generator.standard_normal(len(term.parameters))
             try:
-                size = screen.change(term, normal).size
+                size = screen.change(term, normal).squared_size
             except DiscrepancyError:  # more than the structure can carry
                 continue
             if size >= DETECTED:
@@ -109,7 +109,9 @@ class Simulator:
         trials: list[Trial] = []
         for number, data in enumerate(problem.trials):
             local = _drawn(self.found.local[number], data.unknowns.precision, generator)
-            if began_before(data.trial):  # whose prior has no information: the state stays as fitted
+            if has_free_initial_state(
+                data.trial
+            ):  # whose prior has no information: the state stays as fitted
                 initials = slice(*data.unknowns.ends[:2])
                 local[initials] = self.found.local[number][initials]
             acts = data.trial.kind in candidate.acts_on
@@ -313,7 +315,7 @@ def self_calibrate(
     """
     campaign, _ = checked(campaign, model)
     simulator = Simulator(campaign, model)
-    testable = usable(effects, simulator.setting)
+    testable = usable_effects(effects, simulator.setting)
     screen = simulator.screen()
     root = np.random.SeedSequence(seed)
     drawing, *own = root.spawn(count + 1)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from discrepancy.document import Origin, write_document
-from discrepancy.judgement.conclusion import hypothesis
+from discrepancy.judgement.conclusion import hypothesis_record
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import Hypothesis
 
@@ -63,7 +63,7 @@ class SearchInProgress:
             return ()
         probabilities = list(self.search.set_probabilities().items())[:MOST_HYPOTHESES]
         return tuple(
-            hypothesis(self.search.problem, self.search.best_of(identifiers), probability)
+            hypothesis_record(self.search.problem, self.search.best_of(identifiers), probability)
             for identifiers, probability in probabilities
         )
 

@@ -20,22 +20,22 @@ from discrepancy.checks.model_check import check_against_model
 from discrepancy.checks.outliers import mark_outliers, wrong_ends
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError, said
-from discrepancy.fits.beginnings import refitted_from_beginnings
+from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
-from discrepancy.fits.gates import solver_share
+from discrepancy.fits.gates import time_step_error
 from discrepancy.fits.predictive import held_out_fit, residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import (
     NO_GAP,
     calibrated_parameters,
-    dated,
     look_alike_remark,
+    with_date,
     with_untested,
 )
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
-from discrepancy.judgement.naming import name
+from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
 from discrepancy.location.locate import Location, locate, outlier_remarks
@@ -44,9 +44,9 @@ from discrepancy.missing_force.shares import MissingForce, seen_force
 from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
 from discrepancy.model_choice import load_model
 from discrepancy.proof_record import Proof
-from discrepancy.search.starts import Tell
+from discrepancy.search.starts import OnProgress
 from discrepancy.search.strategy import Search
-from discrepancy.search.whole_search import OnSearch, nobody_looks
+from discrepancy.search.whole_search import OnSearch, ignore_search
 from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
@@ -117,7 +117,7 @@ def investigate(
     seed: int = 0,
     thorough: bool = True,
     progress: Progress | None = None,
-    on_search: OnSearch = nobody_looks,
+    on_search: OnSearch = ignore_search,
 ) -> Investigation:
     """Find out what a model lacks.
 
@@ -153,7 +153,7 @@ def investigate(
     shown, seconds = reporter(progress), {}
 
     @contextmanager
-    def stage(description: str, key: str) -> Iterator[Tell]:
+    def stage(description: str, key: str) -> Iterator[OnProgress]:
         began = time.perf_counter()
         with shown.stage(description) as under_way:
             yield lambda what: under_way.advance(0, what)
@@ -171,16 +171,16 @@ def investigate(
         problem = without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
-        verdict, search, fit = name(problem, catalogue, tell=tell, on_search=on_search)
+        verdict, search, fit = reach_verdict(problem, catalogue, on_progress=tell, on_search=on_search)
         verdict = with_untested(verdict, setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
-        share = solver_share(problem, fit)
+        share = time_step_error(problem, fit)
         if share > SEARCH.solver_share:
             remarks.append(said("remarks.time_steps", share=share, wanted=SEARCH.solver_share))
     with stage("Residuals", "residuals"):
-        before = residual_set(problem, search.none, sensitivities=thorough)
-        after = residual_set(problem, fit, sensitivities=False) if fit is not search.none else before
+        before = residual_set(problem, search.no_effect, sensitivities=thorough)
+        after = residual_set(problem, fit, sensitivities=False) if fit is not search.no_effect else before
     location, missing, proof = None, None, None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
@@ -194,7 +194,7 @@ def investigate(
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP and not verdict.unfitted:
         with stage("Seeing the missing force", "force"):
-            missing = seen_force(problem, search.force, search.forces, fit)
+            missing = seen_force(problem, search.force_search, search.force_hypotheses, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, effects=added_effects(fit), seed=seed)
@@ -203,9 +203,9 @@ def investigate(
         with stage("Looking for the next experiment", "next"):
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
-        verdict, sentence=dated(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
+        verdict, sentence=with_date(verdict, windows), remarks=tuple(remarks), next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search), windows=windows,
-        parameters=calibrated_parameters(problem, fit), force=None if missing is None else missing.told,
+        parameters=calibrated_parameters(problem, fit), force=None if missing is None else missing.at_port,
     )  # fmt: skip
     return Investigation(
         campaign, model, faults, verdict, location, proof, before, after, problem, search, fit, seconds,
@@ -226,7 +226,7 @@ def _remarks(
     """Return what has to be said beside a verdict."""
     remarks = [*problem.campaign.remarks, *strained(problem, fit), *without_port(problem.setting, catalogue)]
     if verdict.kind not in NO_GAP:
-        remarks += exact_sensor_remarks(problem, search.none)
+        remarks += exact_sensor_remarks(problem, search.no_effect)
     alike = look_alike_remark(verdict, search.effects)
     remarks += [] if alike is None else [alike]
     if not problem.model.parameters:
@@ -276,7 +276,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     The model as it is need not fit: see `outliers.wrong_ends`.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    none = refitted_from_beginnings(problem, fit_to(problem, Candidate(), problem.start(Candidate())))
+    none = refit_from_first_readings(problem, fit_to(problem, Candidate(), problem.start(Candidate())))
     fits = [(problem, none)]
     if problem.campaign.held_out:
         fits.append(held_out_fit(problem, none))
@@ -338,14 +338,14 @@ def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
 
 def not_fitted(setting: Setting, effects: Sequence[Effect], search: Search) -> tuple[NotFitted, ...]:
     """Return the effects of a catalogue that were not fitted, each with the reason."""
-    along = {term.effect.identifier for item in search.forces for term in item.candidate.terms}
-    fitted, rows = search.fitted() | along, []
+    along = {term.effect.identifier for item in search.force_hypotheses for term in item.candidate.terms}
+    fitted, rows = search.fitted_effects() | along, []
     for effect in effects:
         unavailable = effect.unavailable(setting)
         if unavailable is not None:
             rows.append(NotFitted(effect.identifier, unavailable))
         elif effect.identifier not in fitted:
-            gain = search.promised.get(effect.identifier, nan)
+            gain = search.screened_gains.get(effect.identifier, nan)
             why = said("remarks.screened_out", gain=gain)
             cause = search.problem.refusals.get(effect.identifier)
             if cause is not None and not 0.0 < gain < SEARCH.worth_fitting:

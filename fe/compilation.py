@@ -16,7 +16,7 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numpy as np
 
 from fe.reduction.built_once import cache_folder
-from fe.runtime import laws, motion_arrays, motion_kernel, static_path
+from fe.runtime import dry_friction, laws, motion_arrays, motion_kernel, static_path
 from fe.runtime.motion import Kernel
 from reporting.progress import note
 
@@ -165,7 +165,8 @@ def _functions_of(module: ModuleType) -> list[NumericalFunction]:
 def law_functions() -> tuple[NumericalFunction, ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
     implementations = {
-        choice: laws.answers(choice.__name__) for choice in (laws.advance, laws.pull)
+        choice: laws.functions_by_law(choice.__name__)
+        for choice in (laws.advance, laws.force_and_slope)
     }
     functions: list[NumericalFunction] = []
     for module in laws.MODULES:
@@ -220,13 +221,20 @@ def compiled_kernel() -> Kernel:
 
     The functions of `fe.runtime` stay plain; compiled functions can call them from then on.
     """
-    inner_functions = {*_functions_of(motion_arrays), *_functions_of(motion_kernel)}
+    inner_functions = {
+        *_functions_of(motion_arrays),
+        *_functions_of(dry_friction),
+        *_functions_of(motion_kernel),
+    }
     inner_functions.remove(motion_kernel.integrate)
     for function in inner_functions:
         callable_when_compiled(function, makes_arrays=False, inline=True)
-    callable_when_compiled(static_path.settle_port, makes_arrays=False)
-    callable_when_compiled(static_path.static_forces)
-    called_functions = (*law_functions(), *inner_functions, static_path.settle_port)
+    static_functions = {*_functions_of(static_path)}
+    static_functions.remove(static_path.static_path)
+    functions_with_arrays = {static_path.static_forces, static_path.solve_static_position}
+    for function in static_functions:
+        callable_when_compiled(function, makes_arrays=function in functions_with_arrays)
+    called_functions = (*law_functions(), *inner_functions, *static_functions)
     integrate = compiled(motion_kernel.integrate, called_functions)
     follow_static_path = compiled(static_path.static_path, called_functions)
     return Kernel(integrate, follow_static_path)

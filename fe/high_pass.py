@@ -10,7 +10,7 @@ from scipy.special import hyp1f1, rgamma
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import HighPass
-from fe.runtime.sensors import SensorRecord, held_before
+from fe.runtime.sensors import SensorRecord, levels_before_record
 
 _ASYMPTOTIC_FROM = 700.0
 """Above this u the asymptotic series of 1F1 is used: exp(-u) is nothing beside powers of u."""
@@ -56,7 +56,7 @@ def filtered_record(
     signal = _interpolated(grid, time, signal)
     slope = _interpolated(grid, time, slope)
     # signal
-    held = held_before(high_pass_filter, record, signal[0])
+    held = levels_before_record(high_pass_filter, record, signal[0])
     filtered = high_pass(signal, interval, time_constant, high_pass_filter.order, held)
     # rate; each of several whole stages obeys y' = x' - y / tau
     is_whole_order = high_pass_filter.order == int(high_pass_filter.order)

@@ -28,8 +28,8 @@ from tests.refusals import Inputs
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
     from fe.reduction.reduced_basis import Reduction
+    from fe.runtime.patch_arrays import PatchArrays
     from fe.runtime.reduced import ReducedModel
-    from fe.runtime.wing_rows import PatchArrays
     from fe.structure.operators import Structure
     from fe.wing.design import WingDesign
     from fe.wing.operators import AffineOperators

@@ -8,19 +8,21 @@ from numpy.typing import NDArray
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import Losses
 from fe.runtime.transient import ModalIntegrator
-from fe.wing.operators import ROOT_UNKNOWNS, AffineOperators, AffineWing, solve_static, upward
+from fe.structure.affine import static_response
+from fe.wing.operators import ROOT_UNKNOWNS, AffineOperators, AffineWing, upward, wing_values
 
 
 def wing_integrator(
     model: ReducedModel, *, damping_alpha: float, damping_beta: float, **values: Any
 ) -> ModalIntegrator:
     """Return the integrator at values by name, the losses together as `stiffness_loss`."""
-    return ModalIntegrator(model, model.vector(**values), damping_alpha, damping_beta)
+    return ModalIntegrator(model.structure_at(model.vector(**values)), damping_alpha, damping_beta)
 
 
 def tip_stiffness(wing: AffineWing, young_modulus_factor: float = 1.0, loss: Losses = ()) -> float:
     """Stiffness [N/m] of the static test of the full wing: force near the tip over the displacement there."""
-    found = solve_static(wing, young_modulus_factor, loss, load_factor=0.0, tip_force=1.0)
+    values = wing_values(wing, young_modulus_factor, loss, load_factor=0.0, tip_force=1.0)
+    found = static_response(wing, values)
     return 1.0 / float(wing.load_tip @ found.displacement)
 
 

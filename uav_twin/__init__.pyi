@@ -9,14 +9,12 @@ from discrepancy.files.verdict import read_verdict as read_verdict
 from discrepancy.model_choice import load_model as load_model
 from discrepancy.workflow import investigate as investigate
 from fe.reduction.model_cache import reduced_model as reduced_model
-from fe.reduction.model_cache import reduced_structure as reduced_structure
 from fe.structure.affine import natural_frequencies as natural_frequencies
+from fe.structure.affine import static_response as static_response
 from fe.structure.affine import static_responses as static_responses
-from fe.structure.operators import assemble_structure as assemble_structure
 from fe.wing.design import load_design as load_design
 from fe.wing.operators import assemble as assemble
-from fe.wing.operators import eigenmodes as eigenmodes
-from fe.wing.operators import solve_static as solve_static
+from fe.wing.operators import flapwise_bending_modes as flapwise_bending_modes
 from fmu_asset.door.session import FmiAsset as FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
 from scenarios import structure_files as structure_files

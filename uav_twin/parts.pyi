@@ -75,7 +75,6 @@ from discrepancy.verdict_so_far import write_so_far as write_so_far
 from discrepancy.workflow import checked as checked
 from discrepancy.workflow import investigate as investigate
 from fe.reduction.model_cache import reduced_model as reduced_model
-from fe.reduction.model_cache import reduced_structure as reduced_structure
 from fe.reduction.model_cache import wing_fields as wing_fields
 from fe.reduction.model_cache import write_modes_vtu as write_modes_vtu
 from fe.reduction.model_cache import write_wing_vtu as write_wing_vtu
@@ -89,7 +88,6 @@ from fe.structure.design import is_structure as is_structure
 from fe.structure.design import load_structure as load_structure
 from fe.structure.mesh_file import memory_estimate as memory_estimate
 from fe.structure.operators import Structure as Structure
-from fe.structure.operators import assemble_structure as assemble_structure
 from fe.structure.operators import load_and_assemble as load_and_assemble
 from fe.structure.operators import mass_and_centre as mass_and_centre
 from fe.structure.operators import write_structure_vtu as write_structure_vtu
@@ -100,6 +98,7 @@ from fe.verification.calculix_run import required_calculix as required_calculix
 from fe.verification.wing_checks import Check as Check
 from fe.verification.wing_checks import all_checks as all_checks
 from fe.wing.design import load_design as load_design
+from fe.wing.operators import assemble as assemble
 from fe.wing.operators import structural_mass as structural_mass
 from fmu_asset.archive.declared import VariableInfo as VariableInfo
 from fmu_asset.archive.declared import describe_fmu as describe_fmu

@@ -106,7 +106,7 @@ def assembled(
 def assembled_of_any(file: Path, memory_limit: float | None) -> "parts.AffineStructure":
     """Return the full model of a mesh or of matrices."""
     with stage("Reading and assembling"):
-        return parts.assemble_structure(located(file), in_bytes(memory_limit))
+        return parts.assemble(located(file), in_bytes(memory_limit))
 
 
 def info(file: Path, *, modes: int = 6, memory_limit: float | None = None, json: bool = False) -> None:
@@ -266,7 +266,7 @@ def field(
 
 def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, json: bool = False) -> None:
     """Make the reduced model of a structure, keep it in the cache, and measure its errors."""
-    model, errors = parts.reduced_structure(located(file), memory_limit=in_bytes(memory_limit)), None
+    model, errors = parts.reduced_model(located(file), memory_limit=in_bytes(memory_limit)), None
     if states:
         structure = assembled_of_any(file, memory_limit)
         with stage("Comparing it with the full model"):
@@ -320,7 +320,7 @@ def fmu(
     if rig is not None:
         use = f"the model of `uav-twin calibrate campaign` and `discrepancy run CAMPAIGN --model {rig}`"
         others.append((rig, parts.rig_text(design, relpath(target, rig.parent)), use))
-    model = parts.reduced_structure(source, memory_limit=in_bytes(memory_limit))
+    model = parts.reduced_model(source, memory_limit=in_bytes(memory_limit))
     show("packed", info=parts.build_fmu(model, target, kind=kind, fmi=version, replace=replace))
     for path, text, what in others:
         atomic_write_text(path, text)

@@ -1,4 +1,4 @@
-"""Make sealed campaigns, or score verdicts on them: `python -m benchmarks.blind generate|score --out DIR`.
+"""Make sealed campaigns or score verdicts: `python -m benchmarks.blind generate|score --out DIR`.
 
 DIR/campaigns/<case>/   campaign.toml, CSV files; model.toml where the structure is the lumped rig
 DIR/leave_out.json      effects that whoever names must leave out of the catalogue, by case
@@ -56,12 +56,16 @@ def generate(arguments: argparse.Namespace) -> int:
         wanted = [order for order in wanted if set(order.identifiers) & set(arguments.effects)]
     arguments.out.mkdir(parents=True, exist_ok=True)
     leave_out = {order.name: list(order.identifiers) for order in wanted if order.kind == "outside"}
-    (arguments.out / "leave_out.json").write_text(json.dumps(leave_out, indent=1) + "\n", encoding="utf-8")
+    (arguments.out / "leave_out.json").write_text(
+        json.dumps(leave_out, indent=1) + "\n", encoding="utf-8"
+    )
     begin = time.perf_counter()
     if any(order.rig == "wing" for order in wanted):
         _build_region(arguments.cache, -1)
     with ProcessPoolExecutor(arguments.jobs) as pool:
-        if any(order.rig == "wing" and "local_stiffness_loss" in order.identifiers for order in wanted):
+        if any(
+            order.rig == "wing" and "local_stiffness_loss" in order.identifiers for order in wanted
+        ):
             list(pool.map(partial(_build_region, arguments.cache), range(len(REGION_LINES))))
         prepared = time.perf_counter() - begin
         made = pool.map(partial(_make, arguments.out, arguments.cache), wanted, chunksize=2)
@@ -69,8 +73,8 @@ def generate(arguments: argparse.Namespace) -> int:
             pass
     elapsed = time.perf_counter() - begin
     console.print(
-        f"{len(wanted)} campaigns in {elapsed:.0f} s, {prepared:.0f} s of them to prepare the wing, "
-        f"in {arguments.out}"
+        f"{len(wanted)} campaigns in {elapsed:.0f} s, {prepared:.0f} s of them to prepare the "
+        f"wing, in {arguments.out}"
     )
     return 0
 
@@ -87,19 +91,25 @@ def score(arguments: argparse.Namespace) -> int:
 
 
 def main(arguments: list[str]) -> int:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.blind", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.blind", description=__doc__.splitlines()[0]
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     make = commands.add_parser("generate", help="make campaigns with hidden effects")
     make.add_argument("--out", type=Path, required=True, help="folder to write to")
     make.add_argument("--count-per-effect", type=int, default=8, help="cases of each effect")
     make.add_argument("--nulls", type=int, default=300, help="cases with nothing hidden")
     make.add_argument("--pairs", type=int, default=60, help="cases with two effects")
-    make.add_argument("--outside", type=int, default=3, help="cases of each effect that is left out")
+    make.add_argument(
+        "--outside", type=int, default=3, help="cases of each effect that is left out"
+    )
     make.add_argument("--traps", type=int, default=4, help="cases of each trap")
     make.add_argument("--seed", type=int, default=1)
     make.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS))
     make.add_argument("--rigs", nargs="+", choices=("wing", "lumped"), default=["wing", "lumped"])
-    make.add_argument("--effects", nargs="+", default=[], help="make only campaigns that hide one of these")
+    make.add_argument(
+        "--effects", nargs="+", default=[], help="make only campaigns that hide one of these"
+    )
     make.add_argument("--jobs", type=int, default=2, help="processes")
     make.add_argument("--cache", type=Path, default=None, help="where the projected wing is kept")
     make.set_defaults(run=generate)

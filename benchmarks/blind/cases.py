@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
@@ -16,7 +16,15 @@ from benchmarks.blind import traps
 from benchmarks.blind.changes import Changes
 from benchmarks.blind.detectability import Reference, reference
 from benchmarks.blind.effects import DRAWS, LUMPED, Bench, Hidden, Scale
-from benchmarks.blind.instruments import Chance, Measured, Rig, Signals, draw_chance, measure, true_signals
+from benchmarks.blind.instruments import (
+    Chance,
+    Measured,
+    Rig,
+    Signals,
+    draw_chance,
+    measure,
+    true_signals,
+)
 from benchmarks.blind.lumped_rig import SPRINGS, LumpedRig, lumped_campaign
 from benchmarks.blind.plan import CampaignPlan
 from benchmarks.blind.wing_basis import REGION_LINES, WingBasisStore
@@ -35,7 +43,7 @@ NOT_TOGETHER = (
     frozenset({"joint_micro_slip", "bouc_wen_hysteresis"}),
     frozenset({"gauge_gain", "gauge_misalignment"}),
 )
-"""Pairs that are not drawn: together they act as one, or their forces could not be told apart at all."""
+"""Pairs that are not drawn, because no campaign can distinguish the two from one effect."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +83,12 @@ class Case:
 class Workbench:
     """A rig with its campaign plan and its scales."""
 
-    def __init__(self, rig: Rig, plan: CampaignPlan, make_bench: Callable[[Workbench], Bench]) -> None:
-        self.rig, self.plan, self._make_bench = rig, plan, make_bench
+    def __init__(
+        self, rig: Rig, plan: CampaignPlan, make_bench: Callable[[Workbench], Bench]
+    ) -> None:
+        self.rig = rig
+        self.plan = plan
+        self._make_bench = make_bench
 
     @cached_property
     def mean(self) -> Chance:
@@ -195,7 +207,7 @@ def _lumped_bench(work: Workbench) -> Bench:
 
 @cache
 def workbench(rig: str, folder: Path | None = None) -> Workbench:
-    """Return the workbench of a rig; the wing's full model is projected once and kept in `folder`."""
+    """Return the workbench of a rig; the projection of the full wing is cached in `folder`."""
     if rig == "lumped":
         return Workbench(LumpedRig(), lumped_campaign(), _lumped_bench)
     wing = WingRig(WingBasisStore(folder))
@@ -228,7 +240,7 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
 
 
 def finite_signals(work: Workbench, chance: Chance, changes: Changes) -> Signals | None:
-    """Return what channels without noise show, or None where motion runs away or nothing holds a load."""
+    """Return readings without noise, None if it diverges or a load has no equilibrium."""
     try:
         with np.errstate(invalid="ignore", over="ignore"):
             signals = true_signals(work.rig, work.plan, chance, changes)
@@ -241,7 +253,9 @@ def finite_signals(work: Workbench, chance: Chance, changes: Changes) -> Signals
 def _drawn(
     identifiers: tuple[str, ...], work: Workbench, generator: np.random.Generator, known: Reference
 ) -> tuple[list[Hidden], Changes, list[float]]:
-    hidden, distances, changes = [], [], Changes()
+    hidden = []
+    distances = []
+    changes = Changes()
     for identifier in identifiers:
         for _ in range(ATTEMPTS):
             effect = DRAWS[identifier](generator, work.bench)
@@ -281,7 +295,7 @@ def _trap(
     order: Order, work: Workbench, generator: np.random.Generator, chance: Chance, known: Reference
 ) -> Case:
     trap = traps.TRAPS[order.trap]
-    drawn = trap.draw(generator, work.bench)
+    drawn: Sequence[Hidden] = trap.draw(generator, work.bench)
     changes = Changes()
     for effect in drawn:
         changes = changes.with_other(effect.changes)
@@ -301,15 +315,25 @@ def _trap(
     if trap.free_phase:
         signals = traps.with_free_phase(generator, work.plan, signals, changes)
     measured = measure(
-        generator, work.plan, signals, changes, correlation=trap.correlation, noise_factor=trap.noise_factor
+        generator,
+        work.plan,
+        signals,
+        changes,
+        correlation=trap.correlation,
+        noise_factor=trap.noise_factor,
     )
     plan = work.plan
     if trap.spoil is not None:
         plan, measured = trap.spoil(generator, plan, measured)
     truth = _truth(
-        order, list(drawn), distances, chance,
-        trap=order.trap, accepted=list(trap.accepted), no_record=trap.no_record,
-    )  # fmt: skip
+        order,
+        list(drawn),
+        distances,
+        chance,
+        trap=order.trap,
+        accepted=list(trap.accepted),
+        no_record=trap.no_record,
+    )
     return Case(order, plan, measured, truth)
 
 
@@ -328,7 +352,8 @@ def orders(
     Parameters
     ----------
     count_per_effect : int
-        In-catalogue cases of each effect; effects that the lumped rig can hide are on it every other time.
+        In-catalogue cases of each effect; effects that the lumped rig can hide are on it every
+        other time.
     nulls, pairs : int
         Cases with nothing and with two effects.
     outside : int

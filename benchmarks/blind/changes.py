@@ -15,9 +15,10 @@ class Fault:
     Attributes
     ----------
     kind : str
-        "gain" (relative), "drift" (amplitude [channel's unit] over the campaign, exponent), "rotation" [rad],
-        "thermal" [channel's unit per K], "high_pass" [s], "line" (Hz, cosine, sine [channel's unit]),
-        "mode" (Hz, damping ratio, cosine, sine [channel's unit per unit of release amplitude]), "offset".
+        "gain" (relative), "drift" (amplitude [channel's unit] over the campaign, exponent),
+        "rotation" [rad], "thermal" [channel's unit per K], "high_pass" [s], "line" (Hz, cosine,
+        sine [channel's unit]), "mode" (Hz, damping ratio, cosine, sine [channel's unit per unit of
+        release amplitude]), "offset".
     channels : tuple of str
         Names of the channels.
     numbers : tuple of float

@@ -1,9 +1,9 @@
 """How far a hidden effect stands out of the noise when everything else is fitted again.
 
-d^2 is the least sum of squared differences, over noise, between the signals with the effect and those of
-the nominal structure whose calibrated parameters, gains, zeros and release amplitudes may move as their
-priors let them: twice the log likelihood ratio that the data could at best show. Levenberg-Marquardt, with
-new derivatives where the old ones no longer help.
+d^2 is the least sum of squared differences, over noise, between the signals with the effect and
+those of the nominal structure whose calibrated parameters, gains, zeros and release amplitudes may
+move as their priors let them: twice the log likelihood ratio that the data could at best show.
+Levenberg-Marquardt, with new derivatives where the old ones no longer help.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,8 @@ class Reference:
     nominal : Signals
         Without an effect.
     matrix : (n, k)
-        Whitened, zeros projected out: parameters, gains, release amplitudes, each per prior deviation.
+        Whitened, zeros projected out: parameters, gains, release amplitudes, each per prior
+        deviation.
     normal : (k, k)
         Its normal matrix with the prior.
     """
@@ -50,10 +51,13 @@ class Reference:
     def distance(self, signals: Signals) -> float:
         """Return d^2 of signals: the least cost that Levenberg-Marquardt finds.
 
-        It begins at the truth or where another value of the first parameter, which scales the stiffness, fits
-        better: out of phase, a record says nothing about its frequency.
+        It begins at the truth or where another value of the first parameter, which scales the
+        stiffness, fits better: out of phase, a record says nothing about its frequency.
         """
-        matrix, normal, fresh, damping = self.matrix, self.normal, True, 0.0
+        matrix = self.matrix
+        normal = self.normal
+        fresh = True
+        damping = 0.0
         moved = np.zeros(self.matrix.shape[1])
         residual = self._residual(signals, moved)
         cost = float(residual @ residual)
@@ -63,21 +67,30 @@ class Reference:
             after = self._residual(signals, there)
             reached = float(after @ after + first**2)
             if reached < cost:
-                moved, residual, cost, fresh = there, after, reached, False
+                moved = there
+                residual = after
+                cost = reached
+                fresh = False
         if not fresh:
-            matrix, fresh = self._derivatives(moved), True
+            matrix = self._derivatives(moved)
+            fresh = True
             normal = matrix.T @ matrix + np.eye(len(moved))
         for _ in range(ITERATIONS):
             if cost < NEGLIGIBLE:
                 break
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), matrix.T @ residual - moved)
+            step = np.linalg.solve(
+                normal + damping * np.diag(np.diag(normal)), matrix.T @ residual - moved
+            )
             longest = float(np.abs(step[: len(self.plan.priors)]).max())
             there = moved + step * min(1.0, LONGEST / longest)
             after = self._residual(signals, there)
             reached = float(after @ after + there @ there)
             if reached < cost:
                 gain = 1.0 - reached / cost
-                moved, residual, cost, damping = there, after, reached, 0.1 * damping
+                moved = there
+                residual = after
+                cost = reached
+                damping = 0.1 * damping
                 if gain < SETTLED and fresh:
                     break
                 fresh = False
@@ -86,7 +99,8 @@ class Reference:
             elif fresh:
                 damping = max(10.0 * damping, 0.1)
                 continue
-            matrix, fresh = self._derivatives(moved), True
+            matrix = self._derivatives(moved)
+            fresh = True
             normal = matrix.T @ matrix + np.eye(len(moved))
         return cost
 
@@ -120,14 +134,15 @@ class Reference:
         rings = [t for t in plan.trials if t.kind == "ringdown"]
         first = len(plan.priors) + len(plan.channels)
         amplitude = {
-            t.name: self.chance.amplitude[t.name] * (1.0 + plan.release_deviation * moved[first + k])
+            t.name: self.chance.amplitude[t.name]
+            * (1.0 + plan.release_deviation * moved[first + k])
             for k, t in enumerate(rings)
         }
         return replace(self.chance, parameters=values, amplitude=amplitude)
 
 
 def whitened(plan: CampaignPlan, difference: Mapping[str, FloatArray]) -> FloatArray:
-    """Differences over noise (n,), all trials one after the other, the freedom of the zeros taken out."""
+    """Return differences over noise (n,) of all trials, orthogonal to the zeros of channels."""
     parts = []
     for trial in plan.trials:
         channels = [plan.channels[name] for name in trial.channels]
@@ -145,18 +160,24 @@ def reference(rig: Rig, plan: CampaignPlan, chance: Chance) -> Reference:
     """Return the nominal signals of a case and their derivatives."""
     nominal = true_signals(rig, plan, chance, Changes())
     matrix = _derivatives(rig, plan, chance, nominal)
-    return Reference(rig, plan, chance, nominal, matrix, matrix.T @ matrix + np.eye(matrix.shape[1]))
+    return Reference(
+        rig, plan, chance, nominal, matrix, matrix.T @ matrix + np.eye(matrix.shape[1])
+    )
 
 
 def _derivatives(rig: Rig, plan: CampaignPlan, chance: Chance, nominal: Signals) -> FloatArray:
-    """Return derivatives (n, k) by parameters, gains and release amplitudes, per prior deviation."""
+    """Return derivatives (n, k) by parameters, gains and amplitudes, per prior deviation."""
     columns = []
     for name, (_, deviation) in plan.priors.items():
         step = DIFFERENCE * deviation
-        moved = replace(chance, parameters={**chance.parameters, name: chance.parameters[name] + step})
+        moved = replace(
+            chance, parameters={**chance.parameters, name: chance.parameters[name] + step}
+        )
         other = true_signals(rig, plan, moved, Changes())
         columns.append(
-            whitened(plan, {t.name: (other[t.name] - nominal[t.name]) / DIFFERENCE for t in plan.trials})
+            whitened(
+                plan, {t.name: (other[t.name] - nominal[t.name]) / DIFFERENCE for t in plan.trials}
+            )
         )
     for channel in plan.channels.values():
         part = {
@@ -167,7 +188,8 @@ def _derivatives(rig: Rig, plan: CampaignPlan, chance: Chance, nominal: Signals)
     for ring in plan.trials:
         if ring.kind == "ringdown":
             part = {
-                t.name: nominal[t.name] * (plan.release_deviation if t is ring else 0.0) for t in plan.trials
+                t.name: nominal[t.name] * (plan.release_deviation if t is ring else 0.0)
+                for t in plan.trials
             }
             columns.append(whitened(plan, part))
     return np.array(columns).T

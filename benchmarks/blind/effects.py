@@ -1,9 +1,9 @@
 """Hidden effects: how large they are, what they change, and what is true of them.
 
-Identifiers are those of the package's catalogue; what is true is said with the names and SI units of the
-package's primitives ("<identifier>.<field>"), forces of power laws at unit speed [m/s, rad/s] and unit
-displacement [m, rad]. Where an effect acts otherwise than at a port, its truth is what gives the same
-energy or force in the first mode at each port, "<identifier>.<field>@<port>".
+Identifiers are those of the package's catalogue; what is true is said with the names and SI units
+of the package's primitives ("<identifier>.<field>"), forces of power laws at unit speed [m/s,
+rad/s] and unit displacement [m, rad]. Where an effect acts otherwise than at a port, its truth is
+what gives the same energy or force in the first mode at each port, "<identifier>.<field>@<port>".
 """
 
 from collections.abc import Callable, Mapping
@@ -24,7 +24,7 @@ JENKINS_COUNT = 48
 
 @dataclass(frozen=True)
 class Scale:
-    """Stiffness [N/m or N m/rad], largest motion [m or rad] and angular frequency [rad/s] at a port."""
+    """Stiffness [N/m, N m/rad], largest motion [m, rad] and angular frequency [rad/s] at a port."""
 
     port: str
     stiffness: float
@@ -46,7 +46,8 @@ class Bench:
     rig : str
         "wing" or "lumped".
     joint, free : Scale
-        Of the joint (its own spring), and of the place that moves most (the first mode's stiffness there).
+        Of the joint (its own spring), and of the place that moves most (the first mode's stiffness
+        there).
     gauges, dynamic : tuple of str
         Strain channels, and channels of ring-downs.
     dynamic_range : mapping of str to float
@@ -129,9 +130,10 @@ def point_mass(generator: np.random.Generator, bench: Bench) -> Hidden:
     mass = log_uniform(generator, 0.01, 0.3) * bench.modal_mass
     station = float(generator.uniform(0.35, 1.0)) * bench.length
     return Hidden(
-        "point_mass", Changes(mass=mass, mass_station=station),
+        "point_mass",
+        Changes(mass=mass, mass_station=station),
         {"point_mass.mass": mass, "point_mass.station": station},
-    )  # fmt: skip
+    )
 
 
 def root_compliance(generator: np.random.Generator, bench: Bench) -> Hidden:
@@ -181,7 +183,10 @@ def coulomb_friction(generator: np.random.Generator, bench: Bench) -> Hidden:
     force = log_uniform(generator, *ranges) * bench.joint.force
     law = Law(bench.joint.port, FRICTION, (force, 0.0))
     return Hidden(
-        "coulomb_friction", Changes(laws=(law,)), {"coulomb_friction.coefficient": force}, bench.joint.port
+        "coulomb_friction",
+        Changes(laws=(law,)),
+        {"coulomb_friction.coefficient": force},
+        bench.joint.port,
     )
 
 
@@ -200,7 +205,9 @@ def structural_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
 def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
     scale = bench.free
     ratio = log_uniform(generator, 0.002, 0.05)
-    at_free = ratio * 3.0 * np.pi * scale.stiffness / (4.0 * scale.displacement * scale.frequency**2)
+    at_free = (
+        ratio * 3.0 * np.pi * scale.stiffness / (4.0 * scale.displacement * scale.frequency**2)
+    )
     truth = "quadratic_damping.coefficient"
     if bench.line_shares is None or bench.line_motion is None or bench.port_motion is None:
         law = Law(scale.port, DRAG, (at_free,))
@@ -208,20 +215,25 @@ def quadratic_damping(generator: np.random.Generator, bench: Bench) -> Hidden:
     # Equal loss in the first mode.
     cube = float(bench.line_shares @ np.abs(bench.line_motion) ** 3)
     drag = at_free * bench.port_motion["tip"] ** 3 / cube
-    values = {f"{truth}@{port}": drag * cube / motion**3 for port, motion in bench.port_motion.items()}
+    values = {
+        f"{truth}@{port}": drag * cube / motion**3 for port, motion in bench.port_motion.items()
+    }
     values[f"{truth}@planform"] = drag
     return Hidden("quadratic_damping", Changes(drag=drag), values, "planform")
 
 
 def cubic_stiffness(generator: np.random.Generator, bench: Bench) -> Hidden:
-    """Hide a cubic spring where the structure moves most; sized at the largest motion of the campaign."""
+    """Hide a cubic spring at the free port, sized at the largest motion of the campaign."""
     # Softer than -4/27 no state holds the largest motion's load: such a draw is drawn again.
     hard = generator.random() < 0.6
     ratio = log_uniform(generator, 0.02, 0.3) if hard else -log_uniform(generator, 0.02, 0.15)
     force = ratio * bench.free.stiffness / bench.largest**2
     law = Law(bench.free.port, POWER, (force, 3.0, 0.0))
     return Hidden(
-        "cubic_stiffness", Changes(laws=(law,)), {"cubic_stiffness.coefficient": force}, bench.free.port
+        "cubic_stiffness",
+        Changes(laws=(law,)),
+        {"cubic_stiffness.coefficient": force},
+        bench.free.port,
     )
 
 
@@ -244,11 +256,17 @@ def breathing_crack(generator: np.random.Generator, bench: Bench) -> Hidden:
     force = -log_uniform(generator, *ranges) * bench.joint.stiffness
     law = Law(bench.joint.port, POWER, (force, 1.0, side))
     place = f"{bench.joint.port}, {'lower' if side > 0.0 else 'upper'} skin"
-    return Hidden("breathing_crack", Changes(laws=(law,)), {"breathing_crack.coefficient": force}, place)
+    return Hidden(
+        "breathing_crack", Changes(laws=(law,)), {"breathing_crack.coefficient": force}, place
+    )
 
 
 def free_play(generator: np.random.Generator, bench: Bench) -> Hidden:
-    share = float(generator.uniform(0.4, 0.9)) if bench.rig == "wing" else log_uniform(generator, 0.1, 0.8)
+    share = (
+        float(generator.uniform(0.4, 0.9))
+        if bench.rig == "wing"
+        else log_uniform(generator, 0.1, 0.8)
+    )
     stiffness = share * bench.joint.stiffness
     half_width = log_uniform(generator, 0.01, 0.4) * bench.joint.displacement
     law = Law(bench.joint.port, GAP, (stiffness, half_width))
@@ -260,15 +278,23 @@ def free_play(generator: np.random.Generator, bench: Bench) -> Hidden:
     )
 
 
-def jenkins(port: str, stiffness: float, slip_force: float, chi: float, count: int = JENKINS_COUNT) -> Law:
-    """Jenkins elements with slip displacements of density d^chi up to the one that gives `slip_force`."""
+def jenkins(
+    port: str, stiffness: float, slip_force: float, chi: float, count: int = JENKINS_COUNT
+) -> Law:
+    """Return Jenkins elements with slips of density d^chi and the total force `slip_force`."""
     largest = slip_force * (2.0 + chi) / ((1.0 + chi) * stiffness)
     share = (np.arange(count) + 0.5) / count
-    return Law(port, JENKINS, (), largest * share ** (1.0 / (1.0 + chi)), np.full(count, stiffness / count))
+    return Law(
+        port, JENKINS, (), largest * share ** (1.0 / (1.0 + chi)), np.full(count, stiffness / count)
+    )
 
 
 def joint_micro_slip(generator: np.random.Generator, bench: Bench) -> Hidden:
-    share = float(generator.uniform(0.4, 0.9)) if bench.rig == "wing" else log_uniform(generator, 0.05, 0.5)
+    share = (
+        float(generator.uniform(0.4, 0.9))
+        if bench.rig == "wing"
+        else log_uniform(generator, 0.05, 0.5)
+    )
     stiffness = share * bench.joint.stiffness
     slip_force = log_uniform(generator, 0.1, 2.0) * stiffness * bench.joint.displacement
     return Hidden(
@@ -280,14 +306,21 @@ def joint_micro_slip(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 
 def bouc_wen_hysteresis(generator: np.random.Generator, bench: Bench) -> Hidden:
-    share = float(generator.uniform(0.4, 0.9)) if bench.rig == "wing" else log_uniform(generator, 0.05, 0.5)
+    share = (
+        float(generator.uniform(0.4, 0.9))
+        if bench.rig == "wing"
+        else log_uniform(generator, 0.05, 0.5)
+    )
     stiffness = share * bench.joint.stiffness
     limit = log_uniform(generator, 0.15, 3.0) * bench.joint.displacement
     law = Law(bench.joint.port, BOUC_WEN, (stiffness, limit, 1.0))
     return Hidden(
         "bouc_wen_hysteresis",
         Changes(laws=(law,)),
-        {"bouc_wen_hysteresis.stiffness": stiffness, "bouc_wen_hysteresis.yield_displacement": limit},
+        {
+            "bouc_wen_hysteresis.stiffness": stiffness,
+            "bouc_wen_hysteresis.yield_displacement": limit,
+        },
         bench.joint.port,
     )
 
@@ -306,7 +339,8 @@ def load_place(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 
 def load_cell(generator: np.random.Generator, bench: Bench) -> Hidden:
-    gain, tare = _signed(generator, 0.01, 0.05), _signed(generator, 0.005, 0.05) * bench.force
+    gain = _signed(generator, 0.01, 0.05)
+    tare = _signed(generator, 0.005, 0.05) * bench.force
     return Hidden(
         "load_cell",
         Changes(force_gain=gain, force_tare=tare),
@@ -316,7 +350,9 @@ def load_cell(generator: np.random.Generator, bench: Bench) -> Hidden:
 
 def washout(generator: np.random.Generator, bench: Bench) -> Hidden:
     value = log_uniform(generator, 0.02, 0.25)
-    return Hidden("washout", Changes(washout=value, washout_exponent=1.0), {"washout.coefficient": value})
+    return Hidden(
+        "washout", Changes(washout=value, washout_exponent=1.0), {"washout.coefficient": value}
+    )
 
 
 def inertia_relief(generator: np.random.Generator, bench: Bench) -> Hidden:
@@ -335,15 +371,20 @@ def seating_offset(generator: np.random.Generator, bench: Bench) -> Hidden:
     run = _pick(generator, bench.runs)
     offset = _signed(generator, 0.005, 0.06) * bench.force * bench.compliance
     return _fault(
-        "seating_offset", Fault("offset", bench.displacements, (offset,), run),
-        {"seating_offset.offset": offset}, run,
-    )  # fmt: skip
+        "seating_offset",
+        Fault("offset", bench.displacements, (offset,), run),
+        {"seating_offset.offset": offset},
+        run,
+    )
 
 
 def thermal_strain(generator: np.random.Generator, bench: Bench) -> Hidden:
     value = _signed(generator, 0.2e-6, 12e-6)
     return _fault(
-        "thermal_strain", Fault("thermal", bench.gauges, (value,)), {"thermal_strain.coefficient": value}, "*"
+        "thermal_strain",
+        Fault("thermal", bench.gauges, (value,)),
+        {"thermal_strain.coefficient": value},
+        "*",
     )
 
 
@@ -352,35 +393,43 @@ def gauge_zero_drift(generator: np.random.Generator, bench: Bench) -> Hidden:
     value = _signed(generator, 0.01, 0.2) * bench.dynamic_range[channel]
     # The amplitude is that over the whole campaign.
     return _fault(
-        "gauge_zero_drift", Fault("drift", (channel,), (value, 1.0)),
+        "gauge_zero_drift",
+        Fault("drift", (channel,), (value, 1.0)),
         {
             "gauge_zero_drift.rate": bench.scale[channel] * value / bench.duration,
             "gauge_zero_drift.amplitude": bench.scale[channel] * value,
         },
         channel,
-    )  # fmt: skip
+    )
 
 
 def gauge_gain(generator: np.random.Generator, bench: Bench) -> Hidden:
     channel = _pick(generator, bench.gauges)
     value = _signed(generator, 0.02, 0.15)
-    return _fault("gauge_gain", Fault("gain", (channel,), (value,)), {"gauge_gain.gain": value}, channel)
+    return _fault(
+        "gauge_gain", Fault("gain", (channel,), (value,)), {"gauge_gain.gain": value}, channel
+    )
 
 
 def gauge_misalignment(generator: np.random.Generator, bench: Bench) -> Hidden:
     channel = _pick(generator, bench.gauges)
     value = float(np.radians(_signed(generator, 5.0, 15.0)))
     return _fault(
-        "gauge_misalignment", Fault("rotation", (channel,), (value,)),
-        {"gauge_misalignment.angle": value}, channel,
-    )  # fmt: skip
+        "gauge_misalignment",
+        Fault("rotation", (channel,), (value,)),
+        {"gauge_misalignment.angle": value},
+        channel,
+    )
 
 
 def high_pass(generator: np.random.Generator, bench: Bench) -> Hidden:
     channel = _pick(generator, bench.dynamic)
     value = log_uniform(generator, 0.02, 5.0)
     return _fault(
-        "high_pass", Fault("high_pass", (channel,), (value,)), {"high_pass.time_constant": value}, channel
+        "high_pass",
+        Fault("high_pass", (channel,), (value,)),
+        {"high_pass.time_constant": value},
+        channel,
     )
 
 
@@ -410,8 +459,13 @@ def mains_hum(generator: np.random.Generator, bench: Bench) -> Hidden:
     phase = float(generator.uniform(0.0, 2.0 * np.pi))
     return _fault(
         "mains_hum",
-        Fault("line", (channel,), (frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))),
-        {"mains_hum.frequency": frequency, **_wave("mains_hum", amplitude * bench.scale[channel], phase)},
+        Fault(
+            "line", (channel,), (frequency, amplitude * np.cos(phase), amplitude * np.sin(phase))
+        ),
+        {
+            "mains_hum.frequency": frequency,
+            **_wave("mains_hum", amplitude * bench.scale[channel], phase),
+        },
         f"{line:g} Hz, {channel}",
     )
 
@@ -427,7 +481,11 @@ def unmodelled_mode(generator: np.random.Generator, bench: Bench) -> Hidden:
     phase = float(generator.uniform(0.0, 2.0 * np.pi))
     return _fault(
         "unmodelled_mode",
-        Fault("mode", (channel,), (frequency, ratio, amplitude * np.cos(phase), amplitude * np.sin(phase))),
+        Fault(
+            "mode",
+            (channel,),
+            (frequency, ratio, amplitude * np.cos(phase), amplitude * np.sin(phase)),
+        ),
         {
             "unmodelled_mode.frequency": float(frequency),
             "unmodelled_mode.damping_ratio": ratio,
@@ -440,18 +498,51 @@ def unmodelled_mode(generator: np.random.Generator, bench: Bench) -> Hidden:
 DRAWS: dict[str, Draw] = {
     draw.__name__: draw
     for draw in (
-        point_mass, root_compliance, local_stiffness_loss, temperature_dependent_modulus, stiffness_drift,
-        coulomb_friction, structural_damping, quadratic_damping, cubic_stiffness, breathing_crack, free_play,
-        joint_micro_slip, bouc_wen_hysteresis, load_place, load_cell, washout, inertia_relief, seating_offset,
-        thermal_strain, gauge_zero_drift, gauge_gain, gauge_misalignment, high_pass, clock_error, mains_hum,
+        point_mass,
+        root_compliance,
+        local_stiffness_loss,
+        temperature_dependent_modulus,
+        stiffness_drift,
+        coulomb_friction,
+        structural_damping,
+        quadratic_damping,
+        cubic_stiffness,
+        breathing_crack,
+        free_play,
+        joint_micro_slip,
+        bouc_wen_hysteresis,
+        load_place,
+        load_cell,
+        washout,
+        inertia_relief,
+        seating_offset,
+        thermal_strain,
+        gauge_zero_drift,
+        gauge_gain,
+        gauge_misalignment,
+        high_pass,
+        clock_error,
+        mains_hum,
         unmodelled_mode,
     )
-}  # fmt: skip
+}
 """Every effect by its identifier."""
 
 LUMPED = (
-    "stiffness_drift", "coulomb_friction", "structural_damping", "quadratic_damping", "cubic_stiffness",
-    "breathing_crack", "free_play", "joint_micro_slip", "bouc_wen_hysteresis", "load_cell", "seating_offset",
-    "high_pass", "clock_error", "mains_hum", "unmodelled_mode",
-)  # fmt: skip
+    "stiffness_drift",
+    "coulomb_friction",
+    "structural_damping",
+    "quadratic_damping",
+    "cubic_stiffness",
+    "breathing_crack",
+    "free_play",
+    "joint_micro_slip",
+    "bouc_wen_hysteresis",
+    "load_cell",
+    "seating_offset",
+    "high_pass",
+    "clock_error",
+    "mains_hum",
+    "unmodelled_mode",
+)
 """Effects that the lumped rig can hide."""

@@ -1,4 +1,4 @@
-"""What the instruments of a campaign show: hidden faults, then gains, zeros and noise as in any campaign."""
+"""Readings of instruments: hidden faults, then gains, zeros and noise as in any campaign."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -66,16 +66,21 @@ def draw_chance(generator: np.random.Generator, plan: CampaignPlan) -> Chance:
     rings = [trial for trial in plan.trials if trial.kind == "ringdown"]
     return Chance(
         parameters,
-        {t.name: t.release * (1.0 + RELEASE_ERROR * float(generator.standard_normal())) for t in rings},
+        {
+            t.name: t.release * (1.0 + RELEASE_ERROR * float(generator.standard_normal()))
+            for t in rings
+        },
         {t.name: RELEASE_PLACE_ERROR * float(generator.standard_normal()) for t in rings},
     )
 
 
 def true_signals(rig: Rig, plan: CampaignPlan, chance: Chance, changes: Changes) -> Signals:
-    """Return what channels without noise show: (rows, channels) by trial, in the channels' units."""
+    """Return readings without noise by trial, arrays (rows, channels) in the channels' units."""
     temperatures = {trial.temperature for trial in plan.trials}
     structures = {t: rig.structure(chance.parameters, changes, t) for t in temperatures}
-    filtered = {name for fault in changes.faults if fault.kind == "high_pass" for name in fault.channels}
+    filtered = {
+        name for fault in changes.faults if fault.kind == "high_pass" for name in fault.channels
+    }
     index = {output: k for k, output in enumerate(rig.outputs)}
     signals = {}
     for trial in plan.trials:
@@ -97,7 +102,15 @@ def true_signals(rig: Rig, plan: CampaignPlan, chance: Chance, changes: Changes)
         for fault in changes.faults:
             for column, name in enumerate(trial.channels):
                 if name in fault.channels:
-                    _apply(fault, values[:, column], plan, trial, amplitude, plan.channels[name].scale, split)
+                    _apply(
+                        fault,
+                        values[:, column],
+                        plan,
+                        trial,
+                        amplitude,
+                        plan.channels[name].scale,
+                        split,
+                    )
         signals[trial.name] = values[::split]
     return signals
 
@@ -111,9 +124,11 @@ def _apply(
     scale: float,
     split: int,
 ) -> None:
-    """Apply a fault to a column of values [channel's unit], in place; offsets in the fault are SI."""
+    """Apply a fault in place to the values of a channel [its unit]; the fault's numbers are SI."""
     ring = trial.kind == "ringdown"
-    times = np.linspace(trial.rows[0], trial.rows[-1], len(values)) if ring else trial.campaign_times
+    times = (
+        np.linspace(trial.rows[0], trial.rows[-1], len(values)) if ring else trial.campaign_times
+    )
     first = fault.numbers[0]
     if fault.kind == "gain":
         values *= 1.0 + first
@@ -160,7 +175,7 @@ class Measured:
 
 
 def coloured(generator: np.random.Generator, count: int, correlation: float) -> FloatArray:
-    """Return unit noise (count,), autoregressive of first order with a correlation between samples."""
+    """Return unit noise (count,) of a first-order autoregression with correlation `correlation`."""
     white = generator.standard_normal(count + 50)
     return np.asarray(lfilter([np.sqrt(1.0 - correlation**2)], [1.0, -correlation], white))[50:]
 
@@ -190,7 +205,9 @@ def measure(
     noise_factor : float
         True noise over the one that the channels are planned with.
     """
-    gain = {c.name: 1.0 + c.gain * float(generator.standard_normal()) for c in plan.channels.values()}
+    gain = {
+        c.name: 1.0 + c.gain * float(generator.standard_normal()) for c in plan.channels.values()
+    }
     values = {}
     for trial in plan.trials:
         channels = [plan.channels[name] for name in trial.channels]
@@ -205,13 +222,17 @@ def measure(
     record = {}
     times = np.arange(plan.noise_samples) / plan.rate
     for name in plan.dynamic_channels:
-        samples = noise_factor * plan.channels[name].noise * coloured(generator, len(times), correlation)
+        samples = (
+            noise_factor * plan.channels[name].noise * coloured(generator, len(times), correlation)
+        )
         for fault in changes.faults:
             if fault.kind == "line" and name in fault.channels:
-                size = float(np.hypot(*fault.numbers[1:3]))
+                size = float(np.hypot(fault.numbers[1], fault.numbers[2]))
                 phase = float(generator.uniform(0.0, 2.0 * np.pi))
                 samples = samples + size * np.cos(2.0 * np.pi * fault.numbers[0] * times + phase)
         record[name] = samples
     spread = np.sqrt(generator.chisquare(NOISE_FREEDOM, len(plan.channels)) / NOISE_FREEDOM)
-    stated = {c.name: c.noise * float(s) for c, s in zip(plan.channels.values(), spread, strict=True)}
+    stated = {
+        c.name: c.noise * float(s) for c, s in zip(plan.channels.values(), spread, strict=True)
+    }
     return Measured(values, record, stated)

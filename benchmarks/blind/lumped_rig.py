@@ -1,13 +1,14 @@
-"""A rig of three masses on a joint: its nominal model for the file, and the rig with something hidden."""
+"""A rig of three masses on a joint: its nominal model file, and its true response."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.blind.changes import Changes
 from benchmarks.blind.laws import Law
-from benchmarks.blind.plan import CampaignPlan, ChannelPlan, TrialPlan
+from benchmarks.blind.plan import CampaignPlan, ChannelPlan, TrialPlan, schedule
 from benchmarks.blind.structure import Release, Structure
 
 FloatArray = NDArray[np.float64]
@@ -49,63 +50,115 @@ def model_text() -> str:
 
     lines = ["format = 1", 'name = "Three masses on a joint"']
     lines += [f"mass = {row(np.diag(MASS))}"]
-    lines += ["stiffness = [" + ", ".join(row(line) for line in _stiffness()) + "]", "", "[damping]"]
+    lines += [
+        "stiffness = [" + ", ".join(row(line) for line in _stiffness()) + "]",
+        "",
+        "[damping]",
+    ]
     lines += [f"alpha = {ALPHA}", f"beta = {BETA}"]
     lines += ["", "[[input]]", 'name = "end"', f"vector = {row(PORTS['end'])}"]
     for name, (quantity, vector) in OUTPUTS.items():
-        lines += ["", "[[output]]", f'name = "{name}"', f'quantity = "{quantity}"', f"vector = {row(vector)}"]
+        lines += [
+            "",
+            "[[output]]",
+            f'name = "{name}"',
+            f'quantity = "{quantity}"',
+            f"vector = {row(vector)}",
+        ]
     for name, vector in PORTS.items():
         lines += ["", "[[port]]", f'name = "{name}"', f"vector = {row(vector)}"]
     for name, (mean, deviation) in PRIORS.items():
-        lines += ["", "[[parameter]]", f'name = "{name}"', f'terms = "{name.removesuffix("_factor")}"']
+        lines += [
+            "",
+            "[[parameter]]",
+            f'name = "{name}"',
+            f'terms = "{name.removesuffix("_factor")}"',
+        ]
         lines += [f"mean = {mean}", f"deviation = {deviation}", "low = 0.5", "high = 2.0"]
     return "\n".join(lines) + "\n"
 
 
-def lumped_campaign() -> CampaignPlan:
-    """Return the plan of the campaign: static loads at the end, and releases."""
+RATE = 250.0  # Hz
+DYNAMIC = ("x1", "x3", "s2")
+"""Channels of ring-downs."""
+WARMER = 15.0
+"""Temperature of the warm trials above the reference [K]."""
+
+
+def _channels() -> dict[str, ChannelPlan]:
+    """Return a channel for each output, by name."""
     channels = {}
     for name, (quantity, _) in OUTPUTS.items():
         if quantity == "strain":
-            channels[name] = ChannelPlan(name, quantity, "microstrain", name, 1e-6, STRAIN_NOISE, 0.005, 40.0)
+            channels[name] = ChannelPlan(
+                name, quantity, "microstrain", name, 1e-6, STRAIN_NOISE, gain=0.005, offset=40.0
+            )
         else:
-            channels[name] = ChannelPlan(name, quantity, "mm", name, 1e-3, DISPLACEMENT_NOISE, 0.005, 0.05)
+            channels[name] = ChannelPlan(
+                name, quantity, "mm", name, 1e-3, DISPLACEMENT_NOISE, gain=0.005, offset=0.05
+            )
+    return channels
+
+
+def _load_test(name: str, run: str, *, held_out: bool = False) -> TrialPlan:
+    """Return a load test of the end, in both directions."""
     levels = np.round(np.linspace(5.0, 30.0, 6), 3)
     forces = np.concatenate([levels, -levels])
-    trials: list[TrialPlan] = []
+    return TrialPlan(name, "static", run, tuple(OUTPUTS), forces, place="end", held_out=held_out)
 
-    def add(
-        name: str, kind: str, run: str, measured: tuple[str, ...], rows: FloatArray, **more: object
-    ) -> None:
-        start = 0.0 if not trials else float(trials[-1].campaign_times[-1]) + 600.0
-        trials.append(TrialPlan(name, kind, run, measured, rows, place="end", start=start, **more))  # type: ignore[arg-type]
 
-    for run in ("A", "B"):
-        for repeat in (1, 2):
-            add(
-                f"load {run}{repeat}",
-                "static",
-                run,
-                tuple(channels),
-                forces,
-                held_out=(run, repeat) == ("A", 2),
-            )
-    ring, long = np.arange(1000) / 250.0, np.arange(1750) / 250.0
-    for amplitude, repeat, rows in (
-        (4.0, 1, ring), (-4.0, 1, ring), (12.0, 1, ring), (12.0, 2, ring), (-12.0, 1, ring), (8.0, 1, ring),
-        (12.0, 3, long),
-    ):  # fmt: skip
-        sign = "plus" if amplitude > 0.0 else "minus"
-        add(
-            f"release {abs(amplitude):.0f} mm {sign} {repeat}", "ringdown", "R", ("x1", "x3", "s2"), rows,
-            release=amplitude * 1e-3, held_out=amplitude == 8.0,
-        )  # fmt: skip
-    add("load warm", "static", "A", tuple(channels), forces, temperature=15.0)
-    add("release warm", "ringdown", "R", ("x1", "x3", "s2"), ring, release=0.012, temperature=15.0)
+def _release(amplitude: float, repeat: int, samples: int) -> TrialPlan:
+    """Return a release of the end.
+
+    Parameters
+    ----------
+    amplitude : float
+        Displacement before the release [mm].
+    repeat : int
+        Number of the repetition.
+    samples : int
+        Number of samples.
+    """
+    direction = "plus" if amplitude > 0.0 else "minus"
+    return TrialPlan(
+        name=f"release {abs(amplitude):.0f} mm {direction} {repeat}",
+        kind="ringdown",
+        run="R",
+        channels=DYNAMIC,
+        rows=np.arange(samples) / RATE,
+        place="end",
+        release=amplitude * 1e-3,
+        held_out=amplitude == 8.0,
+    )
+
+
+def lumped_campaign() -> CampaignPlan:
+    """Return the plan of the campaign: load tests of the end and releases, some of them warm."""
+    load_tests = [
+        _load_test(f"load {run}{repeat}", run, held_out=(run, repeat) == ("A", 2))
+        for run, repeat in (("A", 1), ("A", 2), ("B", 1), ("B", 2))
+    ]
+    releases = [
+        _release(4.0, 1, 1000),
+        _release(-4.0, 1, 1000),
+        _release(12.0, 1, 1000),
+        _release(12.0, 2, 1000),
+        _release(-12.0, 1, 1000),
+        _release(8.0, 1, 1000),
+        _release(12.0, 3, 1750),
+    ]
+    warm_load_test = replace(_load_test("load warm", "A"), temperature=WARMER)
+    warm_release = replace(releases[2], name="release warm", release=0.012, temperature=WARMER)
     return CampaignPlan(
-        "Three masses on a joint", channels, tuple(trials), 20.0, PRIORS, {"end": "end"},
-        model_file="model.toml", model_text=model_text(),
-    )  # fmt: skip
+        name="Three masses on a joint",
+        channels=_channels(),
+        trials=schedule([*load_tests, *releases, warm_load_test, warm_release]),
+        reference_temperature=20.0,
+        priors=PRIORS,
+        places={"end": "end"},
+        model_file="model.toml",
+        model_text=model_text(),
+    )
 
 
 class LumpedRig:

@@ -1,12 +1,15 @@
 """The plan of a campaign: channels and trials, before anything is measured."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
+
+PAUSE = 600.0
+"""Time between the last row of a trial and the start of the next trial [s]."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +83,30 @@ class TrialPlan:
     @property
     def campaign_times(self) -> FloatArray:
         """Time of each row since the campaign's start (n,) [s]."""
-        return self.start + (
-            self.rows if self.kind == "ringdown" else self.interval * np.arange(len(self.rows))
-        )
+        if self.kind == "ringdown":
+            return self.start + self.rows
+        return self.start + self.interval * np.arange(len(self.rows), dtype=np.float64)
+
+
+def schedule(
+    trials: Iterable[TrialPlan], longer_pauses: Mapping[str, float] | None = None
+) -> tuple[TrialPlan, ...]:
+    """Return trials with start times one after the other, `PAUSE` apart.
+
+    Parameters
+    ----------
+    trials : iterable of TrialPlan
+        Trials in order; their start times are ignored.
+    longer_pauses : mapping of str to float, optional
+        Additional time before some trials, by name [s].
+    """
+    longer = longer_pauses or {}
+    scheduled: list[TrialPlan] = []
+    for trial in trials:
+        start = float(scheduled[-1].campaign_times[-1]) + PAUSE if scheduled else 0.0
+        start += longer.get(trial.name, 0.0)
+        scheduled.append(replace(trial, start=start))
+    return tuple(scheduled)
 
 
 @dataclass(frozen=True)
@@ -129,5 +153,7 @@ class CampaignPlan:
     @property
     def dynamic_channels(self) -> tuple[str, ...]:
         """Channels of the ring-downs."""
-        names = [name for trial in self.trials if trial.kind == "ringdown" for name in trial.channels]
+        names = [
+            name for trial in self.trials if trial.kind == "ringdown" for name in trial.channels
+        ]
         return tuple(dict.fromkeys(names))

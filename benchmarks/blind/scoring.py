@@ -21,17 +21,33 @@ class Outcome(StrEnum):
 
 
 FAMILIES = {
-    "coulomb_friction": "damping", "structural_damping": "damping", "quadratic_damping": "damping",
-    "cubic_stiffness": "stiffness", "breathing_crack": "stiffness",
-    "joint_micro_slip": "hysteresis", "bouc_wen_hysteresis": "hysteresis",
-    "gauge_gain": "gain", "gauge_misalignment": "gain",
-    "point_mass": "mass", "high_pass": "filter", "free_play": "dead zone",
-    "washout": "lift", "inertia_relief": "lift", "load_place": "load", "load_cell": "load",
-    "thermal_strain": "zero", "gauge_zero_drift": "zero", "seating_offset": "zero",
-    "mains_hum": "line", "unmodelled_mode": "line", "clock_error": "clock", "stiffness_drift": "time",
-    "root_compliance": "compliance", "local_stiffness_loss": "compliance",
+    "coulomb_friction": "damping",
+    "structural_damping": "damping",
+    "quadratic_damping": "damping",
+    "cubic_stiffness": "stiffness",
+    "breathing_crack": "stiffness",
+    "joint_micro_slip": "hysteresis",
+    "bouc_wen_hysteresis": "hysteresis",
+    "gauge_gain": "gain",
+    "gauge_misalignment": "gain",
+    "point_mass": "mass",
+    "high_pass": "filter",
+    "free_play": "dead zone",
+    "washout": "lift",
+    "inertia_relief": "lift",
+    "load_place": "load",
+    "load_cell": "load",
+    "thermal_strain": "zero",
+    "gauge_zero_drift": "zero",
+    "seating_offset": "zero",
+    "mains_hum": "line",
+    "unmodelled_mode": "line",
+    "clock_error": "clock",
+    "stiffness_drift": "time",
+    "root_compliance": "compliance",
+    "local_stiffness_loss": "compliance",
     "temperature_dependent_modulus": "temperature",
-}  # fmt: skip
+}
 """A word that the family's name holds, by identifier."""
 
 
@@ -46,8 +62,8 @@ class Scored:
     outcome : Outcome
         See there.
     covered : mapping of str to bool or None
-        By parameter of a rightly named effect: whether the 90 % interval holds the truth; None if it cannot
-        be compared (acts at another port than the truth).
+        By parameter of a rightly named effect: whether the 90 % interval holds the truth; None if
+        it cannot be compared (acts at another port than the truth).
     """
 
     truth: Mapping[str, Any]
@@ -78,7 +94,8 @@ def outcome(truth: Mapping[str, Any], verdict: Mapping[str, Any]) -> Outcome:
     if kind == "group":
         if not hidden or outside:
             return Outcome.OPEN
-        # members may be sets, written "one + other": none of a set's effects may be foreign to the truth
+        # members may be sets, written "one + other": none of a set's effects may be foreign to the
+        # truth
         members = [set(str(item).split(" + ")) for item in verdict.get("group") or ()]
         members += [{item} for item in named]
         return Outcome.GROUP if any(member <= hidden for member in members) else Outcome.WRONG
@@ -102,7 +119,9 @@ def coverage(truth: Mapping[str, Any], verdict: Mapping[str, Any]) -> dict[str, 
         known = truth["truth"].get(f"{name}@{port}", truth["truth"].get(name))
         if identifier not in truth["identifiers"]:
             continue
-        if known is None or (f"{name}@{port}" not in truth["truth"] and own and port and own != port):
+        if known is None or (
+            f"{name}@{port}" not in truth["truth"] and own and port and own != port
+        ):
             covered[name] = None
             continue
         covered[name] = low <= known <= high
@@ -111,7 +130,8 @@ def coverage(truth: Mapping[str, Any], verdict: Mapping[str, Any]) -> dict[str, 
 
 def load_cases(folder: Path) -> tuple[list[Scored], int]:
     """Read and score all cases that have a verdict; the second value counts those without."""
-    cases, missing = [], 0
+    cases = []
+    missing = 0
     for file in sorted((folder / "sealed").glob("*.json")):
         path = folder / "verdicts" / file.name
         if not path.is_file():
@@ -131,5 +151,9 @@ def wilson(hits: int, count: int, quantile: float = 1.959964) -> tuple[float, fl
         return 0.0, 1.0
     share, square = hits / count, quantile**2
     middle = (share + square / (2 * count)) / (1 + square / count)
-    half = quantile / (1 + square / count) * math.sqrt(share * (1 - share) / count + square / (4 * count**2))
+    half = (
+        quantile
+        / (1 + square / count)
+        * math.sqrt(share * (1 - share) / count + square / (4 * count**2))
+    )
     return max(0.0, middle - half), min(1.0, middle + half)

@@ -1,19 +1,22 @@
-"""A linear structure with ports, and what it does with hidden forces in it: at rest, and after a release."""
+"""A linear structure with hidden forces at ports: its static and its free response."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import linalg
 
+from benchmarks.blind.compilation import compiled
 from benchmarks.blind.laws import (
     BOUC_WEN,
     JENKINS,
     NO_FORCE,
     Law,
+    LawArrays,
+    ModalStructure,
+    Sampling,
     bouc_wen_rate,
     elastic_force,
     integrate,
@@ -23,84 +26,170 @@ from benchmarks.blind.laws import (
 FloatArray = NDArray[np.float64]
 
 STEP = 4e-4
-"""Largest time step [s] of the integration; a quarter of it changes no reading by more than 0.04 noises."""
+"""Largest time step [s]; a quarter of it changes readings by less than 0.04 standard deviations."""
 LOAD_STEPS = 32
 """Increments between two load levels on the path of a static trial."""
 
 
-@njit(cache=True)
-def _tangent(x, x0, flexibility, kinds, numbers, slip, stiffness, z, bouc, h):
-    """Return the derivative (P, P) of x + G F(x) by differences of length h."""
-    p = len(x)
-    matrix = np.eye(p)
-    for j in range(p):
-        at = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j], x0[j], z[j], bouc[j])
-        up = _path_force(kinds[j], numbers[j], slip[j], stiffness[j], x[j] + h, x0[j], z[j], bouc[j])
-        for i in range(p):
-            matrix[i, j] += flexibility[i, j] * (up - at) / h
+NEWTON_ITERATIONS = 60
+"""Most iterations of Newton's method for one increment of a load."""
+
+
+@compiled
+def _bouc_wen_after(
+    laws: LawArrays, port: int, displacement: float, start: float, bouc_wen: float
+) -> float:
+    """Return the Bouc-Wen variable of a port after a motion, by the midpoint rule."""
+    increment = displacement - start
+    sign = np.sign(increment)
+    yield_displacement = laws.numbers[port, 1]
+    order = laws.numbers[port, 2]
+    middle = bouc_wen + 0.5 * increment * bouc_wen_rate(bouc_wen, sign, yield_displacement, order)
+    return bouc_wen + increment * bouc_wen_rate(middle, sign, yield_displacement, order)
+
+
+@compiled
+def _path_force(
+    laws: LawArrays,
+    port: int,
+    displacement: float,
+    start: float,
+    play: FloatArray,
+    bouc_wen: float,
+) -> float:
+    """Return the force of a port after a motion from `start`, where its history was known."""
+    if laws.kinds[port] == BOUC_WEN:
+        after = _bouc_wen_after(laws, port, displacement, start, bouc_wen)
+        return elastic_force(laws, port, displacement, start, play, after)
+    return elastic_force(laws, port, displacement, start, play, bouc_wen)
+
+
+@compiled
+def _tangent(
+    x: FloatArray,
+    start: FloatArray,
+    flexibility: FloatArray,
+    laws: LawArrays,
+    play: FloatArray,
+    bouc_wen: FloatArray,
+    difference: float,
+) -> FloatArray:
+    """Return the derivative (P, P) of x + G F(x) by forward differences."""
+    ports = len(x)
+    matrix = np.eye(ports)
+    for j in range(ports):
+        force = _path_force(laws, j, x[j], start[j], play, bouc_wen[j])
+        force_ahead = _path_force(laws, j, x[j] + difference, start[j], play, bouc_wen[j])
+        for i in range(ports):
+            matrix[i, j] += flexibility[i, j] * (force_ahead - force) / difference
     return matrix
 
 
-@njit(cache=True)
-def _static_path(linear, flexibility, kinds, numbers, slip, stiffness, z, bouc, steps):
-    """Return the forces (N, P) of elastic laws at each row of the motion `linear` (N, P) without them.
+@compiled
+def _solve_increment(
+    start: FloatArray,
+    target: FloatArray,
+    flexibility: FloatArray,
+    laws: LawArrays,
+    play: FloatArray,
+    bouc_wen: FloatArray,
+    difference: float,
+) -> tuple[FloatArray, float]:
+    """Solve x + G F(x) = target by Newton's method from `start`.
 
-    x + G F(x) = x_linear, by Newton's method with differences, in `steps` increments from row to row and
-    from rest to the first. `z` (P, E) and `bouc` (P,) are the state of the hysteresis; they are advanced.
-    Forces are NaN from the row on that has no state on this path: a softening structure has no stiffness left
-    there (the determinant of the tangent is not positive), and what Newton's method finds, if it ends at all,
-    is another branch.
+    Returns
+    -------
+    (P,) array, float
+        The solution x, and its largest residual.
     """
-    rows, p = linear.shape
-    forces = np.full((rows, p), np.nan)
-    x, x0, before = np.zeros(p), np.zeros(p), np.zeros(p)
-    force = np.zeros(p)
-    missed = 1e-6 * np.abs(linear).max() + 1e-12
+    ports = len(start)
+    x = start.copy()
+    force = np.zeros(ports)
+    largest_residual = np.inf
+    for _ in range(NEWTON_ITERATIONS):
+        for j in range(ports):
+            force[j] = _path_force(laws, j, x[j], start[j], play, bouc_wen[j])
+        residual = x + flexibility @ force - target
+        largest_residual = np.abs(residual).max()
+        if largest_residual <= 1e-13 + 1e-11 * np.abs(target).max():
+            break
+        tangent = _tangent(x, start, flexibility, laws, play, bouc_wen, difference)
+        x = x - np.linalg.solve(tangent, residual)
+    return x, largest_residual
+
+
+@compiled
+def _advance_hysteresis(
+    x: FloatArray,
+    start: FloatArray,
+    laws: LawArrays,
+    play: FloatArray,
+    bouc_wen: FloatArray,
+) -> None:
+    """Advance Jenkins elements and Bouc-Wen variables in place for a motion from `start` to `x`."""
+    for j in range(len(x)):
+        if laws.kinds[j] == BOUC_WEN:
+            bouc_wen[j] = _bouc_wen_after(laws, j, x[j], start[j], bouc_wen[j])
+        elif laws.kinds[j] == JENKINS:
+            for e in range(play.shape[1]):
+                slip = laws.slip[j, e]
+                play[j, e] = min(max(play[j, e] + x[j] - start[j], -slip), slip)
+
+
+@compiled
+def _static_path(
+    linear: FloatArray,
+    flexibility: FloatArray,
+    laws: LawArrays,
+    play: FloatArray,
+    bouc_wen: FloatArray,
+    increments: int,
+) -> FloatArray:
+    """Return the forces of elastic laws along a path of static loads, x + G F(x) = x_linear.
+
+    Parameters
+    ----------
+    linear : (N, P) array
+        Port displacements without the laws, row by row.
+    flexibility : (P, P) array
+        Flexibility G of the structure between the ports.
+    laws : LawArrays
+        The law of each port.
+    play : (P, E) array
+        Initial deflections of the Jenkins elements; they are advanced in place.
+    bouc_wen : (P,) array
+        Initial Bouc-Wen variables; they are advanced in place.
+    increments : int
+        Increments from row to row, and from rest to the first.
+
+    Returns
+    -------
+    (N, P) array
+        Forces; NaN from the row on that has no state on this path. A softening structure has no
+        stiffness left there (the determinant of the tangent is not positive), and a solution of
+        Newton's method, if there is one, lies on another branch.
+    """
+    rows, ports = linear.shape
+    forces = np.full((rows, ports), np.nan)
+    x = np.zeros(ports)
+    previous = np.zeros(ports)
+    accepted_residual = 1e-6 * np.abs(linear).max() + 1e-12
     for row in range(rows):
-        for step in range(1, steps + 1):
-            target = before + (linear[row] - before) * (step / steps)
-            h = 1e-6 * (np.abs(target).max() + 1e-9)
-            x0[:] = x
-            for _ in range(60):
-                for j in range(p):
-                    force[j] = _path_force(
-                        kinds[j], numbers[j], slip[j], stiffness[j], x[j], x0[j], z[j], bouc[j]
-                    )
-                residual = x + flexibility @ force - target
-                if np.abs(residual).max() <= 1e-13 + 1e-11 * np.abs(target).max():
-                    break
-                tangent = _tangent(x, x0, flexibility, kinds, numbers, slip, stiffness, z, bouc, h)
-                x = x - np.linalg.solve(tangent, residual)
-            tangent = _tangent(x, x0, flexibility, kinds, numbers, slip, stiffness, z, bouc, h)
-            if np.abs(residual).max() > missed or np.linalg.det(tangent) <= 0.0:
-                return forces
-            for j in range(p):
-                if kinds[j] == BOUC_WEN:
-                    bouc[j] = _bouc_wen_after(numbers[j], x[j], x0[j], bouc[j])
-                elif kinds[j] == JENKINS:
-                    for e in range(z.shape[1]):
-                        z[j, e] = min(max(z[j, e] + x[j] - x0[j], -slip[j, e]), slip[j, e])
-        for j in range(p):
-            forces[row, j] = _path_force(
-                kinds[j], numbers[j], slip[j], stiffness[j], x[j], x[j], z[j], bouc[j]
+        for increment in range(1, increments + 1):
+            target = previous + (linear[row] - previous) * (increment / increments)
+            difference = 1e-6 * (np.abs(target).max() + 1e-9)
+            start = x
+            x, residual = _solve_increment(
+                start, target, flexibility, laws, play, bouc_wen, difference
             )
-        before[:] = linear[row]
+            tangent = _tangent(x, start, flexibility, laws, play, bouc_wen, difference)
+            if residual > accepted_residual or np.linalg.det(tangent) <= 0.0:
+                return forces
+            _advance_hysteresis(x, start, laws, play, bouc_wen)
+        for j in range(ports):
+            forces[row, j] = _path_force(laws, j, x[j], x[j], play, bouc_wen[j])
+        previous[:] = linear[row]
     return forces
-
-
-@njit(cache=True)
-def _bouc_wen_after(numbers, x, x0, z):
-    dx = x - x0
-    sign = np.sign(dx)
-    half = z + 0.5 * dx * bouc_wen_rate(z, sign, numbers[1], numbers[2])
-    return z + dx * bouc_wen_rate(half, sign, numbers[1], numbers[2])
-
-
-@njit(cache=True)
-def _path_force(kind, numbers, slip, stiffness, x, x0, z, bouc):
-    if kind == BOUC_WEN:
-        return elastic_force(kind, numbers, slip, stiffness, x, x0, z, _bouc_wen_after(numbers, x, x0, bouc))
-    return elastic_force(kind, numbers, slip, stiffness, x, x0, z, bouc)
 
 
 @dataclass(frozen=True)
@@ -123,6 +212,28 @@ class Release:
     load: FloatArray
     measured_at: FloatArray
     times: FloatArray
+
+
+@dataclass(frozen=True)
+class HeldState:
+    """The state of a structure that is held before a release.
+
+    Attributes
+    ----------
+    holding_force : float
+        Force at the release point.
+    forces : (P,) array
+        Forces of the laws.
+    play : (P, E) array
+        Deflections of their Jenkins elements.
+    bouc_wen : (P,) array
+        Their Bouc-Wen variables.
+    """
+
+    holding_force: float
+    forces: FloatArray
+    play: FloatArray
+    bouc_wen: FloatArray
 
 
 @dataclass(frozen=True)
@@ -194,8 +305,8 @@ class Structure:
         loads : (r, n)
             Loads.
         laws : sequence of Law
-            Forces inside; those that need motion do nothing here: readings are taken when all is at rest,
-            and after a knock on the structure, which frees dry friction.
+            Forces inside; those that need motion do nothing here: readings are taken when all is at
+            rest, and after a knock on the structure, which frees dry friction.
         """
         linear = self.solve(loads)
         elastic = [law for law in laws if law.is_elastic]
@@ -203,99 +314,131 @@ class Structure:
             return np.asarray((self.outputs @ linear).T)
         ports = np.array([self.ports[law.port] for law in elastic])
         compliance = self.solve(ports.T)
-        kinds, numbers, slip, stiffness = law_arrays(tuple(elastic))
+        arrays = law_arrays(tuple(elastic))
         forces = _static_path(
             np.ascontiguousarray((ports @ linear).T),
             ports @ compliance,
-            kinds,
-            numbers,
-            slip,
-            stiffness,
-            np.zeros(slip.shape),
-            np.zeros(len(kinds)),
+            arrays,
+            np.zeros(arrays.slip.shape),
+            np.zeros(len(elastic)),
             LOAD_STEPS,
         )
         return np.asarray((self.outputs @ (linear - compliance @ forces.T)).T)
 
-    def _hold(
-        self, release: Release, laws: tuple[Law, ...], ports: FloatArray
-    ) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-        """Return the holding force, and the forces (P,) and states (P, E), (P,) of the laws under it."""
-        kinds, numbers, slip, stiffness = law_arrays(laws)
-        bend = self.solve(release.load)
-        unit, target = float(release.measured_at @ bend), release.amplitude
-        z, bouc, forces = np.zeros(slip.shape), np.zeros(len(laws)), np.zeros(len(laws))
+    def _hold(self, release: Release, laws: tuple[Law, ...], ports: FloatArray) -> HeldState:
+        """Return the state in which the release point is held at its displacement before a release.
+
+        Parameters
+        ----------
+        release : Release
+            The release.
+        laws : tuple of Law
+            P laws in the structure.
+        ports : (P, r) array
+            Motion of their ports per coordinate.
+        """
+        arrays = law_arrays(laws)
+        unit_displacement = self.solve(release.load)
+        unit = float(release.measured_at @ unit_displacement)
+        target = release.amplitude
+        play = np.zeros(arrays.slip.shape)
+        bouc_wen = np.zeros(len(laws))
         if not any(law.is_elastic for law in laws):
-            return target / unit, forces, z, bouc
+            return HeldState(target / unit, np.zeros(len(laws)), play, bouc_wen)
         # The displacement is held, not the force: force = (target + coupling . F) / unit.
         compliance = self.solve(ports.T)
-        coupling, along = release.measured_at @ compliance, ports @ bend
+        coupling = release.measured_at @ compliance
+        port_displacement = ports @ unit_displacement
         forces = _static_path(
-            (target / unit * along)[None],
-            np.ascontiguousarray(ports @ compliance - np.outer(along, coupling) / unit),
-            kinds,
-            numbers,
-            slip,
-            stiffness,
-            z,
-            bouc,
+            (target / unit * port_displacement)[None],
+            np.ascontiguousarray(ports @ compliance - np.outer(port_displacement, coupling) / unit),
+            arrays,
+            play,
+            bouc_wen,
             4 * LOAD_STEPS,
         )[0]
-        return (target + float(coupling @ forces)) / unit, forces, z, bouc
+        return HeldState((target + float(coupling @ forces)) / unit, forces, play, bouc_wen)
 
-    def ringdown(self, release: Release, laws: Sequence[Law] = (), refinement: int = 1) -> FloatArray:
+    def ringdown(
+        self, release: Release, laws: Sequence[Law] = (), refinement: int = 1
+    ) -> FloatArray:
         """Return the outputs (n, C) after a release, at `release.times`."""
         return self.fine_ringdown(release, laws, 1, refinement)[0]
 
     def fine_ringdown(
         self, release: Release, laws: Sequence[Law], split: int, refinement: int = 1
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the outputs (split (n - 1) + 1, C) after a release, and their times."""
-        inside = tuple(laws)
-        w2, shapes = self._modal
-        own = np.array([self.ports[law.port] for law in inside]).reshape(len(inside), len(self.mass))
-        force, forces, z, bouc = self._hold(release, inside, own)
-        # The last port carries the holding force until the release, and nothing afterwards.
-        ports = np.vstack([own, release.load])
-        behind = self.higher(ports.T)
-        flexibility = ports @ behind
-        for row, law in enumerate(inside):
+        """Return the outputs after a release at times that part each interval of `release.times`.
+
+        Parameters
+        ----------
+        release : Release
+            The release, with n times.
+        laws : sequence of Law
+            Forces inside the structure.
+        split : int
+            Parts of each interval.
+        refinement : int
+            Factor by which the time step of the integration is refined.
+
+        Returns
+        -------
+        (split (n - 1) + 1, C) array, (split (n - 1) + 1,) array
+            Outputs, and their times [s].
+        """
+        internal = tuple(laws)
+        law_ports = [self.ports[law.port] for law in internal]
+        law_port_matrix = np.array(law_ports).reshape(len(internal), len(self.mass))
+        held = self._hold(release, internal, law_port_matrix)
+
+        # The last port carries the holding force until the release, and nothing afterwards
+        ports = np.vstack([law_port_matrix, release.load])
+        higher = self.higher(ports.T)
+        flexibility = ports @ higher
+        for row, law in enumerate(internal):
             if not law.needs_flexibility:
-                flexibility[row], flexibility[:, row] = 0.0, 0.0
-                behind[:, row] = 0.0
-        laws_all = (*inside, Law("", NO_FORCE, ()))
-        kinds, numbers, slip, stiffness = law_arrays(laws_all)
-        pull = np.append(-forces, force)
-        count = len(w2)
+                flexibility[row] = 0.0
+                flexibility[:, row] = 0.0
+                higher[:, row] = 0.0
+
+        # Initial state: deflection of the modes and of the flexibility under all forces
+        w2, shapes = self._modal
+        modes = len(w2)
+        pull = np.append(-held.forces, held.holding_force)
+        modal_deflection = (shapes.T @ (ports.T @ pull)) / w2
         state = np.concatenate(
-            [(shapes.T @ (ports.T @ pull)) / w2, np.zeros(count), pull, np.append(bouc, 0.0)]
+            [modal_deflection, np.zeros(modes), pull, np.append(held.bouc_wen, 0.0)]
         )
+
+        # Motion
         times = release.times
         interval = (times[-1] - times[0]) / (len(times) - 1)
         steps = int(np.ceil(interval / (split * STEP) - 1e-9)) * refinement
         kept = integrate(
             state,
-            np.vstack([z, np.zeros((1, z.shape[1]))]),
-            w2,
-            self.alpha + self.beta * w2,
-            self.stiffness_rate,
-            np.ascontiguousarray(ports @ shapes),
-            flexibility,
-            self.beta if self.modes < len(self.mass) else 0.0,
-            kinds,
-            numbers,
-            slip,
-            stiffness,
-            0.0,
-            interval / (split * steps),
-            float(times[0]),
-            split * (len(times) - 1) + 1,
-            steps,
+            np.vstack([held.play, np.zeros((1, held.play.shape[1]))]),
+            ModalStructure(
+                squared_frequency=w2,
+                damping=self.alpha + self.beta * w2,
+                stiffness_rate=self.stiffness_rate,
+                ports=np.ascontiguousarray(ports @ shapes),
+                flexibility=flexibility,
+                higher_damping=self.beta if self.modes < len(self.mass) else 0.0,
+            ),
+            law_arrays((*internal, Law("", NO_FORCE, ()))),
+            Sampling(
+                step=interval / (split * steps),
+                lead=float(times[0]),
+                states=split * (len(times) - 1) + 1,
+                steps_between=steps,
+            ),
         )
-        outputs = kept[:, :count] @ (self.outputs @ shapes).T
-        outputs += kept[:, 2 * count : 2 * count + len(laws_all)] @ (self.outputs @ behind).T
-        fine = times[0] + interval / split * np.arange(len(kept))
-        return np.asarray(outputs), fine
+
+        # Outputs of the modes and of the flexibility
+        outputs = kept[:, :modes] @ (self.outputs @ shapes).T
+        outputs += kept[:, 2 * modes : 2 * modes + len(ports)] @ (self.outputs @ higher).T
+        fine_times = times[0] + interval / split * np.arange(len(kept))
+        return np.asarray(outputs), fine_times
 
     def free_ringdown(self, release: Release) -> FloatArray:
         """Return the outputs (n, C) after a release without forces inside, in closed form."""
@@ -309,6 +452,6 @@ class Structure:
         start = (shapes.T @ release.load) * force / w2
         result = (motion.real * start) @ (self.outputs @ shapes).T
         if self.modes < len(self.mass):
-            rest = force * (self.outputs @ self.higher(release.load[:, None]))[:, 0]
-            result += np.exp(-t / self.beta) * rest
+            higher = force * (self.outputs @ self.higher(release.load[:, None]))[:, 0]
+            result += np.exp(-t / self.beta) * higher
         return np.asarray(result)

@@ -40,7 +40,11 @@ def _shown(case: Scored) -> str:
 def _outcomes(cases: Sequence[Scored], label: str, key: str) -> list[str]:
     groups: dict[str, list[Scored]] = {}
     for case in cases:
-        name = case.truth.get(key) if key == "trap" else " + ".join(case.truth["identifiers"]) or "nothing"
+        name = (
+            case.truth.get(key)
+            if key == "trap"
+            else " + ".join(case.truth["identifiers"]) or "nothing"
+        )
         groups.setdefault(str(name), []).append(case)
     rows = [
         [name, len(group), *(sum(c.outcome is o for c in group) for o in Outcome)]
@@ -58,7 +62,7 @@ def _median(values: Iterable[float | None]) -> str:
 
 
 def report(cases: Sequence[Scored], missing: int = 0) -> str:
-    """Return the page: shares by kind of case with 95 % intervals, by effect, confusion, coverage, proof."""
+    """Return the score page: outcomes by kind and effect, confusion, coverage and proof."""
     lines = ["# Score of the blind test", ""]
     if missing:
         lines += [f"{missing} campaigns have no verdict and are not counted.", ""]
@@ -69,14 +73,19 @@ def report(cases: Sequence[Scored], missing: int = 0) -> str:
             if group:
                 counts = Counter(c.outcome for c in group)
                 rows.append(
-                    [TITLES[kind], rig, len(group), *(_share(counts[o], len(group)) for o in Outcome)]
+                    [
+                        TITLES[kind],
+                        rig,
+                        len(group),
+                        *(_share(counts[o], len(group)) for o in Outcome),
+                    ]
                 )
     lines += ["## Shares, with 95 % intervals", ""]
     lines += _table(["cases", "rig", "number", *(o.value for o in Outcome)], rows)
     lines += [
-        "right: exactly what is hidden (a trap: also an accepted verdict); group: a group or family that "
-        "holds it; open: unexplained, below detectability or data error; missed: 'nothing missing'; part: "
-        "one of two; wrong: anything else.",
+        "right: exactly what is hidden (a trap: also an accepted verdict); group: a group or "
+        "family that holds it; open: unexplained, below detectability or data error; missed: "
+        "'nothing missing'; part: one of two; wrong: anything else.",
         "",
     ]
     for kind, title in TITLES.items():
@@ -86,11 +95,17 @@ def report(cases: Sequence[Scored], missing: int = 0) -> str:
             lines += [f"## {title}", "", *_outcomes(group, label, label)]
     lines += ["## Said where it is not right", ""]
     confused = Counter(
-        (c.truth.get("trap") or " + ".join(c.truth["identifiers"]) or "nothing", c.truth["kind"], _shown(c))
+        (
+            c.truth.get("trap") or " + ".join(c.truth["identifiers"]) or "nothing",
+            c.truth["kind"],
+            _shown(c),
+        )
         for c in cases
         if c.outcome is not Outcome.RIGHT
     )
-    lines += _table(["hidden", "kind", "said", "cases"], [[*key, n] for key, n in confused.most_common()])
+    lines += _table(
+        ["hidden", "kind", "said", "cases"], [[*key, n] for key, n in confused.most_common()]
+    )
     lines += _coverage(cases)
     lines += _proof(cases)
     return "\n".join(lines)
@@ -135,5 +150,11 @@ def _proof(cases: Sequence[Scored]) -> list[str]:
                 ]
             )
     lines = ["## Proof on held-out trials where the name is right: median (5 to 95 %)", ""]
-    header = ["cases", "named right", "χ² per sample after", "share of the error closed", "seconds a case"]
+    header = [
+        "cases",
+        "named right",
+        "χ² per sample after",
+        "share of the error closed",
+        "seconds a case",
+    ]
     return lines + _table(header, rows)

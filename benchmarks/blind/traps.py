@@ -58,20 +58,25 @@ def _nothing(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]
 
 
 def _small(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
-    name = str(generator.choice(["coulomb_friction", "quadratic_damping", "cubic_stiffness", "mains_hum"]))
+    name = str(
+        generator.choice(["coulomb_friction", "quadratic_damping", "cubic_stiffness", "mains_hum"])
+    )
     return (scaled(DRAWS[name](generator, bench), 0.1),)
 
 
 def scaled(effect: Hidden, factor: float) -> Hidden:
     """Return an effect of forces or lines with all its forces or amplitudes scaled."""
     changes = effect.changes
-    laws = tuple(replace(law, numbers=(factor * law.numbers[0], *law.numbers[1:])) for law in changes.laws)
+    laws = tuple(
+        replace(law, numbers=(factor * law.numbers[0], *law.numbers[1:])) for law in changes.laws
+    )
     faults = tuple(
         replace(fault, numbers=(fault.numbers[0], *(factor * n for n in fault.numbers[1:])))
         for fault in changes.faults
     )
     truth = {
-        name: value if name.endswith("frequency") else factor * value for name, value in effect.truth.items()
+        name: value if name.endswith("frequency") else factor * value
+        for name, value in effect.truth.items()
     }
     smaller = replace(
         changes,
@@ -86,14 +91,15 @@ def scaled(effect: Hidden, factor: float) -> Hidden:
 def _hum(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
     effect = DRAWS["mains_hum"](generator, bench)
     fault = effect.changes.faults[0]
-    size = float(np.hypot(*fault.numbers[1:])) / bench.noise[fault.channels[0]]
+    _frequency, cosine, sine = fault.numbers
+    size = float(np.hypot(cosine, sine)) / bench.noise[fault.channels[0]]
     return (scaled(effect, log_uniform(generator, 0.5, 3.0) / size),)
 
 
 def with_free_phase(
     generator: np.random.Generator, plan: CampaignPlan, signals: Signals, changes: Changes
 ) -> Signals:
-    """Give the lines in signals another phase in each trial: the mains do not wait for a trigger."""
+    """Draw a new phase of hum lines for each trial, since the mains do not wait for a trigger."""
     moved = {name: values.copy() for name, values in signals.items()}
     for fault in changes.faults:
         if fault.kind != "line":
@@ -113,22 +119,25 @@ def with_free_phase(
 
 
 def _cancelling(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
-    """Hide a mass at the tip, which lowers f1, and a slow clock, which raises all frequencies by as much."""
+    """Hide a tip mass, which lowers f1, and a slow clock, which raises all frequencies as much."""
     ratio = float(generator.uniform(0.03, 0.05))
     mass = ratio * bench.modal_mass
-    # f1 falls by half the mass ratio; a sample stamped t is taken later, so that the motion looks faster.
+    # f1 falls by half the mass ratio; a sample stamped t is taken later, so that the motion looks
+    # faster.
     rate = 1.0 / np.sqrt(1.0 / (1.0 + ratio)) - 1.0
     station = bench.length - 0.05
     return (
         Hidden(
-            "point_mass", Changes(mass=mass, mass_station=station),
+            "point_mass",
+            Changes(mass=mass, mass_station=station),
             {"point_mass.mass": mass, "point_mass.station": station},
         ),
         Hidden(
-            "clock_error", Changes(clock_rate=float(rate)),
+            "clock_error",
+            Changes(clock_rate=float(rate)),
             {"clock_error.rate": float(rate), "clock_error.zero": 0.0},
         ),
-    )  # fmt: skip
+    )
 
 
 def _gain_at_damage(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
@@ -151,10 +160,12 @@ def _friction_elsewhere(generator: np.random.Generator, bench: Bench) -> tuple[H
     port = bench.free.port
     return (
         Hidden(
-            "coulomb_friction", Changes(laws=(Law(port, FRICTION, (force, 0.0)),)),
-            {"coulomb_friction.coefficient": force}, port,
+            "coulomb_friction",
+            Changes(laws=(Law(port, FRICTION, (force, 0.0)),)),
+            {"coulomb_friction.coefficient": force},
+            port,
         ),
-    )  # fmt: skip
+    )
 
 
 def _spread_cubic(generator: np.random.Generator, bench: Bench) -> tuple[Hidden, ...]:
@@ -184,7 +195,7 @@ def _outliers(
             return values
         hit = generator.random(len(values)) < 0.01
         size = plan.channels[name].noise * generator.uniform(10.0, 40.0, len(values))
-        return values + hit * size * generator.choice([-1.0, 1.0], len(values))
+        return np.asarray(values + hit * size * generator.choice([-1.0, 1.0], len(values)))
 
     return plan, _on_trials(measured, plan, change)
 
@@ -247,7 +258,9 @@ TRAPS: dict[str, Trap] = {
     "two effects that cancel in f1": Trap(_cancelling, ("unexplained",), rigs=("wing",)),
     "gain error at a damage site": Trap(_gain_at_damage, ("unexplained",), rigs=("wing",)),
     "known effect in an unexpected place": Trap(_friction_elsewhere, ("unexplained",)),
-    "cubic springs spread over the wing": Trap(_spread_cubic, ("unexplained", "family"), rigs=("wing",)),
+    "cubic springs spread over the wing": Trap(
+        _spread_cubic, ("unexplained", "family"), rigs=("wing",)
+    ),
     "outliers": Trap(_nothing, MODEST, _outliers),
     "clipped channel": Trap(_nothing, ("data error", "unexplained"), _clipped),
     "swapped channels": Trap(_nothing, ("data error", "unexplained"), _swapped),

@@ -1,10 +1,10 @@
-"""The full finite element model of the wing, projected once onto a rich basis: a hidden wing is then cheap.
+"""The finite element model of the wing, projected once onto a rich basis for cheap simulation.
 
-The basis holds static solutions under every load of the campaign and at every place where something may be
-hidden at three values of e, fourteen modes at two of them, again with other masses, and for a
-damaged region all of these again with the damage. A Galerkin solution in it differs from the full solution by
-less than a thousandth of the noise (tests). It is not the basis of the package's reduced model, and holds ten
-times as many vectors.
+The basis holds static solutions under every load of the campaign and at every place where something
+may be hidden at three values of e, fourteen modes at two of them, again with other masses, and for
+a damaged region all of these again with the damage. A Galerkin solution in it differs from the full
+solution by less than a thousandth of the noise (tests). It is not the basis of the package's
+reduced model, and holds ten times as many vectors.
 """
 
 from __future__ import annotations
@@ -45,7 +45,17 @@ PORT_STATIONS = (0.4, 1.828)
 """Stations [m] between which something may sit on the wing."""
 MIDDLE = (0.914, 0.3)
 """The place of a middle load and displacement: y [m], chord fraction; there a rib meets a web."""
-REGION_LINES = ((4, 7), (7, 9), (12, 14), (13, 15), (15, 17), (17, 19), (24, 26), (26, 28), (27, 30))
+REGION_LINES = (
+    (4, 7),
+    (7, 9),
+    (12, 14),
+    (13, 15),
+    (15, 17),
+    (17, 19),
+    (24, 26),
+    (26, 28),
+    (27, 30),
+)
 """Regions that may be damaged: first and last mesh line along the span."""
 REGION_LOSSES = (0.25, 0.6)
 """Losses at which the solutions in a damaged region's basis are taken."""
@@ -58,7 +68,8 @@ class WingBasis:
     Attributes
     ----------
     stiffness : (4, r, r)
-        Skin, defect 1, defect 2, rest with the root springs [N/m], `AffineOperators.stiffness_terms`.
+        Skin, defect 1, defect 2, rest with the root springs [N/m],
+        `AffineOperators.stiffness_terms`.
     mass : (3, r, r)
         Structure, unit servos, unit pitot.
     damaged : (3, r, r)
@@ -70,7 +81,8 @@ class WingBasis:
     root : (r,)
         Flapping rotation of the root.
     stations, line : (S,) m, (3, S, r)
-        Mesh lines along the span, and the displacement of the straight chord line there along x, y, z.
+        Mesh lines along the span, and the displacement of the straight chord line there along x, y,
+        z.
     holder_stations, holders : dict
         By "tip" and "middle": stations (H,) [m] and, by web, upward displacements (3, H, r) there.
     lift_stations, lift : (L,) m, (L, r) N
@@ -118,7 +130,7 @@ class WingBasis:
 
 
 class WingBasisStore:
-    """Bases of the shipped wing, without damage and with each damaged region; built when first asked for.
+    """Cached bases of the shipped wing, without damage and with each damaged region.
 
     Parameters
     ----------
@@ -220,7 +232,7 @@ def _functionals(operators: AffineOperators) -> _Functionals:
         middle_stations=middle,
         middle_holders=tuple(rows([(y, chord) for y in middle]) for chord in CHORDS),
         corner=rows([(corner, 0.9)])[0],
-        lift_stations=places,
+        lift_stations=np.asarray(places, dtype=np.float64),
         lift=lift,
         weight=weight,
         root=root,
@@ -259,7 +271,9 @@ def _snapshots(operators: AffineOperators) -> FloatArray:
     return np.hstack(found)
 
 
-def _region_stiffness(operators: AffineOperators, region: int) -> tuple[list[sparse.csr_array], FloatArray]:
+def _region_stiffness(
+    operators: AffineOperators, region: int
+) -> tuple[list[sparse.csr_array], FloatArray]:
     mesh = operators.wing_mesh
     start, end = (float(mesh.span_lines[k]) for k in REGION_LINES[region])
     inside = (mesh.centres[:, 1] > start) & (mesh.centres[:, 1] < end)
@@ -319,7 +333,7 @@ def _build(operators: AffineOperators, snapshots: FloatArray, region: int) -> Wi
 
 
 def _orthonormal(vectors: FloatArray, least: float = 1e-8) -> FloatArray:
-    """Orthonormal basis (n, r) of the span of vectors (n, k); nearly dependent directions are dropped.
+    """Return an orthonormal basis (n, r) of vectors (n, k) without nearly dependent directions.
 
     Orthonormal in the plain sense: energies of smooth fields are known to a millionth only.
     """

@@ -67,7 +67,9 @@ class WingRig:
                 shear = 2.0 * diagonal - along - across
                 for channel in fault.channels:
                     g = int(channel[1:])
-                    strain[g] = cosine**2 * along[g] + sine**2 * across[g] + sine * cosine * shear[g]
+                    strain[g] = (
+                        cosine**2 * along[g] + sine**2 * across[g] + sine * cosine * shear[g]
+                    )
         return Structure(
             stiffness=stiffness,
             mass=mass,
@@ -107,9 +109,10 @@ class WingRig:
         return ports
 
     def mean_weights(self) -> FloatArray:
-        """Weights (K,) of the displacements of the stations whose sum is the mean over the planform.
+        """Return weights (K,) of station displacements whose sum is the mean over the planform.
 
-        Inboard of the first station, where the root bends too, it grows as the distance to the power 3/2.
+        Inboard of the first station, where the root bends too, it grows as the distance to the
+        power 3/2.
         """
         stations, plan = self.store.basis().stations, self.design.planform
         taper = (plan.tip_chord - plan.root_chord) / plan.semi_span
@@ -121,7 +124,7 @@ class WingRig:
         return np.asarray(weights / (0.5 * (plan.root_chord + plan.tip_chord) * plan.semi_span))
 
     def _at(self, basis: WingBasis, station: float) -> FloatArray:
-        """Displacement (3, r) of the straight chord line at a station, straight between mesh lines."""
+        """Return the displacement (3, r) of a chord line, interpolated between mesh lines."""
         k = int(np.clip(np.searchsorted(basis.stations, station) - 1, 0, len(basis.stations) - 2))
         share = (station - basis.stations[k]) / (basis.stations[k + 1] - basis.stations[k])
         return np.asarray((1.0 - share) * basis.line[:, k] + share * basis.line[:, k + 1])
@@ -129,10 +132,11 @@ class WingRig:
     def load(self, place: str, changes: Changes, region: int = -1) -> FloatArray:
         """Return the load (r,) of an upward force of 1 N said to act at a place.
 
-        A displaced force is held by a clamp: it goes to the mesh lines beside it, and its couple about the
-        web to the next web.
+        A displaced force is held by a clamp: it goes to the mesh lines beside it, and its couple
+        about the web to the next web.
         """
-        basis, plan = self.store.basis(region), self.design.planform
+        basis = self.store.basis(region)
+        plan = self.design.planform
         nominal, y, chord = {
             "tip": (basis.displacement[LOAD_POINT], plan.semi_span - 0.05, 0),
             "middle": (basis.displacement[MIDDLE], 0.914, 0),
@@ -175,7 +179,7 @@ class WingRig:
         place_error: float = 0.0,
         split: int = 1,
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the outputs (n, C) of a trial in SI units, and the rows or times that they belong to.
+        """Return the outputs (n, C) of a trial in SI units, and their rows or times.
 
         Parameters
         ----------
@@ -216,4 +220,6 @@ class WingRig:
     def line_motion(self, structure: Structure) -> FloatArray:
         """Motion of the first mode (S,) at the stations of the basis."""
         count = len(self.store.basis().stations)
-        return np.array([structure.ports[f"line{k}"] @ structure.shapes[:, 0] for k in range(count)])
+        return np.array(
+            [structure.ports[f"line{k}"] @ structure.shapes[:, 0] for k in range(count)]
+        )

@@ -37,7 +37,9 @@ def _channel(channel: ChannelPlan, stated: float | None) -> list[str]:
         rows |= {"station": _text(channel.station), "chord": _text(channel.chord)}
     rows |= {"gain_deviation": _text(channel.gain), "offset_deviation": _text(channel.offset)}
     if stated is not None:
-        rows["noise"] = f"{{ standard_deviation = {stated:.5g}, degrees_of_freedom = {NOISE_FREEDOM} }}"
+        rows["noise"] = (
+            f"{{ standard_deviation = {stated:.5g}, degrees_of_freedom = {NOISE_FREEDOM} }}"
+        )
     return _table("[[channel]]", rows)
 
 
@@ -58,13 +60,16 @@ def _trial(trial: TrialPlan, file: str, case: Case) -> list[str]:
         rows["load_place"] = _text(plan.places[trial.place])
     if trial.kind == "ringdown":
         rows["release"] = (
-            f'{{ displacement = {trial.release!r}, unit = "m", deviation = {plan.release_deviation!r}, '
+            f'{{ displacement = {trial.release!r}, unit = "m", '
+            f"deviation = {plan.release_deviation!r}, "
             "at_rest = true, mode_count = 3, time_zero_deviation = 0.0 }"
         )
     return _table("[[trial]]", rows)
 
 
-def _csv(path: Path, header: list[str], columns: list[NDArray[np.float64]], formats: list[str]) -> None:
+def _csv(
+    path: Path, header: list[str], columns: list[NDArray[np.float64]], formats: list[str]
+) -> None:
     lines = [",".join(header)]
     pattern = ",".join(formats)
     lines += [pattern % tuple(row) for row in np.column_stack(columns).tolist()]
@@ -92,12 +97,16 @@ def write_case(case: Case, campaigns: Path, sealed: Path) -> None:
             ["%.6g", *["%.6g"] * len(names)],
         )
     for channel in plan.channels.values():
-        lines += _channel(channel, None if channel.name in measured.noise else measured.stated[channel.name])
+        lines += _channel(
+            channel, None if channel.name in measured.noise else measured.stated[channel.name]
+        )
     first = {"static": "force", "flight": "load_factor", "ringdown": "time"}
     for number, trial in enumerate(plan.trials, start=1):
         file = f"{number:02d}.csv"
         lines += _trial(trial, file, case)
-        header, columns, formats = [first[trial.kind]], [trial.rows], ["%.9g"]
+        header = [first[trial.kind]]
+        columns = [trial.rows]
+        formats = ["%.9g"]
         if trial.kind != "ringdown":
             header.append("time")
             columns.append(trial.campaign_times)

@@ -1,9 +1,9 @@
-"""Campaigns on these rigs: what drives, what is hidden and how large, what is lost, and the files."""
+"""Campaigns on the open rigs: excitation, hidden effects, lost samples, and their files."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,13 @@ from scipy.signal import lfilter
 from benchmarks.open_rigs.rigs import RIGS, SCALES, Course, FloatArray, Rig, Truth, entry
 
 KINDS = ("cart", "damper", "servo", "support", "stores")
-LAWS = ("coulomb_friction", "quadratic_damping", "cubic_stiffness", "free_play", "bouc_wen_hysteresis")
+LAWS = (
+    "coulomb_friction",
+    "quadratic_damping",
+    "cubic_stiffness",
+    "free_play",
+    "bouc_wen_hysteresis",
+)
 HIDDEN = {
     "cart": LAWS[:3],
     "damper": LAWS,
@@ -22,12 +28,16 @@ HIDDEN = {
 }
 """Natural convection is an outflow of the exponent 5/4: its family."""
 LEFT = ("push", "loose", "law")
-GAPS, SHARES, ALONE = (10.0, 50.0), (0.03, 0.10), (2.0, 6.0)
+GAPS = (10.0, 50.0)
+SHARES = (0.03, 0.10)
+ALONE = (2.0, 6.0)
 SIZES = (1.0, 1.5, 1.2)
 """Of what drives in each trial; the last is held out."""
-SAMPLES, NOISE_SAMPLES, STEP = 128, 400, 8
+SAMPLES = 128
+NOISE_SAMPLES = 400
+STEP = 8
 TONES = (0.5, 0.9, 1.6)
-"""Frequencies of what drives bodies [Hz]; stores are driven in steps, two hundred times as slowly."""
+"""Lowest and highest frequency that drives bodies [Hz]; stores are driven 200 times slower."""
 ZERO = 5.0
 """Deviation of a zero over the noise."""
 COLOUR = 0.5
@@ -37,11 +47,12 @@ OFFSET = 0.05
 
 
 def course_of(rig: Rig, generator: np.random.Generator, size: float) -> Course:
-    """Return what drives one trial: tones, from rest where a motion is prescribed, or steps of a pump."""
+    """Return the excitation of a trial: tones (from rest if a motion), or steps of a pump."""
     slow = 200.0 if rig.drive.endswith("zero_order") else 1.0
-    f = np.exp(generator.uniform(*np.log((0.1, 4.0)), 12)) / slow
+    f = np.exp(generator.uniform(np.log(0.1), np.log(4.0), 12)) / slow
     weight = generator.standard_normal(12) / np.sqrt(1.0 + (f * slow) ** 2)
-    turn, w = generator.uniform(0.0, 2.0 * np.pi, 12), 2.0 * np.pi * f
+    turn = generator.uniform(0.0, 2.0 * np.pi, 12)
+    w = 2.0 * np.pi * f
 
     def push(t: float) -> float:
         return float(weight @ np.sin(w * t + turn))
@@ -52,7 +63,9 @@ def course_of(rig: Rig, generator: np.random.Generator, size: float) -> Course:
         breaks = rig.interval * STEP * np.arange(1.0, count)
         return Course.stepped(tuple(steps.tolist()), tuple(breaks.tolist()), push)
     tones = 2.0 * np.pi * np.array(TONES)
-    heights = size * rig.amplitude * generator.uniform(0.6, 1.4, 3) * generator.choice((-1.0, 1.0), 3)
+    heights = (
+        size * rig.amplitude * generator.uniform(0.6, 1.4, 3) * generator.choice((-1.0, 1.0), 3)
+    )
     rest = rig.drive.startswith("displacement")  # 1 - cos: neither place nor speed jumps
     phases = np.full(3, 0.5 * np.pi) if rest else generator.uniform(0.0, 2.0 * np.pi, 3)
     begin = float(heights.sum()) if rest else 0.0
@@ -105,17 +118,25 @@ class Bench:
         change = self.stacked(truth) - beside
         size = self.taken.shape[1]
         found = np.linalg.lstsq(
-            np.vstack((self.taken, np.eye(size))), np.concatenate((change, np.zeros(size))), rcond=None
+            np.vstack((self.taken, np.eye(size))),
+            np.concatenate((change, np.zeros(size))),
+            rcond=None,
         )[0]
         return float(np.sqrt(np.mean((change - self.taken @ found) ** 2)))
 
-    def sized(self, truth: Truth, key: str, wanted: float, largest: float) -> tuple[Truth, float]:
-        """Return a truth whose size or amount makes a change that leaves so much, and how much it leaves."""
-        beside = self.stacked(replace(truth, **{key: 0.0}))
+    def sized(
+        self, truth: Truth, key: Literal["size", "amount"], wanted: float, largest: float
+    ) -> tuple[Truth, float]:
+        """Return a truth whose effect leaves about `wanted` unexplained, and what it leaves."""
+
+        def with_value(value: float) -> Truth:
+            return replace(truth, size=value) if key == "size" else replace(truth, amount=value)
+
+        beside = self.stacked(with_value(0.0))
         size, found = 0.01, 0.0
         for _ in range(8):
             size = min(size, largest)
-            truth = replace(truth, **{key: size})
+            truth = with_value(size)
             found = self.left(truth, beside)
             if abs(found / wanted - 1.0) < 0.1 or (size == largest and found < wanted):
                 break
@@ -126,9 +147,10 @@ class Bench:
 def drawn(
     number: int, seed: int, samples: int = SAMPLES, turns: int = 5
 ) -> tuple[Bench, Truth, dict[str, Any]]:
-    """Return the rig of a campaign, what is true of it, and in words; nothing is after six turns."""
+    """Return the rig of a campaign, its truth, and the truth in words."""
     generator = np.random.default_rng([seed, number])
-    kind, turn = KINDS[number % 5], number // 5
+    kind = KINDS[number % 5]
+    turn = number // 5
     hidden = "" if turn >= turns else HIDDEN[kind][turn % len(HIDDEN[kind])]
     name = kind
     if kind == "support":
@@ -138,13 +160,19 @@ def drawn(
     bench = Bench(RIGS[name], generator, samples)
     shape = generator.uniform(0.6, 0.85) if hidden == "overflow" else generator.uniform(0.1, 0.4)
     at = 0 if hidden == "overflow" else turn // 2 % 2
-    truth, gap = Truth(bench.factors, hidden, 0.0, float(shape), at), 0.0
+    truth = Truth(bench.factors, hidden, 0.0, float(shape), at)
+    gap = 0.0
     if hidden:
         wanted = float(np.exp(generator.uniform(*np.log(GAPS))))
         truth, gap = bench.sized(truth, "size", wanted, 0.6)
     if turn > turns:
-        return bench, truth, {"rig": name, "identifiers": [], "gap": 0.0, "left": "", "remainder": 0.0}
-    left, pitch = LEFT[number % 3], float(np.exp(generator.uniform(*np.log((1.5, 6.0)))))
+        return (
+            bench,
+            truth,
+            {"rig": name, "identifiers": [], "gap": 0.0, "left": "", "remainder": 0.0},
+        )
+    left = LEFT[number % 3]
+    pitch = float(np.exp(generator.uniform(*np.log((1.5, 6.0)))))
     wanted = gap * float(generator.uniform(*SHARES)) if hidden else float(generator.uniform(*ALONE))
     truth, rest = bench.sized(replace(truth, left=left, pitch=pitch), "amount", wanted, 0.5)
     effect = {"": [], "natural_convection": ["outflow"]}.get(hidden, [hidden])
@@ -163,7 +191,8 @@ def hidden_values(name: str, truth: Truth) -> dict[str, Any]:
         port = ("upper outlet", "lower outlet")[truth.at] if name == "stores" else ports[name]
     else:
         force, length, speed = SCALES[name.split()[0]]
-        size, port = truth.size * force, ports.get(name, "mount")
+        size = truth.size * force
+        port = ports.get(name, "mount")
         yields = {"stiffness": size / length, "yield_displacement": truth.shape * length}
         values = {
             "coulomb_friction": {"coefficient": size},
@@ -184,10 +213,14 @@ def varied(
     bench: Bench, variant: str, generator: np.random.Generator
 ) -> tuple[list[Course], list[FloatArray], float]:
     """Return courses and stamps of a variant, and how well the constant of the drive is known."""
-    courses, stamps, offset = list(bench.courses), list(bench.stamps), 0.0
+    courses = list(bench.courses)
+    stamps = list(bench.stamps)
+    offset = 0.0
     if variant == "held" and bench.rig.drive.startswith(("force", "angle", "acceleration")):
         courses = [
-            Course.stepped(tuple(one.value(float(t), 0) for t in time), tuple(time[1:].tolist()), one.push)
+            Course.stepped(
+                tuple(one.value(float(t), 0) for t in time), tuple(time[1:].tolist()), one.push
+            )
             for one, time in zip(courses, stamps, strict=True)
         ]
     if variant in ("jitter", "all"):
@@ -198,7 +231,9 @@ def varied(
         ]
         stamps = [time - time[0] for time in stamps]
         courses = [
-            Course.stepped(one.steps, tuple(time[STEP::STEP].tolist()), one.push) if one.steps else one
+            Course.stepped(one.steps, tuple(time[STEP::STEP].tolist()), one.push)
+            if one.steps
+            else one
             for one, time in zip(courses, stamps, strict=True)
         ]
     return courses, stamps, OFFSET * bench.rig.amplitude if variant in ("offset", "all") else offset
@@ -206,7 +241,9 @@ def varied(
 
 def shifted(course: Course, constant: float) -> Course:
     """Return a course with a constant that its record lacks."""
-    return replace(course, value=lambda t, order: course.value(t, order) + (constant if order == 0 else 0.0))
+    return replace(
+        course, value=lambda t, order: course.value(t, order) + (constant if order == 0 else 0.0)
+    )
 
 
 def blanks(count: int, variant: str, generator: np.random.Generator) -> NDArray[np.bool_]:
@@ -236,7 +273,8 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
     rig = bench.rig
     courses, stamps, offset = varied(bench, variant, change)
     driven = [
-        shifted(course, offset * float(change.standard_normal())) if offset else course for course in courses
+        shifted(course, offset * float(change.standard_normal())) if offset else course
+        for course in courses
     ]
     names = [channel[0] for channel in rig.channels]
     quantity, unit, hold = rig.drive.split()
@@ -244,9 +282,14 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
     text = f'format = 1\nname = "{folder.name}"\n\n[noise]\nfile = "rest.csv"\n'
     for name, of, in_unit, deviation in rig.channels:
         text += entry(
-            "channel", name=name, quantity=of, unit=in_unit, output=name, offset_deviation=ZERO * deviation
+            "channel",
+            name=name,
+            quantity=of,
+            unit=in_unit,
+            output=name,
+            offset_deviation=ZERO * deviation,
         )
-    more = {"reference": True} if "[[controller]]" in rig.model else {}
+    more: dict[str, bool | float] = {"reference": True} if "[[controller]]" in rig.model else {}
     more |= {"offset_deviation": offset} if offset else {}
     text += entry("input", name="drive", quantity=quantity, unit=unit, hold=hold, **more)
     folder.mkdir(parents=True)
@@ -258,15 +301,26 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
         np.column_stack((rig.interval * np.arange(NOISE_SAMPLES), rest)),
     )
     readings = simulate(rig, truth, driven, stamps)
-    for number, (course, time_, values) in enumerate(zip(courses, stamps, readings, strict=True), start=1):
+    for number, (course, time_, values) in enumerate(
+        zip(courses, stamps, readings, strict=True), start=1
+    ):
         zeros = ZERO * bench.noise * noise.standard_normal(len(names))
         values = values + zeros + bench.noise * noise_of(noise, values.shape, colour)
         values[blanks(len(values), variant, change)] = np.nan
         drive = [course.value(float(t), 0) for t in time_]
-        table(folder / f"{number}.csv", ["time", "drive", *names], np.column_stack((time_, drive, values)))
+        table(
+            folder / f"{number}.csv",
+            ["time", "drive", *names],
+            np.column_stack((time_, drive, values)),
+        )
         held_out = {"held_out": True} if number == len(SIZES) else {}
         text += entry(
-            "trial", name=f"trial {number}", kind="driven", file=f"{number}.csv", begins="still", **held_out
+            "trial",
+            name=f"trial {number}",
+            kind="driven",
+            file=f"{number}.csv",
+            begins="still",
+            **held_out,
         )
     parameters = "".join(
         entry("parameter", name=name, terms=terms, deviation=deviation, low=0.4, high=2.5)

@@ -15,9 +15,11 @@ FloatArray = NDArray[np.float64]
 Force = Callable[[float, float, float], float]
 
 SCALES = {
-    "cart": (6.0, 0.5, 1.5), "damper": (60.0, 0.02, 0.12), "servo": (2.0, 0.5, 2.0),
+    "cart": (6.0, 0.5, 1.5),
+    "damper": (60.0, 0.02, 0.12),
+    "servo": (2.0, 0.5, 2.0),
     "support": (8.0, 0.04, 0.3),
-}  # fmt: skip
+}
 """Force, displacement and speed at which laws have their size."""
 TURNS_OVER = 2e-4
 """Share of the largest speed within which friction turns over."""
@@ -25,7 +27,7 @@ TURNS_OVER = 2e-4
 
 @dataclass(frozen=True)
 class Truth:
-    """What a rig is beside its model: factors of its parameters, a law and its size, and what is left."""
+    """The truth of a rig: factors of its parameters, a hidden law, and a disturbance."""
 
     factors: Mapping[str, float] = field(default_factory=dict)
     law: str = ""
@@ -43,7 +45,7 @@ BEFORE = 1e-9
 
 @dataclass(frozen=True)
 class Course:
-    """What drives in one trial, as a function of time with two derivatives; with its random force."""
+    """The excitation of a trial over time with two derivatives, and a random force."""
 
     value: Callable[[float, int], float]
     push: Callable[[float], float]
@@ -56,15 +58,18 @@ class Course:
     ) -> Course:
         """Return a course that holds each value until the next moment."""
         moments = np.array(breaks)
-        return Course(lambda t, order: steps[int(np.searchsorted(moments, t, "right"))], push, breaks, steps)
+        return Course(
+            lambda t, order: steps[int(np.searchsorted(moments, t, "right"))], push, breaks, steps
+        )
 
 
 @dataclass(frozen=True)
 class Rig:
     """A rig: files as a user writes them, scales, and its equations.
 
-    `drive`: quantity, unit and hold of what drives; `channels`: name, quantity, unit and noise; `parameters`:
-    what each scales in the model, and how well it is known. `motion` returns the readings (n, C) of a trial.
+    `drive`: quantity, unit and hold of what drives; `channels`: name, quantity, unit and noise;
+    `parameters`: what each scales in the model, and how well it is known. `motion` returns the
+    readings (n, C) of a trial.
     """
 
     model: str
@@ -76,7 +81,9 @@ class Rig:
     motion: Callable[[Truth, Course, FloatArray], FloatArray]
 
 
-def law(truth: Truth, force: float, length: float, speed: float) -> Callable[..., tuple[float, float]]:
+def law(
+    truth: Truth, force: float, length: float, speed: float
+) -> Callable[..., tuple[float, float]]:
     """Return force and slope of the hysteretic motion z of a law, by position, speed and z."""
     size, yields = truth.size * force, truth.shape * length
 
@@ -108,7 +115,10 @@ def beside(truth: Truth, course: Course, force: float, length: float) -> Force:
 
 
 def solved(
-    slope: Callable[[float, FloatArray], list[float]], begin: list[float], course: Course, stamps: FloatArray
+    slope: Callable[[float, FloatArray], list[float]],
+    begin: list[float],
+    course: Course,
+    stamps: FloatArray,
 ) -> FloatArray:
     """Return the states (n, S) at stamps, stretch by stretch between the steps of what drives."""
     states = np.zeros((len(stamps), len(begin)))
@@ -117,7 +127,9 @@ def solved(
     for end in ends:
         inside = (stamps >= now) & (stamps <= end)
         asked = (
-            np.append(stamps[inside], end) if not inside.any() or stamps[inside][-1] < end else stamps[inside]
+            np.append(stamps[inside], end)
+            if not inside.any() or stamps[inside][-1] < end
+            else stamps[inside]
         )
         found = solve_ivp(
             slope,
@@ -130,7 +142,8 @@ def solved(
             max_step=(stamps[-1] - stamps[0]) / 50.0,
         )
         states[inside] = found.y.T[: inside.sum()]
-        now, state = end, found.y[:, -1]
+        now = end
+        state = found.y[:, -1]
     return states
 
 
@@ -146,9 +159,9 @@ def body(
 ) -> tuple[FloatArray, FloatArray]:
     """Return motion x, v (n, 2), and the forces of law and remainder against it (n, 2).
 
-    The body, m x'' = own(t, x, v) - law - remainder - m a(t), carries a loose one of `amount` times its mass
-    where that is what is left; x and v are relative to a support that is shaken with a(t).
-    """  # fmt: skip
+    The body, m x'' = own(t, x, v) - law - remainder - m a(t), carries a loose one of `amount` times
+    its mass where that is what is left; x and v are relative to a support that is shaken with a(t).
+    """
     force, length, speed = scales
     hidden, more = law(truth, force, length, speed), beside(truth, course, force, length)
     loose = truth.amount * mass if truth.left == "loose" else 0.0
@@ -162,7 +175,10 @@ def body(
         return [y[1], (own(t, y[0], y[1]) - against) / mass - base, turns, y[4], pulled - base]
 
     states = solved(slope, [0.0] * 5, course, stamps)
-    pairs = [(hidden(y[0], y[1], y[2])[0], more(t, y[0], y[1])) for t, y in zip(stamps, states, strict=True)]
+    pairs = [
+        (hidden(y[0], y[1], y[2])[0], more(t, y[0], y[1]))
+        for t, y in zip(stamps, states, strict=True)
+    ]
     return states[:, :2], np.array(pairs)
 
 
@@ -176,11 +192,14 @@ def cart(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
 
 
 def damper(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
-    """Return the force that a prescribed motion takes: the body follows it, and only a loose one is free."""
+    """Return the force that a prescribed motion of a body takes; a loose mass moves freely."""
     factor = truth.factors.get
-    m, c, k = 2.0 * factor("mass", 1.0), 400.0 * factor("oil", 1.0), 3000.0 * factor("spring", 1.0)
+    m = 2.0 * factor("mass", 1.0)
+    c = 400.0 * factor("oil", 1.0)
+    k = 3000.0 * factor("spring", 1.0)
     hidden, more = law(truth, *SCALES["damper"]), beside(truth, course, *SCALES["damper"][:2])
-    loose, w = truth.amount * m if truth.left == "loose" else 0.0, 2.0 * np.pi * truth.pitch
+    loose = truth.amount * m if truth.left == "loose" else 0.0
+    w = 2.0 * np.pi * truth.pitch
 
     def pulled(t: float, y: FloatArray) -> float:
         x, v = course.value(t, 0), course.value(t, 1)
@@ -194,12 +213,14 @@ def damper(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
     readings = []
     for t, y in zip(stamps, states, strict=True):
         x, v, a = (course.value(t, order) for order in range(3))
-        readings.append(m * a + c * v + k * x + hidden(x, v, y[0])[0] + more(t, x, v) + loose * pulled(t, y))
+        readings.append(
+            m * a + c * v + k * x + hidden(x, v, y[0])[0] + more(t, x, v) + loose * pulled(t, y)
+        )
     return np.array(readings)[:, None]
 
 
 def servo(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
-    """Return angle and torque of a servo: proportional to the error, derivative of the measurement."""
+    """Return angle and torque of a servo: proportional to error, derivative of the measurement."""
     factor = truth.factors.get
     inertia, rubs = 0.05 * factor("inertia", 1.0), 0.04 * factor("bearing", 1.0)
     gains = 6.0, 0.5
@@ -216,9 +237,11 @@ def servo(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
 
 
 def support(truth: Truth, course: Course, stamps: FloatArray, *, order: int) -> FloatArray:
-    """Return motion beside a support driven by displacement (order 2) or acceleration (0), and its force."""
+    """Return the motion relative to a driven support, and the force in its spring and damper."""
     factor = truth.factors.get
-    m, c, k = 2.0 * factor("mass", 1.0), 2.5 * factor("damper", 1.0), 180.0 * factor("spring", 1.0)
+    m = 2.0 * factor("mass", 1.0)
+    c = 2.5 * factor("damper", 1.0)
+    k = 180.0 * factor("spring", 1.0)
 
     def shaken(t: float) -> float:
         return course.value(t, order)
@@ -228,8 +251,12 @@ def support(truth: Truth, course: Course, stamps: FloatArray, *, order: int) -> 
     )
     x, v = found.T
     base = 0.8 * factor("mass", 1.0)
-    between = forces[:, 0] + (forces[:, 1] if truth.left == "law" else 0.0)  # a push comes from outside
-    return np.column_stack((x, base * np.array([shaken(t) for t in stamps]) - c * v - k * x - between))
+    between = forces[:, 0] + (
+        forces[:, 1] if truth.left == "law" else 0.0
+    )  # a push comes from outside
+    return np.column_stack(
+        (x, base * np.array([shaken(t) for t in stamps]) - c * v - k * x - between)
+    )
 
 
 def stores(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
@@ -237,12 +264,18 @@ def stores(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
     factor = truth.factors.get
     upper, lower = 0.02 * factor("upper outlet", 1.0), 0.025 * factor("lower outlet", 1.0)
     largest, flow = 1.0, 0.02
-    more, small = beside(truth, course, flow, largest), truth.amount if truth.left == "loose" else 0.0
+    more = beside(truth, course, flow, largest)
+    small = truth.amount if truth.left == "loose" else 0.0
 
     def lost(h: float) -> float:
         if truth.law == "overflow":
-            return truth.size * flow * (max(h - truth.shape, 0.0) / (largest - truth.shape)) ** 1.5
-        return truth.size * flow * np.sqrt(max(h, 0.0) / largest) if truth.law == "outflow" else 0.0
+            level = max(h - truth.shape, 0.0) / (largest - truth.shape)
+            return float(truth.size * flow * level**1.5)
+        return (
+            truth.size * flow * float(np.sqrt(max(h, 0.0) / largest))
+            if truth.law == "outflow"
+            else 0.0
+        )
 
     def slope(t: float, y: FloatArray) -> list[float]:
         over = upper * y[0] + (lost(y[0]) if truth.at == 0 else 0.0)
@@ -257,7 +290,8 @@ def heated(truth: Truth, course: Course, stamps: FloatArray) -> FloatArray:
     """Return the temperature of a heated block over that of the room."""
     factor = truth.factors.get
     capacity, loss = 400.0 * factor("capacity", 1.0), 2.0 * factor("loss", 1.0)
-    more, small = beside(truth, course, 80.0, 40.0), truth.amount if truth.left == "loose" else 0.0
+    more = beside(truth, course, 80.0, 40.0)
+    small = truth.amount if truth.left == "loose" else 0.0
 
     def slope(t: float, y: FloatArray) -> list[float]:
         hidden = truth.size * 80.0 * (max(y[0], 0.0) / 40.0) ** 1.25 if truth.law else 0.0
@@ -292,13 +326,20 @@ DAMPER = "mass = 2.0\nstiffness = 3000.0\ndamping = { matrix = 400.0 }\n" + (
 )
 SERVO = "mass = 0.05\nfree = true\ndamping = { matrix = 0.04 }\n" + (
     entry(
-        "controller", name="loop", quantity="angle", vector=1.0, acts=1.0, reference="drive",
-        proportional=6.0, derivative=0.5, derivative_of="measurement",
+        "controller",
+        name="loop",
+        quantity="angle",
+        vector=1.0,
+        acts=1.0,
+        reference="drive",
+        proportional=6.0,
+        derivative=0.5,
+        derivative_of="measurement",
     )
     + entry("output", name="angle", vector=1.0, quantity="angle")
     + entry("output", name="torque", controller="loop", quantity="torque")
     + port("bearing")
-)  # fmt: skip
+)
 SUPPORT = "mass = [0.8, 2.0]\nstiffness = [[180.0, -180.0], [-180.0, 180.0]]\nfree = true\n" + (
     "damping = { matrix = [[2.5, -2.5], [-2.5, 2.5]] }\n"
     + entry("output", name="x", vector=[-1.0, 1.0])
@@ -324,24 +365,67 @@ HEATED = "capacity = 400.0\nconductance = 2.0\n" + (
     + port("surface")
 )
 RIGS = {
-    "cart": Rig(CART, "force N smooth", 2.0, 0.025, (("x", "displacement", "m", 5e-4),),
-                {"mass": ("mass", 0.03), "bearing": ("damping", 0.2)}, cart),
-    "damper": Rig(DAMPER, "displacement m smooth", 0.006, 0.025, (("force", "force", "N", 0.1),),
-                  {"mass": ("mass", 0.03), "oil": ("damping", 0.1), "spring": ("stiffness", 0.03)}, damper),
-    "servo": Rig(SERVO, "angle rad smooth", 0.2, 0.025,
-                 (("angle", "angle", "rad", 5e-4), ("torque", "torque", "N m", 5e-3)),
-                 {"inertia": ("mass", 0.03), "bearing": ("damping", 0.2)}, servo),
-    "support moved": Rig(SUPPORT + DRIVEN_BY["displacement"], "displacement m smooth", 0.008, 0.025,
-                         (("x", "displacement", "m", 1e-4), ("force", "force", "N", 0.02)),
-                         {"mass": ("mass", 0.03), "damper": ("damping", 0.2), "spring": ("stiffness", 0.03)},
-                         partial(support, order=2)),
-    "support shaken": Rig(SUPPORT + DRIVEN_BY["acceleration"], "acceleration m/s2 smooth", 0.8, 0.025,
-                          (("x", "displacement", "m", 1e-4), ("force", "force", "N", 0.02)),
-                          {"mass": ("mass", 0.03), "damper": ("damping", 0.2), "spring": ("stiffness", 0.03)},
-                          partial(support, order=0)),
-    "stores": Rig(STORES, "flow m3/s zero_order", 0.016, 5.0,
-                  (("upper", "level", "m", 5e-4), ("lower", "level", "m", 5e-4)),
-                  {"upper outlet": ("upper outlet", 0.05), "lower outlet": ("lower outlet", 0.05)}, stores),
-    "heated": Rig(HEATED, "heat W zero_order", 80.0, 5.0, (("block", "temperature", "K", 0.01),),
-                  {"capacity": ("capacity", 0.05), "loss": ("conductance", 0.1)}, heated),
-}  # fmt: skip
+    "cart": Rig(
+        CART,
+        "force N smooth",
+        2.0,
+        0.025,
+        (("x", "displacement", "m", 5e-4),),
+        {"mass": ("mass", 0.03), "bearing": ("damping", 0.2)},
+        cart,
+    ),
+    "damper": Rig(
+        DAMPER,
+        "displacement m smooth",
+        0.006,
+        0.025,
+        (("force", "force", "N", 0.1),),
+        {"mass": ("mass", 0.03), "oil": ("damping", 0.1), "spring": ("stiffness", 0.03)},
+        damper,
+    ),
+    "servo": Rig(
+        SERVO,
+        "angle rad smooth",
+        0.2,
+        0.025,
+        (("angle", "angle", "rad", 5e-4), ("torque", "torque", "N m", 5e-3)),
+        {"inertia": ("mass", 0.03), "bearing": ("damping", 0.2)},
+        servo,
+    ),
+    "support moved": Rig(
+        SUPPORT + DRIVEN_BY["displacement"],
+        "displacement m smooth",
+        0.008,
+        0.025,
+        (("x", "displacement", "m", 1e-4), ("force", "force", "N", 0.02)),
+        {"mass": ("mass", 0.03), "damper": ("damping", 0.2), "spring": ("stiffness", 0.03)},
+        partial(support, order=2),
+    ),
+    "support shaken": Rig(
+        SUPPORT + DRIVEN_BY["acceleration"],
+        "acceleration m/s2 smooth",
+        0.8,
+        0.025,
+        (("x", "displacement", "m", 1e-4), ("force", "force", "N", 0.02)),
+        {"mass": ("mass", 0.03), "damper": ("damping", 0.2), "spring": ("stiffness", 0.03)},
+        partial(support, order=0),
+    ),
+    "stores": Rig(
+        STORES,
+        "flow m3/s zero_order",
+        0.016,
+        5.0,
+        (("upper", "level", "m", 5e-4), ("lower", "level", "m", 5e-4)),
+        {"upper outlet": ("upper outlet", 0.05), "lower outlet": ("lower outlet", 0.05)},
+        stores,
+    ),
+    "heated": Rig(
+        HEATED,
+        "heat W zero_order",
+        80.0,
+        5.0,
+        (("block", "temperature", "K", 0.01),),
+        {"capacity": ("capacity", 0.05), "loss": ("conductance", 0.1)},
+        heated,
+    ),
+}

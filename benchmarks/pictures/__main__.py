@@ -1,8 +1,9 @@
 """Draw the pictures of README and docs: `python -m benchmarks.pictures [NAME ...] [--data FOLDER]`.
 
-Without a name all are drawn. A picture whose published record is not in FOLDER is passed over, and one of the
-live view where Chromium is missing. What pages say otherwise than the pictures is printed, and the exit code
-is then 1. `--check` draws nothing, and compares the pictures that are there with the pages.
+Without a name all are drawn. A picture whose published record is not in FOLDER is passed over, and
+one of the live view where Chromium is missing. What pages say otherwise than the pictures is
+printed, and the exit code is then 1. `--check` draws nothing, and compares the pictures that are
+there with the pages.
 """
 
 import argparse
@@ -29,12 +30,18 @@ def reason_to_pass_over(picture: Picture, data: Path) -> str:
 
 def main() -> int:
     """Draw or check pictures; return 1 if a page says otherwise."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
     names = [whole.NAME, *PICTURES]
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(names))
-    parser.add_argument("--data", type=Path, default=PUBLISHED_DATA, help="folder of published records")
+    parser.add_argument(
+        "--data", type=Path, default=PUBLISHED_DATA, help="folder of published records"
+    )
     parser.add_argument("--out", type=Path, default=IMAGES, help="folder of the pictures")
-    parser.add_argument("--check", action="store_true", help="compare pages with the pictures that are there")
+    parser.add_argument(
+        "--check", action="store_true", help="compare pages with the pictures that are there"
+    )
     arguments = parser.parse_args()
     unknown = [name for name in arguments.names if name not in names]
     if unknown:

@@ -3,7 +3,9 @@
 from benchmarks.pictures import examples, front, measured, missions
 from benchmarks.pictures.picture import Picture, Statement
 
-NOTEBOOK_FLEET, NOTEBOOK_EFFECT, REAL_WING = "fleet", "effect", "real wing"
+NOTEBOOK_FLEET = "fleet"
+NOTEBOOK_EFFECT = "effect"
+REAL_WING = "real wing"
 WING_RECORDS = "uav_experimental_calibration"
 
 PICTURES = {
@@ -14,7 +16,9 @@ PICTURES = {
             front.draw_mission,
             (
                 Statement("README.md", "falls back to a gentle turn at turn {change}"),
-                Statement("README.md", "the damage that calls for it is there from turn {damage} on"),
+                Statement(
+                    "README.md", "the damage that calls for it is there from turn {damage} on"
+                ),
             ),
         ),
         Picture("front_structure", front.draw_structure),
@@ -24,7 +28,8 @@ PICTURES = {
             (
                 Statement("README.md", "found as Coulomb friction, {friction} N;"),
                 Statement(
-                    "README.md", "χ² per sample of the held-out release falls from {before} to {after}."
+                    "README.md",
+                    "χ² per sample of the held-out release falls from {before} to {after}.",
                 ),
             ),
             minutes=True,
@@ -44,14 +49,18 @@ PICTURES = {
             minutes=True,
         ),
         Picture(
-            "front_watch", front.draw_watch, (Statement("README.md", "at turn 10: alarm at turn {alarm},"),)
+            "front_watch",
+            front.draw_watch,
+            (Statement("README.md", "at turn 10: alarm at turn {alarm},"),),
         ),
         Picture(
             "front_fleet",
             front.draw_fleet,
             (
                 Statement("README.md", "damage worsens in {assumed} % of sharp turns"),
-                Statement("README.md", "they learn {mean} % (95 %: {low} to {high}), where 5 % is true"),
+                Statement(
+                    "README.md", "they learn {mean} % (95 %: {low} to {high}), where 5 % is true"
+                ),
             ),
             minutes=True,
             source=NOTEBOOK_FLEET,
@@ -72,7 +81,12 @@ PICTURES = {
         Picture(
             "learnt",
             missions.draw_learnt,
-            (Statement("docs/learning.md", "![What was learnt in {turns} turns of the shipped scenario]"),),
+            (
+                Statement(
+                    "docs/learning.md",
+                    "![What was learnt in {turns} turns of the shipped scenario]",
+                ),
+            ),
         ),
         Picture("structure_bracket", missions.draw_bracket),
         Picture("structure_stiffened_panel", missions.draw_stiffened_panel),
@@ -90,7 +104,11 @@ PICTURES = {
         Picture(
             "design",
             missions.draw_design,
-            (Statement("docs/planning.md", "Eight of the 24 gauges tell {chosen} of {of_all} bit."),),
+            (
+                Statement(
+                    "docs/planning.md", "Eight of the 24 gauges tell {chosen} of {of_all} bit."
+                ),
+            ),
         ),
         Picture(
             "view",
@@ -101,13 +119,22 @@ PICTURES = {
         Picture(
             "plate_against_box",
             measured.draw_plate_against_box,
-            (Statement("docs/verification.md", "all 24 gauges, rms | | {rms} ({largest}: {gauge}) |"),),
+            (
+                Statement(
+                    "docs/verification.md", "all 24 gauges, rms | | {rms} ({largest}: {gauge}) |"
+                ),
+            ),
             minutes=True,
         ),
         Picture(
             "real_wing_residuals",
             measured.draw_real_wing_residuals,
-            (Statement("docs/real_wing.md", "leaves {without} µV (rms) without and {with_effects} µV with"),),
+            (
+                Statement(
+                    "docs/real_wing.md",
+                    "leaves {without} µV (rms) without and {with_effects} µV with",
+                ),
+            ),
             record=WING_RECORDS,
             minutes=True,
             source=REAL_WING,

@@ -19,12 +19,19 @@ def draw_force_at_joint() -> Drawing:
     folder = folder_until_exit() / "demo"
     example = ["discrepancy", "example", "laboratory", str(folder)]
     options = ["--model", CHAIN, "--effect", HIDDEN_FRICTION]
-    subprocess.run([sys.executable, "-m", "uav_twin", *example, *options], check=True, capture_output=True)
+    subprocess.run(
+        [sys.executable, "-m", "uav_twin", *example, *options], check=True, capture_output=True
+    )
     missing = uav_twin.investigate(folder, CHAIN).missing
     if missing is None:
-        raise ValueError(f"No force is missing in the example with {HIDDEN_FRICTION}: nothing is drawn.")
+        raise ValueError(
+            f"No force is missing in the example with {HIDDEN_FRICTION}: nothing is drawn."
+        )
     with publication_style():
         figure = missing_force_figure(missing)
         figure.suptitle("Force that the three-mass chain lacks at its joint", x=0.02, ha="left")
         png = to_png(figure, 110.0)
-    return Drawing(png, {"rms": float(missing.told.rms), "largest": abs(float(missing.told.largest.force))})
+    return Drawing(
+        png,
+        {"rms": float(missing.at_port.rms), "largest": abs(float(missing.at_port.largest.force))},
+    )

@@ -34,7 +34,12 @@ def belief_drawing(run: Any, x_label: str, y_label: str) -> Drawing:
     with publication_style():
         figure, axes = small_axes(x_label, y_label)
         axes.fill_between(
-            range(len(mean)), mean - two_deviations, mean + two_deviations, color=PAST, alpha=0.2, lw=0
+            range(len(mean)),
+            mean - two_deviations,
+            mean + two_deviations,
+            color=PAST,
+            alpha=0.2,
+            lw=0,
         )
         axes.plot(mean, color=PAST)
         axes.plot(truth, color="k", ls="--", lw=1)
@@ -67,7 +72,13 @@ def draw_effect() -> Drawing:
         figure, axes = small_axes("time, s", "residual, mm")
         for residuals, colour, label in curves:
             (held_out,) = (fitted for fitted in residuals.trials if fitted.trial.held_out)
-            axes.plot(held_out.trial.time, 1e3 * held_out.residual[:, 0], color=colour, lw=0.6, label=label)
+            axes.plot(
+                held_out.trial.time,
+                1e3 * held_out.residual[:, 0],
+                color=colour,
+                lw=0.6,
+                label=label,
+            )
         axes.legend(loc="upper left")
         png = to_png(figure, RESOLUTION)
     (effect,) = investigation.verdict.effects
@@ -119,7 +130,9 @@ def draw_fleet() -> Drawing:
             learnt_label, assumed_label, truth_label = (
                 ("learnt", "assumed", "truth") if place else (None, None, None)
             )
-            axes.plot([place, place], [rate["lower_95"], rate["upper_95"]], color=PAST, lw=4, alpha=0.4)
+            axes.plot(
+                [place, place], [rate["lower_95"], rate["upper_95"]], color=PAST, lw=4, alpha=0.4
+            )
             axes.plot(place, rate["mean"], "o", color=PAST, label=learnt_label)
             axes.plot(place, rate["assumed"], "x", color=REFERENCE, label=assumed_label)
             axes.plot([place - 0.2, place + 0.2], [truth, truth], "k--", lw=1, label=truth_label)

@@ -34,7 +34,9 @@ BEGIN_OF_RECORDS = 0.8
 def force_drawing(investigation: Investigation) -> bytes:
     """Return the picture of a missing force as PNG."""
     if investigation.missing is None:
-        raise ValueError(f"No force is missing in {investigation.campaign.name!r}: nothing can be drawn.")
+        raise ValueError(
+            f"No force is missing in {investigation.campaign.name!r}: nothing can be drawn."
+        )
     with publication_style():
         return to_png(missing_force_figure(investigation.missing), 110.0)
 
@@ -58,9 +60,11 @@ def draw_real_wing_force(data: Path) -> Drawing:
 
 
 def draw_real_wing_residuals(data: Path) -> Drawing:
-    """Draw the signal of the first ring-down, and what the model leaves without and with the effects."""
+    """Draw the first ring-down, and its residuals without and with the effects."""
     investigation = real_wing(data)
-    problem, search, fit = investigation.problem, investigation.search, investigation.fit
+    problem = investigation.problem
+    search = investigation.search
+    fit = investigation.fit
     assert isinstance(problem, Problem), "a campaign without faults has a problem"
     assert search is not None, "a campaign without faults has a search"
     assert fit is not None, "a campaign without faults has a fit"
@@ -68,7 +72,7 @@ def draw_real_wing_residuals(data: Path) -> Drawing:
     trial: Trial = problem.trials[number].trial
     assert trial.time is not None, "a ring-down has times"
     time = trial.time + BEGIN_OF_RECORDS
-    rows = ((search.none, "wing model, refitted"), (fit, "with the effects"))
+    rows = ((search.no_effect, "wing model, refitted"), (fit, "with the effects"))
     root_mean_squares = []
     with publication_style():
         figure = new_figure(5.2, 6.4)
@@ -77,7 +81,9 @@ def draw_real_wing_residuals(data: Path) -> Drawing:
         signal_axes.plot(time, 1e3 * trial.values[:, 0], lw=0.8, color="black")
         signal_axes.set_ylabel("signal, mV")
         for axes, (candidate_fit, label) in zip(residual_axes, rows, strict=True):
-            prediction = problem.prediction(number, candidate_fit.point, candidate_fit.responses[number])
+            prediction = problem.prediction(
+                number, candidate_fit.point, candidate_fit.responses[number]
+            )
             residual = 1e6 * (trial.values - prediction)[:, 0]
             root_mean_squares.append(float(np.sqrt(np.mean(residual**2))))
             axes.plot(time, residual, lw=0.8, color=PAST)
@@ -108,7 +114,7 @@ def draw_cooling_water(data: Path) -> Drawing:
 
 
 def draw_plate_against_box() -> Drawing:
-    """Draw gauge strains of box and sandwich plate, and their ratios under damage, over the span."""
+    """Draw gauge strains of box and sandwich plate over the span, and their ratios under damage."""
     design = load_design()
     agreement = compare_with_plate(design)
     distance = np.array([place for place, _ in design.gauges.positions])
@@ -116,7 +122,9 @@ def draw_plate_against_box() -> Drawing:
         figure = new_figure(2.6)
         strain_axes, ratio_axes = figure.subplots(1, 2)
         strain_axes.plot(distance, 1e6 * agreement.box.strain, "o", color=OBSERVED, label="box")
-        strain_axes.plot(distance, 1e6 * agreement.plate.strain, "x", color=PAST, label="sandwich plate")
+        strain_axes.plot(
+            distance, 1e6 * agreement.plate.strain, "x", color=PAST, label="sandwich plate"
+        )
         panel_label(strain_axes, "a", f"strain at {design.lift.load_factor:g}g")
         strain_axes.set_ylabel("microstrain")
         for region, color in enumerate((PREDICTION, PAST)):
@@ -136,7 +144,7 @@ def draw_plate_against_box() -> Drawing:
 
 
 def strain_difference(agreement: PlateAgreement) -> dict[str, float]:
-    """Return how much the plate's strains differ from the box's: rms and largest [%], and its gauge."""
+    """Return the rms and the largest difference of plate and box strains [%], with its gauge."""
     relative = 100.0 * np.abs(agreement.strain)
     gauge = int(np.argmax(relative))
     return {

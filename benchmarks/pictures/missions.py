@@ -2,9 +2,11 @@
 
 import io
 import json
+import re
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +19,6 @@ import uav_twin
 from benchmarks.browser import open_browser
 from benchmarks.pictures.notebooks import folder_until_exit, notebook
 from benchmarks.pictures.picture import Drawing
-from benchmarks.view_latency import served
 from reporting.figures import to_png
 from twin_master.fleet.flight import KIND, fleet_config
 from twin_master.fleet.reading import last_turns
@@ -27,6 +28,23 @@ from twin_master.scenario.schema import Scenario
 
 RESOLUTION = 150.0
 VIEWED_TURN = 28
+
+
+@contextmanager
+def served_view(run_folder: Path) -> Iterator[str]:
+    """Run `uav-twin view` on a run folder, give the address of its page, and end it."""
+    command = [sys.executable, "-m", "uav_twin", "view", str(run_folder)]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, stderr=subprocess.DEVNULL
+    ) as process:
+        assert process.stdout is not None
+        try:
+            line = process.stdout.readline()
+            address = re.search(r"http://\S+", line)
+            assert address is not None, f"uav-twin view printed no address but {line!r}"
+            yield address.group()
+        finally:
+            process.terminate()
 
 
 @cache
@@ -89,7 +107,9 @@ def stacked(pictures: Sequence[bytes]) -> bytes:
     """Return PNG pictures of one width below each other."""
     images = [matplotlib.image.imread(io.BytesIO(png), format="png") for png in pictures]
     buffer = io.BytesIO()
-    matplotlib.image.imsave(buffer, np.vstack(images), format="png", metadata={"Software": None})
+    # None leaves the name of the software out, which matplotlib's annotation does not allow for
+    metadata: dict[str, Any] = {"Software": None}
+    matplotlib.image.imsave(buffer, np.vstack(images), format="png", metadata=metadata)
     return buffer.getvalue()
 
 
@@ -122,7 +142,7 @@ def draw_view() -> Drawing:
     keys = ["Home", *["PageDown"] * tens, *["ArrowRight"] * ones]
     steps = [0, *[10] * tens, *[1] * ones]
     turns = np.cumsum(steps).tolist()
-    with served(flown("level_turns")) as address, open_browser() as browser:
+    with served_view(flown("level_turns")) as address, open_browser() as browser:
         tab = browser.tab()
         tab.go(address, width=1265, height=1300)
         tab.wait("window.painted.length > 0")

@@ -1,7 +1,7 @@
-"""What a picture of the documentation is: its drawing, the numbers in it, and the sentences that quote them.
+"""A picture of the documentation: drawing, numbers, and the sentences that quote them.
 
-The numbers are kept in the PNG file itself, as a text chunk (PNG specification, 3rd edition, 11.3.3). So a
-committed picture can be compared with the pages without drawing it.
+The numbers are kept in the PNG file itself, as a text chunk (PNG specification, 3rd edition,
+11.3.3). So a committed picture can be compared with the pages without drawing it.
 """
 
 import io
@@ -91,7 +91,8 @@ class Picture:
     statements : tuple of Statement
         What pages say of it in numbers.
     record : str
-        File or folder of a published record that is drawn, in the folder of published data; empty: none.
+        File or folder of a published record that is drawn, in the folder of published data; empty:
+        none.
     minutes : bool
         Whether drawing takes minutes of processor time.
     browser : bool
@@ -120,13 +121,23 @@ class Picture:
 
     def disagreements(self, numbers: Mapping[str, float]) -> list[str]:
         """Return where pages say other numbers than these."""
-        return [sentence for statement in self.statements for sentence in statement.disagreements(numbers)]
+        return [
+            sentence
+            for statement in self.statements
+            for sentence in statement.disagreements(numbers)
+        ]
 
 
 def with_numbers(png: bytes, numbers: Mapping[str, float]) -> bytes:
     """Return a PNG file with numbers in a text chunk behind its header."""
-    kind, content = b"tEXt", KEYWORD + b"\0" + json.dumps(dict(numbers)).encode("ascii")
-    chunk = struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+    kind = b"tEXt"
+    content = KEYWORD + b"\0" + json.dumps(dict(numbers)).encode("ascii")
+    chunk = (
+        struct.pack(">I", len(content))
+        + kind
+        + content
+        + struct.pack(">I", zlib.crc32(kind + content))
+    )
     end_of_header = len(SIGNATURE) + 4 + 4 + 13 + 4  # length, kind, content and checksum of IHDR
     return png[:end_of_header] + chunk + png[end_of_header:]
 
@@ -143,7 +154,9 @@ def numbers_of(png: bytes) -> dict[str, Any]:
         if kind == b"tEXt" and content.startswith(KEYWORD + b"\0"):
             numbers: dict[str, Any] = json.loads(content.removeprefix(KEYWORD + b"\0"))
             return numbers
-    raise ValueError("The picture holds no numbers: draw it anew with python -m benchmarks.pictures.")
+    raise ValueError(
+        "The picture holds no numbers: draw it anew with python -m benchmarks.pictures."
+    )
 
 
 def _chunks(png: bytes) -> Iterator[tuple[bytes, bytes]]:
@@ -156,7 +169,7 @@ def _chunks(png: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def share_of_changed_pixels(first: bytes, second: bytes) -> float:
-    """Return the share of pixels that differ visibly between two PNG files; 1 where their sizes differ."""
+    """Return the share of visibly different pixels of two PNG files; 1 if their sizes differ."""
     before, after = (imread(io.BytesIO(png), format="png")[..., :3] for png in (first, second))
     if before.shape != after.shape:
         return 1.0

@@ -11,7 +11,7 @@ NAME = "whole"
 WIDTH, HEIGHT = 1100, 600
 INK, QUIET, GROUND = "#1f2933", "#52606d", "#ffffff"
 BLUE, GREEN, ORANGE, PURPLE = "#0072b2", "#007a5a", "#b35900", "#8e4585"
-"""Of the four lanes: model, calibration, flight, discrepancy (after Okabe and Ito, darker for text)."""
+"""Colours of the lanes model, calibration, flight and discrepancy (darker Okabe-Ito colours)."""
 TINTS = {BLUE: "#eaf4fb", GREEN: "#e8f6f1", ORANGE: "#fdf1e3", PURPLE: "#f7eef6"}
 
 
@@ -19,12 +19,17 @@ def text(x: float, y: float, words: str, size: int = 14, colour: str = INK, **st
     """Return words, centred unless told otherwise; `style` holds SVG attributes, `_` for `-`."""
     attributes = {"text_anchor": "middle", **style}
     rest = "".join(f' {name.replace("_", "-")}="{value}"' for name, value in attributes.items())
-    return f'<text x="{x:g}" y="{y:g}" font-size="{size}" fill="{colour}"{rest}>{escape(words)}</text>'
+    return (
+        f'<text x="{x:g}" y="{y:g}" font-size="{size}" fill="{colour}"{rest}>{escape(words)}</text>'
+    )
 
 
 def lane(x: float, y: float, width: float, height: float, colour: str) -> str:
     """Return a tinted field."""
-    return f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}" rx="12" fill="{TINTS[colour]}"/>'
+    return (
+        f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="{height:g}" rx="12" '
+        f'fill="{TINTS[colour]}"/>'
+    )
 
 
 def heading(x: float, y: float, title: str, command_x: float, command: str, colour: str) -> str:
@@ -42,7 +47,8 @@ def box(x: float, y: float, width: float, title: str, lines: tuple[str, ...], co
     """Return a box of 78 units' height with a title and two lines."""
     middle = x + width / 2.0
     parts = [
-        f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="78" rx="8" fill="{GROUND}" stroke="{colour}" '
+        f'<rect x="{x:g}" y="{y:g}" width="{width:g}" height="78" rx="8" fill="{GROUND}" '
+        f'stroke="{colour}" '
         'stroke-width="1.5"/>',
         text(middle, y + 24, title, 15, INK, font_weight="600"),
     ]
@@ -54,7 +60,8 @@ def arrow(*points: tuple[float, float], colour: str = QUIET) -> str:
     """Return a line through points that ends in a head."""
     path = " ".join(f"{x:g},{y:g}" for x, y in points)
     return (
-        f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2" marker-end="url(#head)"/>'
+        f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="2" '
+        'marker-end="url(#head)"/>'
     )
 
 
@@ -70,8 +77,17 @@ def model_lane() -> list[str]:
         lane(20, 20, 1020, 148, BLUE),
         heading(38, 45, "Model", 108, "uav-twin wing, uav-twin fmu", BLUE),
         box(44, row, 200, "Design", ("planform, materials,", "gauges: one TOML file"), BLUE),
-        box(300, row, 200, "Finite elements", ("stiffness, mass, loads,", "affine in e, z1, z2"), BLUE),
-        box(556, row, 200, "Reduced model", ("microseconds, with a", "certified error bound"), BLUE),
+        box(
+            300,
+            row,
+            200,
+            "Finite elements",
+            ("stiffness, mass, loads,", "affine in e, z1, z2"),
+            BLUE,
+        ),
+        box(
+            556, row, 200, "Reduced model", ("microseconds, with a", "certified error bound"), BLUE
+        ),
         box(812, row, 204, "FMU", ("ours, or any other", "of FMI 1, 2 or 3"), BLUE),
         arrow((244, 109), (298, 109)),
         arrow((500, 109), (554, 109)),
@@ -145,11 +161,15 @@ def draw() -> str:
     """Return the picture as SVG."""
     head = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {HEIGHT}" width="{WIDTH}" '
-        f'height="{HEIGHT}" font-family="system-ui, -apple-system, Segoe UI, Helvetica, Arial, sans-serif" '
+        f'height="{HEIGHT}" '
+        'font-family="system-ui, -apple-system, Segoe UI, Helvetica, Arial, sans-serif" '
         'role="img">\n'
-        "<title>From a design and measurements to a twin that flies, and to what its model lacks</title>\n"
-        '<defs><marker id="head" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" '
-        f'orient="auto-start-reverse"><path d="M0,0 L10,5 L0,10 z" fill="{QUIET}"/></marker></defs>\n'
+        "<title>From a design and measurements to a twin that flies, "
+        "and to what its model lacks</title>\n"
+        '<defs><marker id="head" viewBox="0 0 10 10" refX="9" refY="5" '
+        'markerWidth="7" markerHeight="7" '
+        f'orient="auto-start-reverse"><path d="M0,0 L10,5 L0,10 z" fill="{QUIET}"/>'
+        "</marker></defs>\n"
         f'<rect width="{WIDTH}" height="{HEIGHT}" rx="16" fill="{GROUND}"/>\n'
     )
     lanes = [*model_lane(), *calibration_lane(), *flight_lane(), *discrepancy_lane()]

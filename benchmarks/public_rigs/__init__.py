@@ -1,1 +1,1 @@
-"""Rigs that others measured and published in repositories, beside those that the package converts."""
+"""Rigs that others measured and published in repositories."""

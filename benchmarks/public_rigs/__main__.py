@@ -1,8 +1,9 @@
 """Campaigns of further rigs that others measured: `python -m benchmarks.public_rigs DATA OUT`.
 
-DATA holds the records as they were published, `falling.txt`, `CoolingWater.csv` and `Q1.txt`, which are not
-part of the project (docs/measured_rigs.md says where they are). Campaign and `model.toml` of each are in the
-folder of its name here; they were written before the first run. Printed: the commands that search them.
+DATA holds the records as they were published, `falling.txt`, `CoolingWater.csv` and `Q1.txt`, which
+are not part of the project (docs/measured_rigs.md says where they are). Campaign and `model.toml`
+of each are in the folder of its name here; they were written before the first run. Printed: the
+commands that search them.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ HERE = Path(__file__).parent
 BLOWN = 9.0
 """The seismometer is blown at until then [s]."""
 JOINED = 4
-"""Its samples that are averaged: the table shakes at 5 Hz, which ten samples a second show as their signs."""
+"""Number of samples that are averaged, to remove the table's 5 Hz from ten samples a second."""
 
 
 def fall(data: FloatArray) -> FloatArray:
@@ -34,7 +35,7 @@ def cooling(data: FloatArray) -> FloatArray:
 
 
 def swing(data: FloatArray) -> FloatArray:
-    """Return time [s] and position [V] of the seismometer after it was blown at, means of four samples."""
+    """Return times [s] and averaged positions [V] of the seismometer after it was blown at."""
     data = data[data[:, 0] >= BLOWN]
     whole = len(data) // JOINED * JOINED
     means = data[:whole].reshape(-1, JOINED, 2).mean(axis=1)
@@ -46,7 +47,7 @@ RIGS: dict[str, tuple[str, int, str, str, Callable[[FloatArray], FloatArray]]] =
     "cooling_water": ("CoolingWater.csv", 1, "cooling.csv", "water", cooling),
     "swinging_gate": ("Q1.txt", 2, "swing.csv", "position", swing),
 }
-"""Published file, its lines of heading, table of the campaign, its column, and what makes the table."""
+"""Published file, heading lines, table of the campaign, its column, and its converter."""
 
 
 def write(rig: str, data: Path, folder: Path) -> Path:
@@ -56,7 +57,9 @@ def write(rig: str, data: Path, folder: Path) -> Path:
     values = made(np.genfromtxt(data / name, delimiter=separator, skip_header=heading))
     folder.mkdir(parents=True, exist_ok=True)
     for file in ("campaign.toml", "model.toml"):
-        (folder / file).write_text((HERE / rig / file).read_text(encoding="utf-8"), encoding="utf-8")
+        (folder / file).write_text(
+            (HERE / rig / file).read_text(encoding="utf-8"), encoding="utf-8"
+        )
     np.savetxt(folder / table, values, "%.9g", ",", header=f"time,{column}", comments="")
     return folder
 
@@ -66,13 +69,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("data", type=Path)
     parser.add_argument("out", type=Path)
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     for rig, (name, *_) in RIGS.items():
-        if (given.data / name).is_file():
-            folder = write(rig, given.data, given.out / rig)
-            print(f"uav-twin discrepancy run {folder} --model {folder / 'model.toml'} --out {folder}_verdict")
+        if (arguments.data / name).is_file():
+            folder = write(rig, arguments.data, arguments.out / rig)
+            print(
+                f"uav-twin discrepancy run {folder} --model {folder / 'model.toml'} "
+                f"--out {folder}_verdict"
+            )
         else:
-            print(f"{rig} is passed over: there is no {given.data / name}.")
+            print(f"{rig} is passed over: there is no {arguments.data / name}.")
     return 0
 
 

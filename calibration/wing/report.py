@@ -27,7 +27,7 @@ from calibration.result.folder import (
 from calibration.wing.calibrate import WingCalibration
 from calibration.wing.lab_data import StepOrigin
 from fe.reduction.model_cache import WingFields, wing_fields, write_modes_vtu, write_wing_vtu
-from fe.runtime.reduced import Modes
+from fe.runtime.reduced_results import ReducedModes
 from reporting import figures as style
 from reporting.arrays import Float
 from reporting.page import Page, Words
@@ -159,7 +159,7 @@ def _moments(density: _HasMoments) -> str:
     return plus_minus(density.mean, density.standard_deviation)
 
 
-def _mode_titles(modes: Modes) -> list[str]:
+def _mode_titles(modes: ReducedModes) -> list[str]:
     """Return the titles of the first six modes: number, frequency, and which are flapwise."""
     flapwise = dict(zip(modes.followed, ("first flapwise", "second flapwise"), strict=True))
     titles = []
@@ -172,7 +172,7 @@ def _mode_titles(modes: Modes) -> list[str]:
 
 
 @style.publication_style()
-def modes_figure(fields: WingFields, modes: Modes, titles: Sequence[str]) -> Figure:
+def modes_figure(fields: WingFields, modes: ReducedModes, titles: Sequence[str]) -> Figure:
     """Return the figure of the mode shapes of the upper skin, coloured by their displacement.
 
     Parameters

@@ -219,7 +219,7 @@ def _effect(row: object, where: str) -> Effect:
         _recipe(item, names, moments, f"{where}, primitives {n}")
         for n, item in enumerate(section.primitives, start=1)
     )
-    timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].courses]
+    timed = [item for item in recipes if item.in_windows or PRIMITIVES[item.kind].formula_fields]
     if timed and (still := [kind for kind in TrialKind if kind in section.acts_on - DYNAMIC]):
         raise CatalogueError(said("effects.no_course", where=timed[0].where, kind=still[0].value))
     law = _Law(section, recipes)
@@ -306,8 +306,10 @@ class _Recipe:
         for name, value in self.values.items():
             if not isinstance(value, Expression):
                 row[name] = words.get(value, value) if isinstance(value, str) else value
-            elif name in PRIMITIVES[self.kind].courses:
-                row[name] = value.with_numbers({key: known[key] for key in value.used() if key in known})
+            elif name in PRIMITIVES[self.kind].formula_fields:
+                row[name] = value.with_numbers(
+                    {key: known[key] for key in value.used_names() if key in known}
+                )
             else:
                 row[name] = value.value(known)
         primitive = _primitive_of(self.kind, row)
@@ -321,8 +323,8 @@ def _recipe(
     if kind not in PRIMITIVES:
         raise CatalogueError(f"{where}: 'kind' is {kind!r}, but known are {', '.join(PRIMITIVES)}.")
     primitive = PRIMITIVES[kind]
-    types = primitive.values()
-    times = ("begin", "end") if primitive.in_windows else ()
+    types = primitive.value_types()
+    times = ("begin", "end") if primitive.can_act_in_windows else ()
     keys = ("kind", *types, *times, "if")
     known = names | {name for name in SCALES if _OF_SHAPES.get(name, set()) <= names}
     values: dict[str, str | float | Expression] = {}
@@ -335,16 +337,16 @@ def _recipe(
             if name not in types:
                 if name != "kind":
                     when[name] = Expression(text, known | moments if name in times else known, place)
-            elif name in primitive.courses:
+            elif name in primitive.formula_fields:
                 values[name] = Expression(text, known | moments | {"time"}, place)
             else:
                 numeric = isinstance(value, str) and types[name] is not str
                 values[name] = Expression(text, known, place) if numeric else value
         # whether all values are there, with numbers in the place of expressions
-        one = {name: "1" if name in primitive.courses else 1.0 for name in values}
+        one = {name: "1" if name in primitive.formula_fields else 1.0 for name in values}
         _primitive_of(kind, {n: one[n] if isinstance(v, Expression) else v for n, v in values.items()})
     written = [item for item in (*values.values(), *when.values()) if isinstance(item, Expression)]
-    used = frozenset(name for item in written for name in item.used())
+    used = frozenset(name for item in written for name in item.used_names())
     return _Recipe(where, kind, values, when, used & SCALES.keys() - names, used & moments)
 
 
@@ -379,7 +381,7 @@ class _Law:
 
 def _primitive_of(kind: str, row: Mapping[str, str | float]) -> Primitive:
     """Return the primitive; whole numbers of expressions become integers where integers are wanted."""
-    types = PRIMITIVES[kind].values()
+    types = PRIMITIVES[kind].value_types()
     whole = {
         name: int(value)
         for name, value in row.items()

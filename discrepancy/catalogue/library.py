@@ -100,7 +100,7 @@ def _switches(effect: Effect, setting: Setting) -> bool:
         return False
     sizes = {item.name: item.prior.value(0.5) for item in effect.parameters}
     patch = effect.patch(setting, sizes, places[0])
-    if not len(patch) or patch.has_windows or not all(item.in_windows for item in patch):
+    if not len(patch) or patch.has_windows or not all(item.can_act_in_windows for item in patch):
         return False
     return setting.model.follows_windows or all(isinstance(item, SENSORS) for item in patch)
 

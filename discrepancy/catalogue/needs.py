@@ -15,8 +15,8 @@ from discrepancy.system.interface import Model
 from discrepancy.system.response import ACROSS
 from discrepancy.system.scales import PortScale
 from discrepancy.system.structures import StructureModel
-from fe.runtime.motion import PLANFORM
 from fe.runtime.patch import EVERY_CHANNEL, SENSORS, PortForce, Primitive
+from fe.runtime.port_laws import PLANFORM
 from fe.runtime.wing_rows import PORTS
 
 from .entry import ROW, EffectKeys, Number, Setting

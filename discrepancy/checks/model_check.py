@@ -26,7 +26,7 @@ from discrepancy.checks.quality import is_still, rest_faults
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit, normal_equations
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.separability import begun
+from discrepancy.judgement.separability import prior_point_with_initial_states
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -47,7 +47,7 @@ def prior_left(campaign: Campaign, model: Model) -> dict[str, float]:
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     known, weights = problem.shared.count, np.ones(len(problem.channel_names))
-    found = fit(problem, Candidate(), begun(problem), iterations=0)
+    found = fit(problem, Candidate(), prior_point_with_initial_states(problem), iterations=0)
     matrix = normal_equations(problem, found, Candidate(), weights).matrix
     left = np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True))[:known])
     return {

@@ -7,16 +7,16 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.missing_force.hypotheses import Columns
+from discrepancy.fits.candidate import Candidate, EffectTerm, with_step
+from discrepancy.missing_force.hypotheses import ColumnBuilder
 from discrepancy.missing_force.trial import SeenTrial
-from discrepancy.missing_force.view import Motion
+from discrepancy.missing_force.view import TrialMotion
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
 from .laws import ForceAlong, force_along
-from .linearised import Forces, Readings, Trajectory
+from .linearised import Forces, SensorReadings, Trajectory
 
 STEP = 0.02
 """Standard normal step of the derivatives of an effect by its unknowns."""
@@ -28,7 +28,7 @@ class EffectLaws:
 
     Attributes
     ----------
-    columns : Columns
+    columns : ColumnBuilder
         Makes what sensors do to readings.
     trials : tuple of SeenTrial
         Dynamic trials.
@@ -40,7 +40,7 @@ class EffectLaws:
         Shared unknowns by which these change.
     """
 
-    columns: Columns
+    columns: ColumnBuilder
     trials: tuple[SeenTrial, ...]
     candidate: Candidate
     own_laws: Callable[[FloatArray], ModelPatch]
@@ -58,8 +58,11 @@ class EffectLaws:
         effect: FloatArray,
         shared: FloatArray,
         smoothing: float,
-    ) -> tuple[Mapping[int, Forces], Readings] | None:
-        """Return forces at ports and readings of a trial along a trajectory; None where they cannot be."""
+    ) -> tuple[Mapping[int, Forces], SensorReadings] | None:
+        """Return forces at ports and readings of a trial along a trajectory.
+
+        None where they cannot be.
+        """
         try:
             forces = self._forces(number, trajectory, effect, shared, smoothing)
             return forces, self._readings(number, trajectory, effect)
@@ -67,7 +70,12 @@ class EffectLaws:
             return None
 
     def forces(
-        self, number: int, trajectory: Trajectory, effect: FloatArray, shared: FloatArray, smoothing: float
+        self,
+        number: int,
+        trajectory: Trajectory,
+        effect: FloatArray,
+        shared: FloatArray,
+        smoothing: float,
     ) -> Mapping[int, ForceAlong] | None:
         """Return the forces of all laws at ports along a trajectory; None where they cannot be."""
         try:
@@ -78,14 +86,24 @@ class EffectLaws:
     # ------------------------------------------------------------ laws
 
     def _forces_at(
-        self, number: int, trajectory: Trajectory, effect: FloatArray, shared: FloatArray, smoothing: float
+        self,
+        number: int,
+        trajectory: Trajectory,
+        effect: FloatArray,
+        shared: FloatArray,
+        smoothing: float,
     ) -> dict[int, ForceAlong]:
         """Return the forces of all laws at ports along a trajectory."""
         patch = self.own_laws(shared) + self._patch(number, effect).of(PortForce)
         return self._along(number, trajectory, patch, smoothing)
 
     def _forces(
-        self, number: int, trajectory: Trajectory, effect: FloatArray, shared: FloatArray, smoothing: float
+        self,
+        number: int,
+        trajectory: Trajectory,
+        effect: FloatArray,
+        shared: FloatArray,
+        smoothing: float,
     ) -> dict[int, Forces]:
         """Return the forces of all laws at ports, with their derivatives by unknowns."""
 
@@ -95,10 +113,16 @@ class EffectLaws:
         along = at(effect, shared)
         slopes: dict[int, dict[int, FloatArray]] = {port: {} for port in along}
         for k in range(self.size):
-            above, below = at(moved(effect, k, STEP), shared), at(moved(effect, k, -STEP), shared)
+            above, below = (
+                at(with_step(effect, k, STEP), shared),
+                at(with_step(effect, k, -STEP), shared),
+            )
             self._take_slopes(slopes, len(shared) + k, above, below)
         for k in self.adjustable:
-            above, below = at(effect, moved(shared, k, STEP)), at(effect, moved(shared, k, -STEP))
+            above, below = (
+                at(effect, with_step(shared, k, STEP)),
+                at(effect, with_step(shared, k, -STEP)),
+            )
             self._take_slopes(slopes, k, above, below)
         return {port: Forces(force, slopes[port]) for port, force in along.items()}
 
@@ -119,18 +143,18 @@ class EffectLaws:
     def _patch(self, number: int, effect: FloatArray) -> ModelPatch:
         """Return what the effects add to the model in a trial."""
         trial = self.columns.problem.trials[self.columns.numbers[number]].trial
-        found = ModelPatch()
-        for term, part in self.candidate.parts(effect):
+        patch = ModelPatch()
+        for term, part in self.candidate.split(effect):
             if trial.kind in term.effect.acts_on:
-                found = found + term.patch(self.columns.problem.setting, part).in_trial(trial.name)
-        return found
+                patch = patch + term.patch(self.columns.problem.setting, part).in_trial(trial.name)
+        return patch
 
     def _along(
         self, number: int, trajectory: Trajectory, patch: ModelPatch, smoothing: float
     ) -> dict[int, ForceAlong]:
         """Return the forces of a patch's laws, by port."""
         trial = self.trials[number]
-        found: dict[int, ForceAlong] = {}
+        forces: dict[int, ForceAlong] = {}
         for law in self.columns.problem.model.at_ports(patch):
             if not isinstance(law, PortForce):
                 continue
@@ -142,45 +166,40 @@ class EffectLaws:
                 trajectory.speeds[:, port],
                 smoothing,
             )
-            found[port] = force.plus(found[port]) if port in found else force
-        return found
+            forces[port] = force.plus(forces[port]) if port in forces else force
+        return forces
 
     # ------------------------------------------------------------ sensors
 
-    def _readings(self, number: int, trajectory: Trajectory, effect: FloatArray) -> Readings:
-        """Return what effects that are no laws do to readings, with derivatives by their unknowns."""
+    def _readings(self, number: int, trajectory: Trajectory, effect: FloatArray) -> SensorReadings:
+        """Return what effects of sensors do to readings, with derivatives by their unknowns."""
         trial = self.trials[number]
         known = np.zeros_like(trial.residual)
         by_unknown: dict[int, FloatArray] = {}
-        at = len(trial.shared)
+        first_unknown = len(trial.shared)
         motion = seen_motion(trajectory)
-        for term, part in self.candidate.parts(effect):
+        for term, part in self.candidate.split(effect):
             if not len(term.patch(self.columns.problem.setting, part).of(PortForce)):
                 known = known + self._shown(number, motion, term, part)
                 for k in range(len(part)):
-                    above = self._shown(number, motion, term, moved(part, k, STEP))
-                    below = self._shown(number, motion, term, moved(part, k, -STEP))
-                    by_unknown[at + k] = (above - below) / (2.0 * STEP)
-            at += len(part)
-        return Readings(known, by_unknown)
+                    above = self._shown(number, motion, term, with_step(part, k, STEP))
+                    below = self._shown(number, motion, term, with_step(part, k, -STEP))
+                    by_unknown[first_unknown + k] = (above - below) / (2.0 * STEP)
+            first_unknown += len(part)
+        return SensorReadings(known, by_unknown)
 
-    def _shown(self, number: int, motion: Motion, term: Term, values: FloatArray) -> FloatArray:
+    def _shown(
+        self, number: int, motion: TrialMotion, term: EffectTerm, values: FloatArray
+    ) -> FloatArray:
         """Return what one effect does to the readings (N, C) of a trial, over their noise."""
         patch = term.patch(self.columns.problem.setting, values)
         part = self.columns.part(self.trials[number], motion, number, patch, term.effect.acts_on)
         return part.readings
 
 
-def moved(values: FloatArray, index: int, step: float) -> FloatArray:
-    """Return values with one of them a step further."""
-    found = values.copy()
-    found[index] += step
-    return found
-
-
-def seen_motion(trajectory: Trajectory) -> Motion:
+def seen_motion(trajectory: Trajectory) -> TrialMotion:
     """Return a trajectory as sensors see it: what laws and missing forces add."""
-    return Motion(
+    return TrialMotion(
         added=trajectory.added,
         forces=trajectory.forces,
         left={},

@@ -1,11 +1,11 @@
 """Trajectory, missing force and unknowns of a hypothesis, estimated together, with the evidence.
 
-Gauss-Newton on the trajectory: the trials are made linear along the last trajectory, one filter and one
-smoother give the next, until nothing moves. This is the iterated Kalman smoother (Bell 1994, SIAM J.
-Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It begins with a large missing force, with
-which a trajectory follows the readings whatever the law, and lowers it step by step (continuation). The
-innovations at the end give the evidence by Laplace's approximation, which chooses how large the missing force
-is.
+Gauss-Newton on the trajectory: the trials are made linear along the last trajectory, one filter and
+one smoother give the next, until nothing moves. This is the iterated Kalman smoother (Bell 1994,
+SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It begins with a large
+missing force, with which a trajectory follows the readings whatever the law, and lowers it step by
+step (continuation). The innovations at the end give the evidence by Laplace's approximation, which
+chooses how large the missing force is.
 """
 
 from collections.abc import Mapping
@@ -17,24 +17,31 @@ from typing import Protocol
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.missing_force.filtered import LEAST_PRECISION, Process, Regression, Solution, without
+from discrepancy.missing_force.filtered import (
+    LEAST_PRECISION,
+    Process,
+    Regression,
+    Solution,
+    without,
+)
 from discrepancy.missing_force.process_search import prior_log_density
 from discrepancy.missing_force.trial import SeenTrial
 
 from .laws import ForceAlong
-from .linearised import Forces, LinearisedTrial, Readings, SmoothedTrial, Trajectory
+from .linearised import Forces, LinearisedTrial, SensorReadings, SmoothedTrial, Trajectory
 
 SHARES_OF_SIZE = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
 """Deviations of the missing force, over the first one, through which it is lowered."""
 SMOOTHINGS = (0.1, 0.02, 0.005)
-"""Half windows of speeds, over the usual speed, over which laws of speed are averaged: wide ones first."""
+"""Half windows of speeds, over the usual speed, over which laws of speed are averaged: wide ones
+first."""
 ITERATIONS = 12
 """Linearisations at one size of the missing force, at most."""
 SETTLED = 0.02
 """Step of the unknowns, in their standard deviations, below which nothing moves any more."""
 LEVEL = 0.05
 """Change of the evidence [nat] below which nothing moves any more."""
-SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)
+STEP_FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Parts of a step that are tried in turn."""
 LONGEST_STEP = 2.0
 """Longest step of the unknown of an effect, in deviations of its prior."""
@@ -44,7 +51,7 @@ DECLINE = 12.0
 """Evidence [nat] below the best by which lower missing forces are given up."""
 
 
-class Laws(Protocol):
+class HypothesisLaws(Protocol):
     """The laws and sensors of a hypothesis, as the estimator asks for them."""
 
     @property
@@ -58,17 +65,25 @@ class Laws(Protocol):
         effect: FloatArray,
         shared: FloatArray,
         smoothing: float,
-    ) -> tuple[Mapping[int, Forces], Readings] | None:
-        """Return forces at ports and readings of a trial along a trajectory; None where they cannot be."""
+    ) -> tuple[Mapping[int, Forces], SensorReadings] | None:
+        """Return forces at ports and readings of a trial along a trajectory.
+
+        None where they cannot be.
+        """
 
     def forces(
-        self, number: int, trajectory: Trajectory, effect: FloatArray, shared: FloatArray, smoothing: float
+        self,
+        number: int,
+        trajectory: Trajectory,
+        effect: FloatArray,
+        shared: FloatArray,
+        smoothing: float,
     ) -> Mapping[int, ForceAlong] | None:
         """Return the forces at ports of a trial along a trajectory; None where they cannot be."""
 
 
 @dataclass(frozen=True, eq=False)
-class Estimate:
+class MotionEstimate:
     """A hypothesis at its most probable values.
 
     Attributes
@@ -86,7 +101,7 @@ class Estimate:
     log_evidence : float
         Logarithm of the evidence [nat], with the priors of the processes.
     trials : tuple of SmoothedTrial
-        Motion and missing forces of each trial.
+        TrialMotion and missing forces of each trial.
     converged : bool
         Whether the last step was short enough.
     """
@@ -112,30 +127,33 @@ class Linearisation:
         """Return shared unknowns and those of effects, and the unknowns of each trial."""
         total = np.zeros((1 + len(self.precision),) * 2)
         half = 0.0
-        for item in self.trials:
-            products, own_half = item.products
-            kept, kept_half = without(products, np.asarray(own_half), item.trial.local_precision)
-            total += kept
-            half += float(kept_half)
+        for linear_trial in self.trials:
+            products, half_of_trial = linear_trial.products
+            local_precision = linear_trial.trial.local_precision
+            without_local, half_without_local = without(
+                products, np.asarray(half_of_trial), local_precision
+            )
+            total += without_local
+            half += float(half_without_local)
         solution = Regression(total, half).solve(range(len(self.precision)), self.precision)
-        return solution, [self._local(item, solution.mean) for item in self.trials]
+        return solution, [self._local(linear_trial, solution.mean) for linear_trial in self.trials]
 
     def beside(self, processes: Mapping[int, Process]) -> "Linearisation":
         """Return the same with other missing forces."""
-        trials = tuple(replace(item, processes=processes) for item in self.trials)
+        trials = tuple(replace(trial, processes=processes) for trial in self.trials)
         return Linearisation(trials, self.precision)
 
-    def _local(self, item: LinearisedTrial, known: FloatArray) -> FloatArray:
+    def _local(self, linear_trial: LinearisedTrial, known: FloatArray) -> FloatArray:
         """Return the unknowns (L,) of a trial, given the others."""
-        products, _ = item.products
+        products, _ = linear_trial.products
         first = 1 + len(known)
-        precision = np.maximum(item.trial.local_precision, LEAST_PRECISION)
+        precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
         right = products[first:, 0] - products[first:, 1:first] @ known
         return np.linalg.solve(products[first:, first:] + np.diag(precision), right)
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
+class EstimatorStart:
     """Where an estimate begins.
 
     Attributes
@@ -154,18 +172,18 @@ class Start:
     processes: Mapping[int, Process]
 
 
-def following(found: Estimate) -> Start:
+def start_after(estimate: MotionEstimate) -> EstimatorStart:
     """Return the start of an estimate that begins where another one ended."""
-    return Start(
-        found.effect,
-        found.shared,
-        tuple(item.trajectory for item in found.trials),
-        found.processes,
+    return EstimatorStart(
+        estimate.effect,
+        estimate.shared,
+        tuple(smoothed.trajectory for smoothed in estimate.trials),
+        estimate.processes,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class Estimator:
+class MotionEstimator:
     """Estimates hypotheses on the same trials.
 
     Attributes
@@ -182,33 +200,35 @@ class Estimator:
     shared_precision: FloatArray
     usual: Mapping[int, Process]
 
-    def estimate(self, laws: Laws, start: Start) -> Estimate | None:
+    def estimate(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values; None where its laws cannot be followed.
 
         Parameters
         ----------
-        laws : Laws
-            Of the hypothesis.
-        start : Start
-            Where to begin.
+        laws : HypothesisLaws
+            The laws and sensors of the hypothesis.
+        start : EstimatorStart
+            The values and trajectories to begin with.
         """
         current = start
         for smoothing in SMOOTHINGS[:-1]:
-            found = self._iterated(laws, current, smoothing)
-            if found is None:
+            smoothed = self._iterated(laws, current, smoothing)
+            if smoothed is None:
                 return None
-            current = following(found)
+            current = start_after(smoothed)
         estimate = self._with_smaller_missing_forces(laws, current)
         return None if estimate is None else self._tuned(laws, estimate)
 
-    def _with_smaller_missing_forces(self, laws: Laws, start: Start) -> Estimate | None:
-        """Return the estimate whose missing force has the most probable of several sizes (continuation).
+    def _with_smaller_missing_forces(
+        self, laws: HypothesisLaws, start: EstimatorStart
+    ) -> MotionEstimate | None:
+        """Return the estimate with the most probable of several sizes of the missing force.
 
-        With a large missing force the trajectory follows the readings whatever the laws are. The size is
-        then lowered step by step, and each estimate begins where the last one ended. None if the laws
-        cannot be followed even at the first size.
+        With a large missing force the trajectory follows the readings whatever the laws are. The
+        size is then lowered step by step, and each estimate begins where the last one ended. None
+        if the laws cannot be followed even at the first size.
         """
-        best: Estimate | None = None
+        best: MotionEstimate | None = None
         current = start
         for fraction in SHARES_OF_SIZE:
             processes = {
@@ -222,36 +242,42 @@ class Estimator:
                 best = estimate
             elif estimate.log_evidence < best.log_evidence - DECLINE:
                 break
-            current = following(estimate)
+            current = start_after(estimate)
         return best
 
-    def _tuned(self, laws: Laws, found: Estimate) -> Estimate:
+    def _tuned(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
         """Return an estimate with size and time of its missing forces at the most probable values.
 
-        A pattern search by ever smaller factors; the trials stay linear along one trajectory meanwhile.
+        A pattern search by ever smaller factors; the trials stay linear along one trajectory
+        meanwhile.
         """
-        at = following(found)
-        linear = self.linearised(laws, at, SMOOTHINGS[-1])
+        start = start_after(estimate)
+        linear = self.linearised(laws, start, SMOOTHINGS[-1])
         if linear is None:
-            return found
-        processes = dict(at.processes)
+            return estimate
+        processes = dict(start.processes)
         top = self._evidence_beside(linear, processes)
         for factor in FACTORS:
             for port, name in product(tuple(processes), ("size", "time")):
                 for change in (factor, 1.0 / factor):
                     value = change * getattr(processes[port], name)
-                    tried = processes | {port: replace(processes[port], **{name: value})}
-                    evidence = self._evidence_beside(linear, tried)
+                    changed = processes | {port: replace(processes[port], **{name: value})}
+                    evidence = self._evidence_beside(linear, changed)
                     if evidence > top:
-                        processes, top = tried, evidence
+                        processes, top = changed, evidence
                         break
-        again = self._iterated(laws, replace(at, processes=processes), SMOOTHINGS[-1])
-        return again if again is not None and again.log_evidence > found.log_evidence else found
+        tuned = self._iterated(laws, replace(start, processes=processes), SMOOTHINGS[-1])
+        return (
+            tuned if tuned is not None and tuned.log_evidence > estimate.log_evidence else estimate
+        )
 
-    def _iterated(self, laws: Laws, start: Start, smoothing: float) -> Estimate | None:
-        """Return the estimate beside missing forces of given size and time, by Gauss-Newton steps."""
-        current, last_evidence = start, -inf
-        estimate: Estimate | None = None
+    def _iterated(
+        self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
+    ) -> MotionEstimate | None:
+        """Return the estimate beside given missing forces, by Gauss-Newton steps."""
+        current = start
+        last_evidence = -inf
+        estimate: MotionEstimate | None = None
         for _ in range(ITERATIONS):
             linear = self.linearised(laws, current, smoothing)
             if linear is None:
@@ -262,15 +288,15 @@ class Estimator:
             count = len(self.shared_precision)
             unknowns = solution.mean
             smoothed = tuple(
-                item.smoothed(np.concatenate((unknowns, own)))
-                for item, own in zip(linear.trials, local, strict=True)
+                trial.smoothed(np.concatenate((unknowns, local_unknowns)))
+                for trial, local_unknowns in zip(linear.trials, local, strict=True)
             )
             evidence = solution.evidence + self._log_prior(start.processes)
-            before = np.concatenate((current.shared, current.effect))
+            last_unknowns = np.concatenate((current.shared, current.effect))
             deviations = np.sqrt(np.diag(solution.covariance))
-            moved = float(np.max(np.abs(unknowns - before) / deviations, initial=0.0))
-            settled = moved < SETTLED and abs(evidence - last_evidence) < LEVEL
-            estimate = Estimate(
+            largest_move = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
+            is_settled = largest_move < SETTLED and abs(evidence - last_evidence) < LEVEL
+            estimate = MotionEstimate(
                 effect=unknowns[count:],
                 shared=unknowns[:count],
                 local=tuple(local),
@@ -278,13 +304,15 @@ class Estimator:
                 processes=start.processes,
                 log_evidence=evidence,
                 trials=smoothed,
-                converged=settled,
+                converged=is_settled,
             )
             last_evidence = evidence
-            ahead = None if settled else self._stepped(laws, current, estimate, linear, smoothing)
-            if ahead is None:
+            next_start = (
+                None if is_settled else self._stepped(laws, current, estimate, linear, smoothing)
+            )
+            if next_start is None:
                 return estimate
-            current = ahead
+            current = next_start
         return estimate
 
     def _evidence_beside(self, linear: Linearisation, processes: Mapping[int, Process]) -> float:
@@ -292,72 +320,104 @@ class Estimator:
         solution, _ = linear.beside(processes).solve()
         return solution.evidence + self._log_prior(processes)
 
-    def linearised(self, laws: Laws, at: Start, smoothing: float) -> Linearisation | None:
+    def linearised(
+        self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
+    ) -> Linearisation | None:
         """Return all trials, linear along trajectories; None where the laws cannot be followed."""
-        found = []
+        linear_trials = []
         for number, trial in enumerate(self.trials):
-            along = laws.along(number, at.trajectories[number], at.effect, at.shared, smoothing)
-            if along is None:
+            forces_and_sensors = laws.along(
+                number, start.trajectories[number], start.effect, start.shared, smoothing
+            )
+            if forces_and_sensors is None:
                 return None
-            forces, sensors = along
-            found.append(
+            forces, sensors = forces_and_sensors
+            linear_trials.append(
                 LinearisedTrial(
-                    trial, at.processes, at.trajectories[number], forces, sensors, at.effect, at.shared
+                    trial,
+                    start.processes,
+                    start.trajectories[number],
+                    forces,
+                    sensors,
+                    start.effect,
+                    start.shared,
                 )
             )
         precision = np.concatenate((self.shared_precision, np.ones(laws.size)))
-        return Linearisation(tuple(found), precision)
+        return Linearisation(tuple(linear_trials), precision)
 
     def _stepped(
-        self, laws: Laws, current: Start, ahead: Estimate, linear: Linearisation, smoothing: float
-    ) -> Start | None:
+        self,
+        laws: HypothesisLaws,
+        current: EstimatorStart,
+        estimate: MotionEstimate,
+        linear: Linearisation,
+        smoothing: float,
+    ) -> EstimatorStart | None:
         """Return the longest part of a step whose linear laws err by less than the missing force.
 
-        Where a law is not what it was linearised to, the difference acts as a further missing force of which
-        the smoother does not know. In no step is it larger than the missing force that the hypothesis admits.
+        Where a law is not what it was linearised to, the difference acts as a further missing force
+        of which the smoother does not know. In no step is it larger than the missing force that the
+        hypothesis admits.
         """
-        change = ahead.effect - current.effect
+        change = estimate.effect - current.effect
         longest = float(np.max(np.abs(change), initial=0.0))
         most = min(1.0, LONGEST_STEP / longest) if longest > 0.0 else 1.0
-        chosen: Start | None = None
-        for share in SHARES:
-            part = min(share, most)
-            there = Start(
-                current.effect + part * change,
-                current.shared + part * (ahead.shared - current.shared),
+        chosen: EstimatorStart | None = None
+        for fraction in STEP_FRACTIONS:
+            taken = min(fraction, most)
+            stepped = EstimatorStart(
+                current.effect + taken * change,
+                current.shared + taken * (estimate.shared - current.shared),
                 tuple(
-                    trajectory.toward(smoothed.trajectory, part)
-                    for trajectory, smoothed in zip(current.trajectories, ahead.trials, strict=True)
+                    trajectory.toward(smoothed.trajectory, taken)
+                    for trajectory, smoothed in zip(
+                        current.trajectories, estimate.trials, strict=True
+                    )
                 ),
                 current.processes,
             )
-            error = self._error_of_laws(laws, current, there, linear, smoothing)
+            error = self._error_of_laws(laws, current, stepped, linear, smoothing)
             if error is None:
                 continue
-            chosen = there
+            chosen = stepped
             if error <= 1.0:
                 break
         return chosen
 
     def _error_of_laws(
-        self, laws: Laws, current: Start, there: Start, linear: Linearisation, smoothing: float
+        self,
+        laws: HypothesisLaws,
+        current: EstimatorStart,
+        stepped: EstimatorStart,
+        linear: Linearisation,
+        smoothing: float,
     ) -> float | None:
-        """Return the root mean square error of the linear laws over the missing force's deviation."""
+        """Return the rms error of the linear laws over the deviation of the missing force."""
         worst = 0.0
-        for number, item in enumerate(linear.trials):
-            found = laws.forces(number, there.trajectories[number], there.effect, there.shared, smoothing)
-            if found is None:
+        for number, trial in enumerate(linear.trials):
+            forces_after = laws.forces(
+                number, stepped.trajectories[number], stepped.effect, stepped.shared, smoothing
+            )
+            if forces_after is None:
                 return None
-            change = np.concatenate((there.shared - current.shared, there.effect - current.effect))
-            for port, forces in item.forces.items():
-                position = there.trajectories[number].positions[:, port] - item.trajectory.positions[:, port]
-                speed = there.trajectories[number].speeds[:, port] - item.trajectory.speeds[:, port]
+            change = np.concatenate(
+                (stepped.shared - current.shared, stepped.effect - current.effect)
+            )
+            for port, forces in trial.forces.items():
+                position = (
+                    stepped.trajectories[number].positions[:, port]
+                    - trial.trajectory.positions[:, port]
+                )
+                speed = (
+                    stepped.trajectories[number].speeds[:, port] - trial.trajectory.speeds[:, port]
+                )
                 expected = forces.along.force + forces.along.by_position * position
                 expected = expected + forces.along.by_speed * speed
                 for unknown, slope in forces.by_unknown.items():
                     expected = expected + change[unknown] * slope
-                error = float(np.sqrt(np.mean((found[port].force - expected) ** 2)))
-                size = max(process.size for process in there.processes.values())
+                error = float(np.sqrt(np.mean((forces_after[port].force - expected) ** 2)))
+                size = max(process.size for process in stepped.processes.values())
                 worst = max(worst, error / size)
         return worst
 

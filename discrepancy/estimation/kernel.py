@@ -1,14 +1,16 @@
-"""Compiled loops of the estimator: step matrices with laws in them, a Kalman filter, and its smoother.
+"""Compiled loops of the estimator.
+
+Step matrices with laws in them, a Kalman filter, and its smoother.
 
 The system of a trial is linear along a trajectory and changes in time:
 
     z[j + 1] = transition[j] z[j] + drift[j] weights + process noise,
     columns weights = rows z + noise of variance one.
 
-`weights` is (1, w): a one for what is known, and the W - 1 unknowns of the hypothesis; `columns` is what each
-leaves of a reading. The filter carries what each weight does to the state beside the state itself (de Jong
-1991, Annals of Statistics 19, 1073-1083), so that unknowns that are constant in time are estimated by one
-regression after one pass, without being states.
+`weights` is (1, w): a one for what is known, and the W - 1 unknowns of the hypothesis; `columns` is
+what each leaves of a reading. The filter carries what each weight does to the state beside the
+state itself (de Jong 1991, Annals of Statistics 19, 1073-1083), so that unknowns that are constant
+in time are estimated by one regression after one pass, without being states.
 
 Shapes: F fine stamps, N samples, n states, C channels, W weights, P ports with a law.
 """
@@ -21,7 +23,10 @@ from fe.compilation import callable_when_compiled, compiled
 
 @callable_when_compiled
 def multiply(left: FloatArray, right: FloatArray, product: FloatArray) -> None:
-    """Fill the product of two small matrices; a loop is several times faster than a call of BLAS."""
+    """Fill the product of two small matrices.
+
+    A loop is several times faster than a call of BLAS.
+    """
     for i in range(left.shape[0]):
         for k in range(right.shape[1]):
             total = 0.0
@@ -31,8 +36,13 @@ def multiply(left: FloatArray, right: FloatArray, product: FloatArray) -> None:
 
 
 @callable_when_compiled
-def carry(transition: FloatArray, covariance: FloatArray, room: FloatArray, carried: FloatArray) -> None:
-    """Fill transition covariance transition^T, symmetric to the bit; `room` (n, n) is used meanwhile."""
+def carry(
+    transition: FloatArray, covariance: FloatArray, room: FloatArray, carried: FloatArray
+) -> None:
+    """Fill transition covariance transition^T, symmetric to the bit.
+
+    `room` (n, n) is used meanwhile.
+    """
     size = len(transition)
     multiply(transition, covariance, room)
     for i in range(size):
@@ -56,10 +66,12 @@ def step_matrices(
     pushes: FloatArray,
     drift: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transition and process noise of each fine step with the laws' tangents in them; fill its drift.
+    """Return transition and process noise of each fine step with the laws' tangents in them.
 
-    The force of a law is linear between two stamps. That at the end of a step depends on the state there, so
-    each step is implicit; its small system is solved by the Woodbury identity.
+    Fill its drift.
+
+    The force of a law is linear between two stamps. That at the end of a step depends on the state
+    there, so each step is implicit; its small system is solved by the Woodbury identity.
 
     Parameters
     ----------
@@ -70,7 +82,8 @@ def step_matrices(
     free_transition, free_noise : (K, n, n) ndarray
         Transition and process noise of a fine step without laws, by kind.
     push_at_begin, push_at_end : (K, n, P) ndarray
-        State that a unit force at a port adds over a fine step, from its value at the begin and at the end.
+        State that a unit force at a port adds over a fine step, from its value at the begin and at
+        the end.
     tangents : (F, P, n) ndarray
         Change of the force of the laws at a port by the state.
     pushes : (F, P, W) ndarray
@@ -119,9 +132,16 @@ def step_matrices(
 
 @callable_when_compiled
 def take_reading(
-    covariance: FloatArray, mean: FloatArray, row: FloatArray, innovation: FloatArray, gain: FloatArray
+    covariance: FloatArray,
+    mean: FloatArray,
+    row: FloatArray,
+    innovation: FloatArray,
+    gain: FloatArray,
 ) -> float:
-    """Take one reading into covariance (n, n) and mean (n, W); fill its gain (n,), return its variance."""
+    """Take one reading into covariance (n, n) and mean (n, W).
+
+    Fill its gain (n,), return its variance.
+    """
     states = len(row)
     weight = np.empty(states)
     variance = 1.0
@@ -132,7 +152,8 @@ def take_reading(
         variance += row[i] * weight[i]
     for i in range(states):
         gain[i] = weight[i] / variance
-    # Joseph's form: from both sides in turn, so that the second takes what rounding left of the first
+    # Joseph form: from both sides in turn, so that the second takes what rounding left of the
+    # first
     for i in range(states):
         for j in range(states):
             covariance[i, j] -= gain[i] * weight[j]
@@ -170,7 +191,8 @@ def filter_record(
     transition, noise, drift : (F - 1, n, n), (F - 1, n, n), (F - 1, n, W) ndarray
         As of `step_matrices`.
     rows, columns : (N, C, n), (N, C, W) ndarray
-        What a reading shows of the state, and what each weight leaves of it, over the deviation of its noise.
+        What a reading shows of the state, and what each weight leaves of it, over the deviation of
+        its noise.
     used : (N, C) ndarray of bool
         Readings that count.
     covariance, mean : (n, n), (n, W) ndarray
@@ -232,8 +254,8 @@ def smooth_record(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the smoothed state at each fine stamp, and its variances.
 
-    The fixed-interval smoother of de Jong (1989, J. American Statistical Association 84, 1085-1088), which
-    inverts no covariance.
+    The fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
+    1085-1088), which inverts no covariance.
 
     Parameters
     ----------
@@ -282,7 +304,9 @@ def smooth_record(
                 for i in range(size):
                     adjoint[i] += row[i] * surprise
                     for m in range(size):
-                        information[i, m] += scale * row[i] * row[m] - row[i] * along[m] - along[i] * row[m]
+                        information[i, m] += (
+                            scale * row[i] * row[m] - row[i] * along[m] - along[i] * row[m]
+                        )
         multiply(covariances[j], information, room)
         for i in range(size):
             reduction = 0.0

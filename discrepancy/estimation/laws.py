@@ -1,4 +1,7 @@
-"""The force of a law along a motion, and its tangents: what a filter needs to have the law inside of it."""
+"""The force of a law along a motion, and its tangents.
+
+What a filter needs to have the law inside of it.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,10 +11,10 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from fe.compilation import compiled, law_functions
-from fe.runtime.arrays import HEAD, PLACE
-from fe.runtime.laws import LAWS, advance, pull
+from fe.runtime.arrays import FIRST_ELEMENT, POSITION
+from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import steady
+from fe.runtime.laws.speed import steady_force
 
 NODES = 8
 """Speeds of a window over which a law of speed is averaged."""
@@ -57,27 +60,28 @@ def along(
     by_position: FloatArray,
     by_speed: FloatArray,
 ) -> None:
-    """Fill force and tangents (F,) of a law along positions and speeds (F,) that follow one another.
+    """Fill force and tangents (F,) of a law along positions and speeds (F,).
 
-    A law of speed is averaged over a window of speeds, so that the step of dry friction has a tangent. The
-    tangent of a law with memory is that at its present state: how the past would have changed is left out.
+    A law of speed is averaged over a window of speeds, so that the step of dry friction has a
+    tangent. The tangent of a law with memory is that at its present state: how the past would have
+    changed is left out.
     """
     for j in range(len(positions)):
         x, v = positions[j], speeds[j]
         if not of_speed:
             advance(number, law, memory, x)
-            memory[PLACE] = x
-            force[j], by_position[j] = pull(number, law, memory, x, 1.0)
+            memory[POSITION] = x
+            force[j], by_position[j] = force_and_slope(number, law, memory, x, 1.0)
             continue
         total = 0.0
         for i in range(NODES):
             offset = half_width * ((2.0 * i + 1.0) / NODES - 1.0)
-            total += steady(law, x, v + offset)
+            total += steady_force(law, x, v + offset)
         force[j] = total / NODES
-        ends = steady(law, x, v + half_width) - steady(law, x, v - half_width)
+        ends = steady_force(law, x, v + half_width) - steady_force(law, x, v - half_width)
         by_speed[j] = ends / (2.0 * half_width)
         if law[2] != 0.0:
-            beside = steady(law, x + nudge, v) - steady(law, x - nudge, v)
+            beside = steady_force(law, x + nudge, v) - steady_force(law, x - nudge, v)
             by_position[j] = beside / (2.0 * nudge)
 
 
@@ -89,7 +93,9 @@ def _compiled_along() -> Callable[..., None]:
 def force_along(
     law: PortForce, time: FloatArray, positions: FloatArray, speeds: FloatArray, smoothing: float
 ) -> ForceAlong:
-    """Return the force of a law along a motion of its port, and its tangents; zero outside of its windows.
+    """Return the force of a law along a motion of its port, and its tangents.
+
+    Zero outside of its windows.
 
     Parameters
     ----------
@@ -100,14 +106,14 @@ def force_along(
     smoothing : float
         Half the window of speeds over which a law of speed is averaged, over the usual speed.
     """
-    row = law.row
-    memory = np.zeros(HEAD + max(1, len(row) - PARAMETERS))
+    row = law.parameter_row
+    memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
     force, by_position, by_speed = np.zeros((3, len(time)))
     usual_speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-300)
     usual_position = max(float(np.sqrt(np.mean(positions**2))), 1e-300)
     _compiled_along()(
         LAWS.index(type(law)),
-        type(law).of_speed,
+        type(law).depends_on_speed,
         row,
         np.ascontiguousarray(positions),
         np.ascontiguousarray(speeds),
@@ -118,5 +124,5 @@ def force_along(
         by_position,
         by_speed,
     )
-    acts = law.acts(time)
+    acts = law.acts_at(time)
     return ForceAlong(force * acts, by_position * acts, by_speed * acts)

@@ -1,7 +1,7 @@
 """A trial, linear along a trajectory: the laws of a hypothesis in it, missing forces beside them.
 
-The state of a trial is what forces at ports add to the answer of the linear model. With the laws G of the
-hypothesis, the missing forces f (Gaussian processes in time) and the unknowns w,
+The state of a trial is what forces at ports add to the answer of the linear model. With the laws G
+of the hypothesis, the missing forces f (Gaussian processes in time) and the unknowns w,
 
     s' = A(w) s - sum_p b_p (G_p(x, v; w) + f_p),
     reading = r(w) + C(w) s - sum_p e_p (G_p(x, v; w) + f_p) + noise,
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from discrepancy.campaign.records import FloatArray, IntArray
-from discrepancy.missing_force.filtered import Filtered, Process
+from discrepancy.missing_force.filtered import ForceFilter, Process
 from discrepancy.missing_force.kalman import discretised
 from discrepancy.missing_force.trial import SeenTrial
 
@@ -32,11 +32,11 @@ class Trajectory:
     Attributes
     ----------
     added : (F, n) ndarray
-        State that forces at ports add to the answer of the linear model.
+        The state that forces at ports add to the response of the linear model.
     positions, speeds : (F, P) ndarray
-        Of the ports [m or rad, and per s].
+        The motion of the ports [m or rad, and per s].
     forces : mapping of int to (F,) ndarray
-        All that acts at a port beside the linear model, by its number [N or N m].
+        The force at a port beside the linear model, by the number of the port [N or N m].
     """
 
     added: FloatArray
@@ -44,17 +44,18 @@ class Trajectory:
     speeds: FloatArray
     forces: Mapping[int, FloatArray]
 
-    def toward(self, other: "Trajectory", share: float) -> "Trajectory":
-        """Return the trajectory a share of the way to another one."""
+    def toward(self, other: "Trajectory", fraction: float) -> "Trajectory":
+        """Return the trajectory a fraction of the way to another one."""
         ports = {*self.forces, *other.forces}
         forces = {
-            port: (1.0 - share) * self.forces.get(port, 0.0) + share * other.forces.get(port, 0.0)
+            port: (1.0 - fraction) * self.forces.get(port, 0.0)
+            + fraction * other.forces.get(port, 0.0)
             for port in ports
         }
         return Trajectory(
-            self.added + share * (other.added - self.added),
-            self.positions + share * (other.positions - self.positions),
-            self.speeds + share * (other.speeds - self.speeds),
+            self.added + fraction * (other.added - self.added),
+            self.positions + fraction * (other.positions - self.positions),
+            self.speeds + fraction * (other.speeds - self.speeds),
             {port: np.asarray(force) for port, force in forces.items()},
         )
 
@@ -76,8 +77,8 @@ class Forces:
 
 
 @dataclass(frozen=True, eq=False)
-class Readings:
-    """What an effect of sensors does to the readings of a trial, over the deviations of their noise.
+class SensorReadings:
+    """What effects of sensors do to the readings of a trial, over their noise.
 
     Attributes
     ----------
@@ -95,40 +96,41 @@ class Readings:
 class LinearisedTrial:
     """A trial, linear along a trajectory.
 
-    The unknowns are the shared ones, those of the hypothesis' effects, and the trial's own, in this order.
+    The unknowns are the shared ones, those of the hypothesis' effects, and the trial's own, in this
+    order.
 
     Attributes
     ----------
     trial : SeenTrial
-        Readings less the linear model, and how ports move.
+        The readings minus the linear model, and how ports move.
     processes : mapping of int to Process
         Missing forces, by the numbers of their ports.
     trajectory : Trajectory
-        Along which it is linear.
+        The trajectory along which it is linear.
     forces : mapping of int to Forces
-        Of the hypothesis' laws, by port.
-    sensors : Readings
-        Of the hypothesis' sensors.
+        The forces of the hypothesis' laws, by port.
+    sensors : SensorReadings
+        What the hypothesis' effects of sensors do to the readings.
     effect : (E,) ndarray
-        Values of the effects' unknowns at which laws and sensors are linearised.
+        The values of the effects' unknowns at which laws and sensors are linearised.
     shared : (K,) ndarray
-        Values of the shared unknowns there.
+        The values of the shared unknowns there.
     """
 
     trial: SeenTrial
     processes: Mapping[int, Process]
     trajectory: Trajectory
     forces: Mapping[int, Forces]
-    sensors: Readings
+    sensors: SensorReadings
     effect: FloatArray
     shared: FloatArray
 
     # ------------------------------------------------------------ layout
 
     @cached_property
-    def filtered(self) -> Filtered:
-        """The linear system with its missing forces, in units in which all states are of size one."""
-        return Filtered(self.trial, tuple(self.processes.items()))
+    def filtered(self) -> ForceFilter:
+        """The linear system with its missing forces, scaled so that states are of size one."""
+        return ForceFilter(self.trial, tuple(self.processes.items()))
 
     @property
     def moving(self) -> int:
@@ -141,7 +143,7 @@ class LinearisedTrial:
         return 1 + len(self.shared) + len(self.effect) + len(self.trial.local)
 
     def weight_of(self, unknown: int) -> int:
-        """Return the weight of a shared unknown, or of one of the trial's own, numbered after these."""
+        """Return the weight of a shared unknown or, numbered after these, of a trial's own."""
         count = len(self.shared)
         return 1 + unknown + (len(self.effect) if unknown >= count else 0)
 
@@ -156,36 +158,39 @@ class LinearisedTrial:
     def tangents(self) -> FloatArray:
         """Change (F, L, n) of the laws' force at each of their ports by the state."""
         generator, _, _, _ = self.filtered.system
-        found = np.zeros((len(self.trial.fine_time), len(self.ports), len(generator)))
-        system, units = self.trial.system, self.filtered.units
-        for at, port in enumerate(self.ports):
+        tangents = np.zeros((len(self.trial.fine_time), len(self.ports), len(generator)))
+        system = self.trial.system
+        units = self.filtered.units
+        for row, port in enumerate(self.ports):
             along = self.forces[port].along
-            found[:, at, : self.moving] = (
+            tangents[:, row, : self.moving] = (
                 along.by_position[:, None] * system.positions[port] * units
                 + along.by_speed[:, None] * system.speeds[port] * units
             )
-        return found
+        return tangents
 
     @cached_property
     def pushes(self) -> FloatArray:
         """Force (F, L, W) of the laws at each of their ports at state zero, by weight."""
-        trial, trajectory = self.trial, self.trajectory
-        found = np.zeros((len(trial.fine_time), len(self.ports), self.width))
-        for at, port in enumerate(self.ports):
+        trial = self.trial
+        trajectory = self.trajectory
+        pushes = np.zeros((len(trial.fine_time), len(self.ports), self.width))
+        for row, port in enumerate(self.ports):
             along = self.forces[port].along
             position = trial.positions[:, port] - trajectory.positions[:, port]
             speed = trial.speeds[:, port] - trajectory.speeds[:, port]
-            for unknown, moves in trial.by_unknowns.items():
-                position = position - trial.about[unknown] * moves[0][:, port]
-                speed = speed - trial.about[unknown] * moves[1][:, port]
-                found[:, at, self.weight_of(unknown)] += (
-                    along.by_position * moves[0][:, port] + along.by_speed * moves[1][:, port]
+            for unknown, (moved_positions, moved_speeds) in trial.by_unknowns.items():
+                position = position - trial.about[unknown] * moved_positions[:, port]
+                speed = speed - trial.about[unknown] * moved_speeds[:, port]
+                pushes[:, row, self.weight_of(unknown)] += (
+                    along.by_position * moved_positions[:, port]
+                    + along.by_speed * moved_speeds[:, port]
                 )
-            found[:, at, 0] = along.force + along.by_position * position + along.by_speed * speed
+            pushes[:, row, 0] = along.force + along.by_position * position + along.by_speed * speed
             for unknown, slope in self.forces[port].by_unknown.items():
-                found[:, at, 1 + unknown] += slope
-                found[:, at, 0] -= self._value(unknown) * slope
-        return found
+                pushes[:, row, 1 + unknown] += slope
+                pushes[:, row, 0] -= self._value(unknown) * slope
+        return pushes
 
     def _value(self, unknown: int) -> float:
         """Return the value at which a law is linear by a shared unknown or by one of an effect."""
@@ -195,10 +200,10 @@ class LinearisedTrial:
     def directions(self) -> FloatArray:
         """State (n, L) that a unit force at each of the laws' ports pushes."""
         generator, _, _, _ = self.filtered.system
-        found = np.zeros((len(generator), len(self.ports)))
-        for at, port in enumerate(self.ports):
-            found[: self.moving, at] = -self.trial.system.actions[port] / self.filtered.units
-        return found
+        directions = np.zeros((len(generator), len(self.ports)))
+        for row, port in enumerate(self.ports):
+            directions[: self.moving, row] = -self.trial.system.actions[port] / self.filtered.units
+        return directions
 
     # ------------------------------------------------------------ steps
 
@@ -223,12 +228,15 @@ class LinearisedTrial:
         )
         return transition, noise, drift
 
-    def _drift_by_parameters(self, begin: FloatArray, end: FloatArray, kind: IntArray) -> FloatArray:
+    def _drift_by_parameters(
+        self, begin: FloatArray, end: FloatArray, kind: IntArray
+    ) -> FloatArray:
         """Return the drift (F - 1, n, W) by what parameters change in the system itself."""
-        trial, moving = self.trial, self.moving
+        trial = self.trial
+        moving = self.moving
         steps = len(trial.fine_time) - 1
         drift = np.zeros((steps, len(begin[0]), self.width))
-        of_step = kind[np.arange(steps) // trial.parts + 1]
+        kind_of_step = kind[np.arange(steps) // trial.parts + 1]
         for unknown, slope in enumerate(trial.slopes):
             if slope is None:
                 continue
@@ -236,8 +244,8 @@ class LinearisedTrial:
             for port, force in self.trajectory.forces.items():
                 push = push - np.outer(force, slope.actions[port])
             push = push / self.filtered.units
-            added = np.einsum("jab,jb->ja", begin[of_step, :, :moving], push[:-1])
-            added += np.einsum("jab,jb->ja", end[of_step, :, :moving], push[1:])
+            added = np.einsum("jab,jb->ja", begin[kind_of_step, :, :moving], push[:-1])
+            added += np.einsum("jab,jb->ja", end[kind_of_step, :, :moving], push[1:])
             drift[:, :, 1 + unknown] += added
             drift[:, :, 0] -= trial.about[unknown] * added
         return drift
@@ -256,16 +264,18 @@ class LinearisedTrial:
         covariance = covariance.copy()
         covariance[:moving, :moving] = 0.0
         for place in self.filtered.places:
-            rest = np.linalg.lstsq(stiffness, -generator[:moving, place], rcond=1e-12)[0]
-            covariance[:moving, :moving] += np.outer(rest, rest)
-            covariance[:moving, place] = covariance[place, :moving] = rest
+            at_rest = np.linalg.lstsq(stiffness, -generator[:moving, place], rcond=1e-12)[0]
+            covariance[:moving, :moving] += np.outer(at_rest, at_rest)
+            covariance[:moving, place] = at_rest
+            covariance[place, :moving] = at_rest
         return covariance, mean
 
     # ------------------------------------------------------------ readings
 
     def _readings(self) -> tuple[FloatArray, FloatArray]:
         """Return rows (N, C, n) and columns (N, C, W) of the readings."""
-        trial, parts = self.trial, self.trial.parts
+        trial = self.trial
+        parts = trial.parts
         samples, channels = trial.residual.shape
         _, _, state_rows, _ = self.filtered.system
         rows = np.repeat(state_rows[None], samples, axis=0)
@@ -274,32 +284,35 @@ class LinearisedTrial:
         for unknown, slope in self.sensors.by_unknown.items():
             columns[:, :, 1 + unknown] -= slope
             columns[:, :, 0] += self._value(unknown) * slope
-        own = np.concatenate((trial.shared, trial.local))
-        for unknown, column in enumerate(own):
+        by_unknowns = np.concatenate((trial.shared, trial.local))
+        for unknown, column in enumerate(by_unknowns):
             columns[:, :, self.weight_of(unknown)] -= column
         for unknown, column in self._by_parameters().items():
             columns[:, :, 1 + unknown] -= column
             columns[:, :, 0] += trial.about[unknown] * column
         columns *= self.filtered.white[:, None]
-        for at, port in enumerate(self.ports):
+        for row, port in enumerate(self.ports):
             through = trial.system.through[port] / trial.deviation * self.filtered.white
             if not np.any(through):
                 continue
-            rows = rows - through[:, None] * self.tangents[::parts, at][:, None, :]
-            columns += self.pushes[::parts, at, None, :] * through[:, None]
+            rows = rows - through[:, None] * self.tangents[::parts, row][:, None, :]
+            columns += self.pushes[::parts, row, None, :] * through[:, None]
         return np.ascontiguousarray(rows), columns * trial.used[:, :, None]
 
     def _by_parameters(self) -> dict[int, FloatArray]:
-        """Return what a unit of shared unknowns (by number) does to readings along the trajectory."""
-        trial, trajectory = self.trial, self.trajectory
-        found: dict[int, FloatArray] = {}
+        """Return the derivatives of readings by shared unknowns along the trajectory."""
+        trial = self.trial
+        trajectory = self.trajectory
+        derivatives: dict[int, FloatArray] = {}
         for unknown, slope in enumerate(trial.slopes):
             if slope is not None:
-                found[unknown] = trial.over_noise(trial.shown(slope, trajectory.added, trajectory.forces))
+                derivatives[unknown] = trial.over_noise(
+                    trial.shown(slope, trajectory.added, trajectory.forces)
+                )
         shown = trial.readings(trajectory.added, trajectory.forces)
         for unknown, channel, scale in trial.gains:
-            found[unknown] = shown * scale * np.eye(shown.shape[1])[channel]
-        return found
+            derivatives[unknown] = shown * scale * np.eye(shown.shape[1])[channel]
+        return derivatives
 
     # ------------------------------------------------------------ filter and smoother
 
@@ -310,13 +323,21 @@ class LinearisedTrial:
         rows, columns = self._readings()
         covariance, mean = self._start()
         means, covariances, innovations, gains, variances = filter_record(
-            self.trial.parts, transition, noise, drift, rows, columns, self.trial.used, covariance, mean
+            self.trial.parts,
+            transition,
+            noise,
+            drift,
+            rows,
+            columns,
+            self.trial.used,
+            covariance,
+            mean,
         )
         return FilteredRecord(transition, rows, means, covariances, innovations, gains, variances)
 
     @cached_property
     def products(self) -> tuple[FloatArray, float]:
-        """Products (W, W) of residual and unknowns, whitened, and what they take from the evidence [nat].
+        """Products (W, W) of whitened residual and unknowns, and half a log determinant [nat].
 
         The second is half the sum of the logarithms of the readings' variances given those before.
         """
@@ -353,13 +374,17 @@ class LinearisedTrial:
         added = smoothed[:, : self.moving] * self.filtered.units
         missing: dict[int, FloatArray] = {}
         deviations: dict[int, FloatArray] = {}
-        for (port, process), place in zip(self.processes.items(), self.filtered.places, strict=True):
+        for (port, process), place in zip(
+            self.processes.items(), self.filtered.places, strict=True
+        ):
             missing[port] = smoothed[:, place] * process.size
             deviations[port] = np.sqrt(variance[:, place]) * process.size
         forces = dict(missing)
         laws: dict[int, FloatArray] = {}
         for at, port in enumerate(self.ports):
-            law = self.pushes[:, at] @ weights + np.einsum("fn,fn->f", self.tangents[:, at], smoothed)
+            law = self.pushes[:, at] @ weights + np.einsum(
+                "fn,fn->f", self.tangents[:, at], smoothed
+            )
             laws[port] = law
             forces[port] = forces.get(port, 0.0) + law
         shared = unknowns[: len(self.shared)]
@@ -411,8 +436,8 @@ class SmoothedTrial:
 def push_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the state (K, n, n) that a unit push adds over steps of some lengths (K,) [s].
 
-    The push is linear over the step: the first matrix is for its value at the begin, the second for that at
-    the end (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
+    The push is linear over the step: the first matrix is for its value at the begin, the second for
+    that at the end (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
     """
     n = len(generator)
     blocks = np.zeros((len(lengths), 3 * n, 3 * n))

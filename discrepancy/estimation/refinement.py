@@ -1,4 +1,4 @@
-"""Hypotheses that were followed along the missing force, estimated with their laws inside the smoother."""
+"""Hypotheses that followed the missing force, estimated with their laws in the smoother."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -6,14 +6,15 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.missing_force.explained import Explained
+from discrepancy.fits.candidate import with_step
+from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.filtered import Solution
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import SeenTrial
-from discrepancy.missing_force.view import Motion
+from discrepancy.missing_force.view import TrialMotion
 
-from .effects import STEP, EffectLaws, moved
-from .estimator import Estimate, Estimator, Start
+from .effects import STEP, EffectLaws
+from .estimator import EstimatorStart, MotionEstimate, MotionEstimator
 from .linearised import SmoothedTrial, Trajectory
 
 REFINED = 4
@@ -24,48 +25,65 @@ CLOSE = 60.0
 
 def refined(
     search: ForceSearch,
-    ranked: Sequence[Explained],
+    ranked: Sequence[ForceHypothesis],
     effect_count: int,
-    tell: Callable[[str], None] = lambda words: None,
-) -> list[Explained]:
-    """Return hypotheses, the most probable first, those that matter with their laws in the smoother.
+    on_progress: Callable[[str], None] = lambda message: None,
+) -> list[ForceHypothesis]:
+    """Return hypotheses, the most probable first, with the best ones estimated anew.
 
-    Along a motion that is taken as known a law that changes much within a step of time, as dry friction does
-    where the motion turns, is followed to the wrong values: a free exponent then explains more than the law.
-    A hypothesis keeps what it was followed to where the estimate is less probable.
+    The laws of these are inside the smoother.
+
+    Along a motion that is taken as known a law that changes much within a step of time, as dry
+    friction does where the motion turns, is followed to the wrong values: a free exponent then
+    explains more than the law. A hypothesis keeps what it was followed to where the estimate is
+    less probable.
 
     Parameters
     ----------
     search : ForceSearch
-        The missing forces.
-    ranked : sequence of Explained
-        The most probable first.
+        The search for the missing force.
+    ranked : sequence of ForceHypothesis
+        The hypotheses, the most probable first.
     effect_count : int
-        Effects that were looked for, for the prior of a hypothesis.
-    tell : callable
-        Takes a few words on what is estimated.
+        The number of effects that were looked for, for the prior of a hypothesis.
+    on_progress : callable
+        Takes a line that says what is estimated.
     """
 
-    def score(item: Explained) -> float:
-        return search.score(item, effect_count)
+    def score(hypothesis: ForceHypothesis) -> float:
+        return search.score(hypothesis, effect_count)
 
-    with_effects = [item for item in ranked if item.candidate.terms]
-    chosen = [item for item in with_effects if score(item) > score(with_effects[0]) - CLOSE][:REFINED]
-    found = list(ranked)
-    for item in chosen:
-        tell(f"estimating {item.candidate.words} together with the motion")
-        better = estimated(search, item)
-        if better is not None and better.log_evidence > item.log_evidence:
-            found[next(at for at, one in enumerate(found) if one is item)] = better
-    return sorted(found, key=lambda item: -score(item))
+    with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
+    close = []
+    for hypothesis in with_effects:
+        if score(hypothesis) > score(with_effects[0]) - CLOSE:
+            close.append(hypothesis)
+    hypotheses = list(ranked)
+    for hypothesis in close[:REFINED]:
+        on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
+        refined_hypothesis = estimated(search, hypothesis)
+        if refined_hypothesis is None:
+            continue
+        if refined_hypothesis.log_evidence > hypothesis.log_evidence:
+            hypotheses = [
+                refined_hypothesis if other is hypothesis else other for other in hypotheses
+            ]
+    return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
 
 
-def estimated(search: ForceSearch, followed: Explained) -> Explained | None:
-    """Return a hypothesis estimated from where it was followed to; None where its laws cannot be."""
+def estimated(search: ForceSearch, followed: ForceHypothesis) -> ForceHypothesis | None:
+    """Return a hypothesis estimated from where it was followed to.
+
+    None where its laws cannot be.
+    """
     trials = tuple(followed.view.trials)
     problem = search.problem
-    laws = EffectLaws(search.columns, trials, followed.candidate, search.own_laws, adjustable_laws(search))
-    estimator = Estimator(trials, problem.shared.precision, search.about(followed.processes))
+    laws = EffectLaws(
+        search.columns, trials, followed.candidate, search.own_laws, adjustable_laws(search)
+    )
+    estimator = MotionEstimator(
+        trials, problem.shared.precision, search.prior_processes(followed.processes)
+    )
     trajectories = tuple(
         Trajectory(motion.added, motion.positions, motion.speeds, motion.forces)
         for motion in followed.motions
@@ -75,48 +93,52 @@ def estimated(search: ForceSearch, followed: Explained) -> Explained | None:
         port: replace(process, size=max(process.size, search.whole_size(port)))
         for port, process in followed.processes.items()
     }
-    found = estimator.estimate(laws, Start(followed.effect, followed.shared, trajectories, processes))
-    return None if found is None else _explained(search, followed, found)
+    estimate = estimator.estimate(
+        laws, EstimatorStart(followed.effect, followed.shared, trajectories, processes)
+    )
+    return None if estimate is None else _explained(search, followed, estimate)
 
 
 def adjustable_laws(search: ForceSearch) -> tuple[int, ...]:
     """Return the shared unknowns by which the laws change that the model has itself."""
     shared = search.point.shared
-    here = search.own_laws(shared)
+    laws_at_point = search.own_laws(shared)
     return tuple(
         number
         for number in range(search.problem.shared.count)
-        if search.own_laws(moved(shared, number, STEP)) != here
+        if search.own_laws(with_step(shared, number, STEP)) != laws_at_point
     )
 
 
-def _explained(search: ForceSearch, followed: Explained, found: Estimate) -> Explained | None:
+def _explained(
+    search: ForceSearch, followed: ForceHypothesis, estimate: MotionEstimate
+) -> ForceHypothesis | None:
     """Return an estimate as a hypothesis of the search, which others may be added to."""
     motions = [
         _smoothed_motion(trial, smoothed)
-        for trial, smoothed in zip(followed.view.trials, found.trials, strict=True)
+        for trial, smoothed in zip(followed.view.trials, estimate.trials, strict=True)
     ]
-    view = search.linear(followed.view, motions, followed.candidate, found.effect)
+    view = search.linear(followed.view, motions, followed.candidate, estimate.effect)
     if view is None:
         return None
-    mean = np.concatenate((found.shared, found.effect))
-    return Explained(
+    mean = np.concatenate((estimate.shared, estimate.effect))
+    return ForceHypothesis(
         candidate=followed.candidate,
-        effect=found.effect,
-        processes=found.processes,
-        log_evidence=found.log_evidence,
+        effect=estimate.effect,
+        processes=estimate.processes,
+        log_evidence=estimate.log_evidence,
         view=view,
-        solution=Solution(found.log_evidence, mean, found.covariance),
-        local=found.local,
+        solution=Solution(estimate.log_evidence, mean, estimate.covariance),
+        local=estimate.local,
         motions=motions,
     )
 
 
-def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> Motion:
+def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> TrialMotion:
     """Return the smoothed motion of a trial in the form in which the search follows hypotheses.
 
-    The search asks which part of the motion the hypothesis explains: all but what the missing force,
-    which none of its laws is, adds to the state.
+    The search asks which part of the motion the hypothesis explains: all but what the missing
+    force, which none of its laws is, adds to the state.
     """
     trajectory = smoothed.trajectory
     state_by_missing_force = np.zeros_like(trajectory.added)
@@ -126,7 +148,7 @@ def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> Motion:
     for port, deviation in smoothed.deviations.items():
         at_samples = deviation[:: trial.parts]
         deviations[port] = (at_samples, _speed_deviation(trial, port, smoothed.state_deviation))
-    return Motion(
+    return TrialMotion(
         added=trajectory.added,
         forces=trajectory.forces,
         left=smoothed.missing,
@@ -138,6 +160,9 @@ def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> Motion:
 
 
 def _speed_deviation(trial: SeenTrial, port: int, state_deviation: FloatArray) -> float:
-    """Return how well the speed of a port is known, at most: as if errors of states were independent."""
+    """Return how well the speed of a port is known, at most.
+
+    As if errors of states were independent.
+    """
     row = trial.system.speeds[port]
     return float(np.median(np.sqrt(np.square(state_deviation) @ np.square(row))))

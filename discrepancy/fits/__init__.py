@@ -1,1 +1,4 @@
-"""A candidate explanation against a campaign: residuals, screen, maximum, evidence, draws, gates."""
+"""A candidate explanation against a campaign.
+
+Residuals, screen, maximum, evidence, draws, gates.
+"""

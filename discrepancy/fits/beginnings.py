@@ -1,8 +1,9 @@
-"""Unknown beginnings of trials, taken from their first readings.
+"""Fits of trials whose initial state is unknown, begun from the first readings.
 
-From rest, a swing of a whole record is far: its phase slips, and a descent ends in a wrong optimum. Over a
-few readings a motion is nearly linear in its beginning. So the beginning is fitted to these, then to twice
-as many, and so on to the whole record.
+Started from rest, the motion of a long record is far from the readings: its phase slips, and a
+descent ends in a wrong optimum. Over a few readings a motion is nearly linear in its initial state.
+So the initial state is fitted to the first readings, then to twice as many, and so on to the whole
+record.
 """
 
 from dataclasses import replace
@@ -14,62 +15,81 @@ from discrepancy.fits.fitting import CandidateFit, attempt
 from discrepancy.fits.problem import Problem
 
 FIRST_SAMPLES = 8
-"""Readings to which a beginning is fitted first."""
+"""Number of readings to which an initial state is fitted first."""
 STEPS = 12
-"""Steps of a fit to a part of the record."""
+"""Largest number of steps of a fit to the first part of a record."""
 MISFIT = 1.5
-"""χ² per sample from which on a beginning is looked for again."""
+"""χ² per sample from which on a fit is repeated from new initial states."""
 
 
-def refitted_from_beginnings(
-    problem: Problem, found: CandidateFit, *, iterations: int = 60, local_only: bool = False
+def refit_from_first_readings(
+    problem: Problem, fit: CandidateFit, *, iterations: int = 60, local_only: bool = False
 ) -> CandidateFit:
-    """Return a fit begun anew from what the first readings show, where that is better; else the fit as it is.
+    """Return a fit that begins at the initial states of the first readings, if it is better.
+
+    The given fit is returned where it explains the readings, where no trial has an unknown initial
+    state, and where the new fit is no better.
 
     Parameters
     ----------
     problem : Problem
-        Of the fit.
-    found : CandidateFit
-        The fit; nothing is done where it explains the readings, or no trial begins in an unknown state.
-    iterations, local_only
-        As of `discrepancy.fits.fitting.fit`.
+        The campaign and model that were fitted.
+    fit : CandidateFit
+        The fit to improve.
+    iterations : int
+        The largest number of steps.
+    local_only : bool
+        Whether only the unknowns of the trials are fitted, and all others stay.
     """
-    if found.chi_square < MISFIT * float(problem.counts.sum()) or not has_unknown_beginning(problem):
-        return found
-    shared = found.point.shared if local_only else np.zeros(problem.shared.size)
-    begun = from_beginnings(problem, Point(shared, problem.start(found.candidate).local, found.point.effect))
-    again = attempt(problem, found.candidate, begun, iterations=iterations, local_only=local_only)
-    return found if again is None or again.objective >= found.objective else again
+    is_fitted = fit.chi_square < MISFIT * float(problem.counts.sum())
+    if is_fitted or not has_unknown_initial_state(problem):
+        return fit
+    candidate = fit.candidate
+    start = Point(
+        shared=fit.point.shared if local_only else np.zeros(problem.shared.size),
+        local=problem.start(candidate).local,
+        effect=fit.point.effect,
+    )
+    start = with_initial_states_of_first_readings(problem, start)
+    new_fit = attempt(problem, candidate, start, iterations=iterations, local_only=local_only)
+    if new_fit is None or new_fit.objective >= fit.objective:
+        return fit
+    return new_fit
 
 
-def has_unknown_beginning(problem: Problem) -> bool:
-    """Whether a trial in motion begins in a state of which entries are unknown."""
-    return any(data.trial.is_dynamic and data.unknowns.initial_shape[0] for data in problem.trials)
+def has_unknown_initial_state(problem: Problem) -> bool:
+    """Return whether a trial in motion begins in a state with unknown entries."""
+    for data in problem.trials:
+        rows, _ = data.unknowns.initial_shape
+        if data.trial.is_dynamic and rows > 0:
+            return True
+    return False
 
 
-def from_beginnings(problem: Problem, point: Point) -> Point:
-    """Return a point whose trials' own unknowns are those that the first readings show, by the bare model.
+def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Point:
+    """Return a point with the unknowns of the trials as fitted to their first readings.
 
-    They are kept in `Problem.beginnings`, by trial: what begins a trial is the same for all hypotheses.
+    They are fitted with the model as it is and kept in `Problem.beginnings` by the name of the
+    trial, since the initial state of a trial is the same under all hypotheses.
     """
-    known = problem.beginnings
-    if any(data.trial.name not in known for data in problem.trials):
-        bare = replace(point, effect=np.zeros(0))
-        for data, unknowns in zip(problem.trials, _grown(problem, bare).local, strict=True):
-            known[data.trial.name] = unknowns
-    return replace(point, local=tuple(known[data.trial.name] for data in problem.trials))
+    beginnings = problem.beginnings
+    if any(data.trial.name not in beginnings for data in problem.trials):
+        without_effect = replace(point, effect=np.zeros(0))
+        fitted = _fit_to_growing_records(problem, without_effect)
+        for data, unknowns in zip(problem.trials, fitted.local, strict=True):
+            beginnings[data.trial.name] = unknowns
+    return replace(point, local=tuple(beginnings[data.trial.name] for data in problem.trials))
 
 
-def _grown(problem: Problem, point: Point) -> Point:
-    """Return the point with the trials' own unknowns fitted to more and more of the records."""
+def _fit_to_growing_records(problem: Problem, point: Point) -> Point:
+    """Return the point with the trials' unknowns fitted to growing parts of the records."""
     longest = max(len(data.trial.time) for data in problem.trials)
     samples = FIRST_SAMPLES
     while samples < 2 * longest:
-        part = problem.first_samples(samples)
-        fitted = attempt(part, Candidate(), point, iterations=STEPS, local_only=True)
-        if fitted is None:
+        shortened = problem.first_samples(samples)
+        fit = attempt(shortened, Candidate(), point, iterations=STEPS, local_only=True)
+        if fit is None:
             break
-        point = fitted.point
+        point = fit.point
         samples *= 2
     return point

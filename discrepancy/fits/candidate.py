@@ -1,4 +1,4 @@
-"""A candidate explanation: effects at given places, shapes fixed or free; where it stands, what it leaves."""
+"""Hypotheses of the search: sets of effects, and the values that fits give to them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -11,21 +11,26 @@ from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeP
 from discrepancy.verdict import FREE_SHAPE
 from fe.runtime.patch import ModelPatch
 
-Key = tuple[tuple[str, str], ...]
+CandidateKey = tuple[tuple[str, str], ...]
+"""Sorted pairs (label, place) of the effects of a candidate."""
 
 
 @dataclass(frozen=True)
-class Term:
-    """One effect of a candidate.
+class EffectTerm:
+    """One effect of a candidate, at one of its places.
+
+    All values of its parameters are standard normal variables: the prior maps them to physical
+    values.
 
     Attributes
     ----------
     effect : Effect
-        Which.
+        The effect of the catalogue.
     place : str
-        One of its discrete places.
+        The place, one of `effect.places(setting)`.
     free_shape : bool
-        Whether its shape parameters are fitted (the effect's family) or canonical (the effect itself).
+        Whether the shape parameters are fitted (the family of the effect), or stay at their
+        canonical values (the effect itself).
     """
 
     effect: Effect
@@ -34,154 +39,197 @@ class Term:
 
     @property
     def label(self) -> str:
-        """The effect's identifier, marked where its shape is free."""
-        return self.effect.identifier + (FREE_SHAPE if self.free_shape else "")
+        """The identifier of the effect, with a mark where its shape is free."""
+        if self.free_shape:
+            return self.effect.identifier + FREE_SHAPE
+        return self.effect.identifier
 
     @property
     def parameters(self) -> tuple[EffectParameter | ShapeParameter, ...]:
-        """Fitted parameters, in order."""
-        return (*self.effect.parameters, *(self.effect.shape if self.free_shape else ()))
-
-    def values(self, normal: Sequence[float] | FloatArray) -> dict[str, float]:
-        """Return values by name at standard normal variables, one for each parameter."""
-        return {
-            item.name: item.prior.value(float(u)) for item, u in zip(self.parameters, normal, strict=True)
-        }
-
-    def patch(self, setting: Setting, normal: Sequence[float] | FloatArray) -> ModelPatch:
-        """Return the patch at standard normal variables, one for each parameter."""
-        return self.effect.patch(setting, self.values(normal), self.place)
-
-    def sized(
-        self, normal: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
-    ) -> FloatArray:
-        """Return standard normal variables with the magnitudes so many times as large, between ends."""
-        found = normal.copy()
-        for number, item in enumerate(self.parameters):
-            if item.magnitude:
-                value = factor * item.prior.value(float(normal[number]))
-                if item.prior.shape == "log_normal":  # it cannot change its sign
-                    value = max(value, item.prior.value(lowest))
-                found[number] = np.clip(item.prior.normal(value), lowest, highest)
-        return found
+        """The fitted parameters, in order."""
+        if self.free_shape:
+            return (*self.effect.parameters, *self.effect.shape)
+        return self.effect.parameters
 
     @property
-    def may_turn(self) -> bool:
-        """Whether its size may be negative."""
-        ends = [item.prior.low for item in self.parameters if item.magnitude]
-        return not ends or min(ends) < 0.0
+    def may_be_negative(self) -> bool:
+        """Whether the magnitude of the effect may be negative."""
+        low_ends = [parameter.prior.low for parameter in self.parameters if parameter.magnitude]
+        return not low_ends or min(low_ends) < 0.0
+
+    def values(self, normal: Sequence[float] | FloatArray) -> dict[str, float]:
+        """Return the physical values by name, at the standard normal variables (E,)."""
+        pairs = zip(self.parameters, normal, strict=True)
+        return {parameter.name: parameter.prior.value(float(u)) for parameter, u in pairs}
+
+    def patch(self, setting: Setting, normal: Sequence[float] | FloatArray) -> ModelPatch:
+        """Return the patch of the model at standard normal variables (one for each parameter)."""
+        return self.effect.patch(setting, self.values(normal), self.place)
 
     def start(self) -> FloatArray:
-        """Return the standard normal variables at prior medians and canonical shapes."""
-        return np.array(
-            [
-                item.prior.normal(item.canonical) if isinstance(item, ShapeParameter) else 0.0
-                for item in self.parameters
-            ]
-        )
+        """Return the standard normal variables of the prior medians and the canonical shapes."""
+        variables = []
+        for parameter in self.parameters:
+            if isinstance(parameter, ShapeParameter):
+                variables.append(parameter.prior.normal(parameter.canonical))
+            else:
+                variables.append(0.0)
+        return np.array(variables)
+
+    def rescaled(
+        self, normal: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
+    ) -> FloatArray:
+        """Return the standard normal variables at which the magnitudes are multiplied by a factor.
+
+        Parameters
+        ----------
+        normal : (E,) array
+            The standard normal variables of the term's parameters.
+        factor : float
+            The factor on the physical value of each magnitude.
+        lowest, highest : float
+            The limits of the returned variables of magnitudes.
+        """
+        rescaled = normal.copy()
+        for number, parameter in enumerate(self.parameters):
+            if not parameter.magnitude:
+                continue
+            prior = parameter.prior
+            value = factor * prior.value(float(normal[number]))
+            if prior.shape == "log_normal":  # a log-normal magnitude cannot change its sign
+                value = max(value, prior.value(lowest))
+            rescaled[number] = np.clip(prior.normal(value), lowest, highest)
+        return rescaled
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A set of effects that act together; the empty one is the model as it is."""
+    """A hypothesis: a set of effects that act together. The empty set is the model as it is.
 
-    terms: tuple[Term, ...] = ()
+    Attributes
+    ----------
+    terms : tuple of EffectTerm
+        The effects at their places.
+    """
+
+    terms: tuple[EffectTerm, ...] = ()
 
     @property
     def identifiers(self) -> tuple[str, ...]:
-        """Identifiers of the effects, sorted; those of free shape are marked by `FREE_SHAPE`."""
+        """The sorted labels of the effects: identifiers, with a mark where the shape is free."""
         return tuple(sorted(term.label for term in self.terms))
 
     @property
-    def key(self) -> Key:
-        """What tells candidates apart: sorted (identifier, place)."""
+    def key(self) -> CandidateKey:
+        """The sorted pairs (label, place), which no other candidate has."""
         return tuple(sorted((term.label, term.place) for term in self.terms))
 
     @property
-    def words(self) -> str:
-        """The effects for a line of progress."""
+    def description(self) -> str:
+        """The effects for a line of progress, such as "mass and stiffness"."""
         return " and ".join(self.identifiers)
 
     @property
     def is_family(self) -> bool:
-        """Whether a shape is free."""
+        """Whether the shape of one of the effects is free."""
         return any(term.free_shape for term in self.terms)
 
     @property
     def parameters(self) -> list[EffectParameter | ShapeParameter]:
-        """Fitted parameters, in order."""
-        return [item for term in self.terms for item in term.parameters]
+        """The fitted parameters of all effects, in order."""
+        return [parameter for term in self.terms for parameter in term.parameters]
 
     @property
     def size(self) -> int:
-        """Number of fitted parameters."""
+        """The number E of fitted parameters."""
         return len(self.parameters)
 
     @property
     def acts_on(self) -> frozenset[TrialKind]:
-        """Kinds of trials that it changes."""
+        """The kinds of trials whose prediction the candidate changes."""
         return frozenset().union(*(term.effect.acts_on for term in self.terms))
 
-    def acting(self, index: int) -> frozenset[TrialKind]:
-        """Kinds of trials that change with the fitted parameter of this index."""
-        owners = [term for term in self.terms for _ in term.parameters]
-        return owners[index].effect.acts_on
+    def acts_on_with(self, parameter: int) -> frozenset[TrialKind]:
+        """Return the kinds of trials whose prediction depends on a parameter, given its index."""
+        effects = [term.effect for term in self.terms for _ in term.parameters]
+        return effects[parameter].acts_on
 
-    def parts(self, normal: FloatArray) -> list[tuple[Term, FloatArray]]:
-        """Return each term with its own of the standard normal variables (size,)."""
+    def split(self, normal: FloatArray) -> list[tuple[EffectTerm, FloatArray]]:
+        """Return each term with its share of the standard normal variables (E,)."""
+        if not self.terms:
+            return []
         ends = np.cumsum([len(term.parameters) for term in self.terms])
-        return list(zip(self.terms, np.split(normal, ends[:-1]), strict=True)) if self.terms else []
+        return list(zip(self.terms, np.split(normal, ends[:-1]), strict=True))
 
     def stepped(self, normal: FloatArray, step: FloatArray) -> FloatArray:
-        """Return standard normal variables after a step, of magnitudes along the tangents of values."""
+        """Return the standard normal variables (E,) after a step (E,).
+
+        A magnitude steps along the tangent of its physical value, in which the prediction is nearly
+        linear; every other parameter steps in its standard normal variable.
+        """
+        variables = []
         moves = zip(self.parameters, normal.tolist(), step.tolist(), strict=True)
-        return np.array([item.prior.stepped(u, du) if item.magnitude else u + du for item, u, du in moves])
+        for parameter, u, du in moves:
+            variables.append(parameter.prior.stepped(u, du) if parameter.magnitude else u + du)
+        return np.array(variables)
 
     def patches(self, setting: Setting, normal: FloatArray) -> list[ModelPatch]:
-        """Return the patch of each term at standard normal variables (size,)."""
-        return [term.patch(setting, part) for term, part in self.parts(normal)]
+        """Return the patch of each term at the standard normal variables (E,)."""
+        return [term.patch(setting, values) for term, values in self.split(normal)]
 
     def patch(self, setting: Setting, normal: FloatArray) -> ModelPatch:
-        """Return the patch at standard normal variables (size,)."""
+        """Return the patch of all terms together at the standard normal variables (E,)."""
         return sum(self.patches(setting, normal), ModelPatch())
 
     def start(self) -> FloatArray:
-        """Return the standard normal variables at which a fit may begin."""
-        return np.concatenate([term.start() for term in self.terms]) if self.terms else np.empty(0)
+        """Return the standard normal variables (E,) from which a fit may begin."""
+        if not self.terms:
+            return np.empty(0)
+        return np.concatenate([term.start() for term in self.terms])
 
-    def plus(self, term: Term) -> "Candidate":
-        """Return this set and one more effect."""
+    def with_term(self, term: EffectTerm) -> "Candidate":
+        """Return the candidate with one more effect."""
         return Candidate((*self.terms, term))
 
-    def some(self, kept: Iterable[int], normal: FloatArray) -> tuple["Candidate", FloatArray]:
-        """Return some of the effects with their standard normal variables, of those of all (size,)."""
-        parts = self.parts(normal)
-        terms, values = zip(*(parts[number] for number in kept), strict=True)
+    def subset(self, numbers: Iterable[int], normal: FloatArray) -> tuple["Candidate", FloatArray]:
+        """Return the candidate of some of the terms, and its standard normal variables.
+
+        Parameters
+        ----------
+        numbers : iterable of int
+            The indices of the terms to keep, at least one.
+        normal : (E,) array
+            The standard normal variables of all terms.
+        """
+        parts = self.split(normal)
+        terms, values = zip(*(parts[number] for number in numbers), strict=True)
         return Candidate(terms), np.concatenate(values)
 
 
 PARAMETER_STEP = 1e-2
-"""Step of the differences in scaled variables."""
+"""Step of finite differences in scaled variables."""
 LEAST_STEP = 1e-4
-"""Least step by effect parameters, above the rounding of the integration."""
+"""Least step in effect parameters: above the rounding of the time integration."""
 SHARED_STEP = 1e-3
-"""The same for calibrated parameters: what effects share with the stiffness must cancel to a thousandth."""
+"""Step in calibrated parameters: what an effect shares with the stiffness must cancel to a
+thousandth."""
 
 
 @dataclass(frozen=True)
-class Linearisation:
-    """Prediction of one trial and its derivatives, before gain and zero.
+class TrialDerivatives:
+    """The prediction of one trial and its derivatives, without gains and zeros of the channels.
 
     Attributes
     ----------
-    response : (N, C) ndarray
-        Prediction without gain and zero.
-    parameters : (P, N, C) ndarray
-        Its derivatives by the scaled calibrated parameters.
-    local : (I, N, C) ndarray
-        By the scaled initial state, time zero and health.
-    effect : (E, N, C) ndarray
-        By the scaled effect parameters; empty without effect.
+    response : (N, C) array
+        The prediction at N times in C channels [unit of the channel].
+    parameters : (P, N, C) array
+        The derivatives with respect to the scaled calibrated parameters.
+    local : (I, N, C) array
+        The derivatives with respect to the scaled unknowns of the trial except its zeros: initial
+        state, constants of inputs, time zero, health.
+    effect : (E, N, C) array
+        The derivatives with respect to the scaled effect parameters.
     """
 
     response: FloatArray
@@ -192,16 +240,16 @@ class Linearisation:
 
 @dataclass(frozen=True)
 class Point:
-    """Values of all scaled variables.
+    """Values of all scaled unknowns of a fit.
 
     Attributes
     ----------
-    shared : (Q,) ndarray
-        Global unknowns.
-    local : tuple of (L_t,) ndarray
-        Of each trial.
-    effect : (E,) ndarray
-        Of the candidate.
+    shared : (Q,) array
+        The unknowns that all hypotheses and trials share: calibrated parameters and gains.
+    local : tuple of (L,) array
+        The unknowns of each trial.
+    effect : (E,) array
+        The effect parameters of the candidate.
     """
 
     shared: FloatArray
@@ -210,72 +258,77 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
-    """Where a candidate stands: a fit, or on the way to one.
+class FitState:
+    """A candidate at one point: the result of a fit, or a step on the way to it.
 
     Attributes
     ----------
     point : Point
-        Values of all unknowns.
+        The values of all unknowns.
     objective : float
-        -ln posterior there, up to a constant shared by all candidates [nat].
-    residuals : tuple of (N, C) ndarray
-        Standardised, of each trial.
-    sums : (channels,) ndarray
-        Sum of squared residuals by channel.
-    linearisations : tuple of Linearisation
-        At the point.
+        The negative log posterior, up to a constant that all candidates share [nat].
+    residuals : tuple of (N, C) array
+        The standardised residuals of each trial.
+    sums : (channels,) array
+        The sum of squared standardised residuals of each channel.
+    linearisations : tuple of TrialDerivatives
+        The prediction of each trial and its derivatives at the point, or near it.
     """
 
     point: Point
     objective: float
     residuals: tuple[FloatArray, ...]
     sums: FloatArray
-    linearisations: tuple[Linearisation, ...] = field(repr=False)
+    linearisations: tuple[TrialDerivatives, ...] = field(repr=False)
 
     @property
     def responses(self) -> tuple[FloatArray, ...]:
-        """Of each trial, (N, C), without gain and zero."""
-        return tuple(part.response for part in self.linearisations)
+        """The prediction (N, C) of each trial, without gains and zeros of the channels."""
+        return tuple(derivatives.response for derivatives in self.linearisations)
 
 
-def moved(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
-    """Return the values with one of them a step further."""
+def with_step(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:
+    """Return a copy of the values in which one of them is larger by a step."""
     changed = values.copy()
     changed[index] += step
     return changed
 
 
 @dataclass(frozen=True, eq=False)
-class Remainder:
-    """What is left in each channel of trials in motion.
+class ResidualProcess:
+    """A random process for each channel that describes what a fit leaves beside white noise.
+
+    No model of a real structure leaves white noise. Hypotheses are then compared under a noise that
+    is as wide as the residuals of the best of them (Kennedy and O'Hagan 2001).
 
     Attributes
     ----------
-    size : (channels,) ndarray
-        Standard deviation beside the noise, over that of the noise; nought where noise alone is left.
-    factor : (channels,) ndarray
-        Deviation of the noise that counts as many samples as are independent, over the recorded one.
-    time : (channels,) ndarray
-        Over which it forgets [s].
-    frequency : (channels,) ndarray
-        At which it swings [Hz]; nought if it does not.
-    of_noise : (channels,) ndarray of bool
-        Where it is the colour of the noise itself, as its record admits.
+    amplitude : (channels,) array
+        The standard deviation beside the noise, relative to that of the noise; 0 where the
+        residuals are noise alone.
+    noise_factor : (channels,) array
+        The factor on the recorded noise deviation that makes dependent samples count as so many
+        independent ones; 1 where the residuals are white noise.
+    correlation_time : (channels,) array
+        The time over which the process forgets [s].
+    frequency : (channels,) array
+        The frequency at which it swings [Hz]; 0 if it does not swing.
+    is_recorded_colour : (channels,) array of bool
+        Whether the residuals have the colour that the noise record of the channel itself has.
     """
 
-    size: FloatArray
-    factor: FloatArray
-    time: FloatArray
+    amplitude: FloatArray
+    noise_factor: FloatArray
+    correlation_time: FloatArray
     frequency: FloatArray
-    of_noise: BoolArray
+    is_recorded_colour: BoolArray
 
     @property
-    def acts(self) -> bool:
-        """Whether anything but white noise is left."""
-        return bool(np.any(self.factor != 1.0))
+    def is_present(self) -> bool:
+        """Whether a channel has residuals other than white noise of the recorded level."""
+        return bool(np.any(self.noise_factor != 1.0))
 
     @property
-    def is_noise(self) -> bool:
-        """Whether all that is left is the colour of the noise, as its records have it."""
-        return bool(np.all(self.of_noise | (self.factor == 1.0)))
+    def is_all_recorded_colour(self) -> bool:
+        """Whether all that the fit leaves is noise of the colour that its records have."""
+        return bool(np.all(self.is_recorded_colour | (self.noise_factor == 1.0)))

@@ -1,74 +1,95 @@
-"""Fit of a candidate: maximum of the posterior by Levenberg-Marquardt, and its Laplace evidence.
+"""Fit of a candidate.
 
-The derivatives by what all hypotheses share change little with an effect: a fit may begin with those of the
-fit that it extends.
+The maximum of the posterior by Levenberg-Marquardt, and its Laplace evidence.
+
+The derivatives with respect to what all hypotheses share change little with an effect. So a fit may
+begin with those of the fit that it extends.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray, IntArray
-from discrepancy.errors import DiscrepancyError, FitError, said
-from discrepancy.fits.candidate import Candidate, Linearisation, Point, Remainder, State
+from discrepancy.errors import DiscrepancyError, FitError
+from discrepancy.fits.candidate import (
+    Candidate,
+    FitState,
+    Point,
+    ResidualProcess,
+    TrialDerivatives,
+)
 from discrepancy.fits.problem import Problem
+from reporting.words import comma_list
 
 LEAST_PRECISION = 1e-12
-"""Of an unknown of which neither prior nor readings tell anything."""
+"""Precision of an unknown about which neither its prior nor the readings say anything."""
 
 
-def finite(values: FloatArray) -> FloatArray:
-    """Return values as they are.
+def check_finite(values: FloatArray) -> FloatArray:
+    """Return the values as they are, if all of them are finite.
 
     Raises
     ------
     FitError
-        If one of them is not finite.
+        If one of the values is not finite.
     """
     if not np.all(np.isfinite(values)):
-        raise FitError("The model gives values or derivatives that are not finite where a fit has come to.")
+        raise FitError(
+            "The model gives values or derivatives that are not finite where a fit has come to."
+        )
     return values
 
 
-def upper_factor(matrix: FloatArray) -> FloatArray:
-    """Return U (n, n) of a symmetric matrix U^T U; what stands below its diagonal means nothing.
+def cholesky_factor(matrix: FloatArray) -> FloatArray:
+    """Return the upper Cholesky factor U (n, n) of a symmetric matrix U^T U.
+
+    The entries below the diagonal of the returned array are arbitrary.
 
     Raises
     ------
     FitError
-        If it is not finite or not positive definite.
+        If the matrix is not finite or not positive definite.
     """
     try:
-        return np.asarray(cho_factor(finite(matrix), check_finite=False)[0])
+        return np.asarray(cho_factor(check_finite(matrix), check_finite=False)[0])
     except np.linalg.LinAlgError as cause:
-        raise FitError("The normal equations of a fit are singular; a parameter has no influence.") from cause
+        raise FitError(
+            "The normal equations of a fit are singular; a parameter has no influence."
+        ) from cause
 
 
-def solved(factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Return (U^T U)^-1 b for columns b (n, ...)."""
+def solve_factored(factor: FloatArray, right: FloatArray) -> FloatArray:
+    """Return (U^T U)^-1 b, given the factor U (n, n) and right-hand sides b (n, ...)."""
     return np.asarray(cho_solve((factor, False), right, check_finite=False))
+
+
+# ---------------------------------------------------------------- normal equations
 
 
 @dataclass(frozen=True, eq=False)
 class TrialRows:
-    """What the unknowns that touch a trial do to its readings, over their noise.
+    """The derivatives and residuals of one trial, over the deviation of the noise.
 
     Attributes
     ----------
-    rows : (L + K, N C) ndarray
-        By the L unknowns of the trial, then by K of the shared ones and effect parameters.
-    index : (K,) ndarray of int
-        Which these are.
-    root : (C,) ndarray
-        Of the precision of each channel.
-    residual : (N C,) ndarray
-        Over the noise.
-    value, prior : (L,) ndarray
-        Of the trial's unknowns, and the precision of their prior.
+    rows : (L + K, N C) array
+        The derivatives of the readings with respect to the L unknowns of the trial, then to the K
+        shared unknowns and effect parameters that act on it.
+    index : (K,) array of int
+        The indices of these K among all shared unknowns and effect parameters.
+    root : (C,) array
+        The square root of the relative noise precision of each channel.
+    residual : (N C,) array
+        The residuals.
+    value : (L,) array
+        The values of the unknowns of the trial.
+    prior : (L,) array
+        The prior precisions of the unknowns of the trial.
     """
 
     rows: FloatArray
@@ -78,35 +99,69 @@ class TrialRows:
     value: FloatArray
     prior: FloatArray
 
-    def followed(self) -> tuple[FloatArray, FloatArray]:
-        """Return the factor of the own unknowns, and what they (L, K) do less of as others do more."""
-        own, others = np.split(self.rows, [len(self.prior)])
-        factor = upper_factor(own @ own.T + np.diag(self.prior + LEAST_PRECISION))
-        return factor, solved(factor, own @ others.T)
+    def eliminate_local(self) -> tuple[FloatArray, FloatArray]:
+        """Return what eliminates the unknowns of the trial from its normal equations.
+
+        With A the block of the trial's unknowns and B that between them and the shared ones, it is
+        the Cholesky factor (L, L) of A, and A^-1 B (L, K): by how much the trial's unknowns fall
+        as the shared ones rise.
+        """
+        local_rows, shared_rows = np.split(self.rows, [len(self.prior)])
+        block = local_rows @ local_rows.T + np.diag(self.prior + LEAST_PRECISION)
+        factor = cholesky_factor(block)
+        return factor, solve_factored(factor, local_rows @ shared_rows.T)
 
 
 def trial_rows(
-    problem: Problem, number: int, found: State, candidate: Candidate, precision: FloatArray
+    problem: Problem, number: int, state: FitState, candidate: Candidate, precision: FloatArray
 ) -> TrialRows:
-    """Return the derivatives of a trial at a state, by precisions (channels,) of all channels."""
-    data, point = problem.trials[number], found.point
-    columns, index = problem.columns(number, point, found.linearisations[number], candidate)
+    """Return the derivatives and residuals of a trial at a state, over the deviation of the noise.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    number : int
+        The index of the trial.
+    state : FitState
+        The point, its residuals and derivatives.
+    candidate : Candidate
+        The effects whose parameters are unknowns.
+    precision : (channels,) array
+        The noise precision of each channel, relative to the recorded one.
+    """
+    data = problem.trials[number]
+    columns, index = problem.prediction_derivatives(
+        number, state.point, state.linearisations[number], candidate
+    )
     root = np.sqrt(precision[data.groups])
-    residual = (found.residuals[number] * root).ravel()
+    residual = (state.residuals[number] * root).ravel()
     rows = (data.standardised(columns) * root).reshape(len(columns), residual.size)
-    return TrialRows(rows, index, root, residual, point.local[number], data.unknowns.precision)
+    return TrialRows(
+        rows=rows,
+        index=index,
+        root=root,
+        residual=residual,
+        value=state.point.local[number],
+        prior=data.unknowns.precision,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """Normal equations of shared unknowns, effect parameters, and the unknowns of each trial, in this order.
+    """The normal equations of a fit.
+
+    Their unknowns are the shared ones, the effect parameters, and those of each trial, in this
+    order.
 
     Attributes
     ----------
-    trials : list of (TrialRows, (M,) ndarray of int)
-        Of each trial, and which of all unknowns its rows belong to.
-    matrix, gradient : (n, n), (n,) ndarray
-        With prior.
+    trials : list of (TrialRows, (M,) array of int)
+        The derivatives of each trial, and the indices of their rows among all unknowns.
+    matrix : (n, n) array
+        The approximate Hessian of the negative log posterior.
+    gradient : (n,) array
+        The negative gradient of the negative log posterior: downhill.
     """
 
     trials: list[tuple[TrialRows, IntArray]]
@@ -116,74 +171,90 @@ class NormalEquations:
 
 def normal_equations(
     problem: Problem,
-    found: State,
+    state: FitState,
     candidate: Candidate,
     precision: FloatArray,
     effect_precision: FloatArray | None = None,
 ) -> NormalEquations:
-    """Return the normal equations of a problem.
+    """Return the normal equations of a fit at a state.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
-    found : State
-        Where they are taken.
+        The campaign and model.
+    state : FitState
+        The point, its residuals and derivatives.
     candidate : Candidate
-        Its effect parameters are unknowns.
-    precision : (channels,) ndarray
-        Of the noise of each channel.
-    effect_precision : (E,) ndarray, optional
-        Of the prior of the effect parameters; one if left out.
+        The effects whose parameters are unknowns.
+    precision : (channels,) array
+        The noise precision of each channel, relative to the recorded one.
+    effect_precision : (E,) array, optional
+        The prior precisions of the effect parameters; 1 if left out.
     """
     numbers = range(len(problem.trials))
-    trials = [trial_rows(problem, number, found, candidate, precision) for number in numbers]
-    at = problem.shared.size + candidate.size
-    effect_prior = np.ones(candidate.size) if effect_precision is None else effect_precision
-    prior = np.concatenate((problem.shared.precision, effect_prior, *(item.prior for item in trials)))
-    shared = (found.point.shared, found.point.effect[: candidate.size])
+    trials = [trial_rows(problem, number, state, candidate, precision) for number in numbers]
+    # prior
+    if effect_precision is None:
+        effect_precision = np.ones(candidate.size)
+    local_priors = [rows.prior for rows in trials]
+    prior = np.concatenate((problem.shared.precision, effect_precision, *local_priors))
+    effect = state.point.effect[: candidate.size]
+    local_values = [rows.value for rows in trials]
+    values = np.concatenate((state.point.shared, effect, *local_values))
     matrix = np.diag(prior + LEAST_PRECISION)
-    gradient = -prior * np.concatenate((*shared, *(item.value for item in trials)))
-    placed = []
-    for item in trials:
-        place = np.concatenate((at + np.arange(len(item.prior)), item.index))
-        at += len(item.prior)
-        matrix[np.ix_(place, place)] += item.rows @ item.rows.T
-        gradient[place] += item.rows @ item.residual
-        placed.append((item, place))
-    return NormalEquations(placed, matrix, gradient)
+    gradient = -prior * values
+    # readings
+    first_local = problem.shared.size + candidate.size
+    indexed_trials = []
+    for rows in trials:
+        local_index = first_local + np.arange(len(rows.prior))
+        index = np.concatenate((local_index, rows.index))
+        first_local += len(rows.prior)
+        matrix[np.ix_(index, index)] += rows.rows @ rows.rows.T
+        gradient[index] += rows.rows @ rows.residual
+        indexed_trials.append((rows, index))
+    return NormalEquations(indexed_trials, matrix, gradient)
 
+
+# ---------------------------------------------------------------- fit
 
 LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
 CONVERGED = 1e-2
-"""A step that promises less than this [nat] ends a fit."""
-WHOLE_STEP, LARGEST_DAMPING = 1e-2, 1.0
-"""Damping below which a step is nearly that of Gauss and Newton, and above which it is a mere trial."""
-STEP_SHARES = (1.0, 0.3)
-"""Shares of a step that are tried before the damping grows."""
+"""A fit ends where the step promises to lower the objective by less than this [nat]."""
+WHOLE_STEP = 1e-2
+"""Damping below which a step is nearly that of Gauss and Newton."""
+LARGEST_DAMPING = 1.0
+"""Damping above which steps are so short that a small promise does not mean convergence."""
+HOPELESS_DAMPING = 1e6
+"""Damping beyond which a fit ends without convergence."""
+STEP_FRACTIONS = (1.0, 0.3)
+"""Fractions of a step that are tried before the damping grows."""
 
 
 @dataclass(frozen=True, eq=False)
-class CandidateFit(State):
-    """A fitted candidate.
+class CandidateFit(FitState):
+    """A fitted candidate; its point is the maximum of the posterior.
 
     Attributes
     ----------
     candidate : Candidate
-        What was fitted; the point is the maximum of the posterior.
+        The effects that were fitted.
     log_evidence : float
-        Laplace, up to the same constant as the objective [nat].
-    covariance : (Q + E, Q + E) ndarray
-        Of global unknowns and effect parameters (scaled), local ones marginalised.
-    spent : (channels,) ndarray
-        Degrees of freedom that the unknowns took from each channel.
+        The Laplace approximation of the log evidence, up to the same constant as the objective
+        [nat].
+    covariance : (Q + E, Q + E) array
+        The posterior covariance of the shared unknowns and effect parameters (scaled), with the
+        unknowns of the trials marginalised.
+    spent : (channels,) array
+        The degrees of freedom that the unknowns took from each channel.
     converged : bool
         Whether the last step was short enough.
-    draws : (N, E) ndarray or None
-        Of the scaled effect parameters, where they are wider than their covariance (see `posterior`).
-    remainder : Remainder or None
-        What it leaves beside the noise, where hypotheses are compared under a wider one.
+    draws : (N, E) array or None
+        Posterior draws of the effect parameters, where their posterior is wider than the covariance
+        says (see `predictive.with_draws`).
+    residual_process : ResidualProcess or None
+        What the fit leaves beside the noise, where hypotheses are compared under a wider noise.
     """
 
     candidate: Candidate
@@ -192,239 +263,366 @@ class CandidateFit(State):
     spent: FloatArray
     converged: bool = True
     draws: FloatArray | None = field(default=None, repr=False)
-    remainder: Remainder | None = field(default=None, repr=False)
+    residual_process: ResidualProcess | None = field(default=None, repr=False)
 
     @property
     def effect(self) -> FloatArray:
-        """Scaled effect parameters (E,)."""
+        """The scaled effect parameters (E,)."""
         return self.point.effect
 
     @property
     def shared(self) -> FloatArray:
-        """Global unknowns (Q,)."""
+        """The scaled shared unknowns (Q,)."""
         return self.point.shared
 
     @property
     def effect_covariance(self) -> FloatArray:
-        """Covariance (E, E) of the scaled effect parameters."""
+        """The covariance (E, E) of the scaled effect parameters."""
         first = len(self.covariance) - self.candidate.size
         return self.covariance[first:, first:]
 
     @property
     def chi_square(self) -> float:
-        """Sum of squared standardised residuals."""
+        """The sum of squared standardised residuals."""
         return float(self.sums.sum())
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of a step too long, which is taken back
+@np.errstate(over="ignore", invalid="ignore")  # a step that is too long is taken back
 def fit(
     problem: Problem,
     candidate: Candidate,
     start: Point,
     *,
-    known: tuple[Linearisation, ...] | None = None,
+    known: tuple[TrialDerivatives, ...] | None = None,
     iterations: int = 60,
     local_only: bool = False,
     give_up: float | None = None,
 ) -> CandidateFit:
-    """Fit a candidate.
+    """Return a candidate at the maximum of its posterior, by Levenberg-Marquardt.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     candidate : Candidate
-        What may act.
+        The effects that may act.
     start : Point
-        Where to begin.
-    known : tuple of Linearisation, optional
-        Derivatives by shared and local unknowns that are near enough to begin with.
+        The point from which the fit begins.
+    known : tuple of TrialDerivatives, optional
+        Derivatives with respect to shared unknowns and those of the trials that are near enough to
+        begin with.
     iterations : int
-        Largest number of steps.
+        The largest number of steps.
     local_only : bool
-        Shared unknowns and effects stay: only the trials' own nuisances are fitted (held-out trials).
+        Whether only the unknowns of the trials are fitted (held-out trials), and shared unknowns
+        and effects stay.
     give_up : float, optional
-        A fit whose objective has no prospect of coming below this ends early, not converged.
+        A value of the objective; a fit without prospect of coming below it ends early, not
+        converged.
 
     Raises
     ------
     FitError
-        If the model gives numbers that are not finite at the start, or none of which a curvature can be made.
+        If the model gives numbers that are not finite at the start, or the normal equations are
+        singular.
     """
     descent = _Descent(problem, candidate, local_only)
     damping = 1e-3
-    state = descent.state(_bounded(problem, start), known)
+    state = descent.state(_within_bounds(problem, start), known)
     if not np.isfinite(state.objective):
-        names = candidate.identifiers or "no effect"
-        raise FitError(said("models.not_finite", names=names))
-    converged, fresh = False, known is None
+        names = comma_list(candidate.identifiers) if candidate.terms else "no effect"
+        raise FitError(
+            f"The model gives values that are not finite for {names}; check the ranges of its "
+            "parameters."
+        )
+    converged = False
+    has_new_derivatives = known is None
     for _ in range(iterations):
         step, promised = descent.step(state, damping)
-        following = None if promised < CONVERGED else descent.following(state, step)
-        if following is not None:
-            gain = state.objective - following.objective
+        next_state = None
+        if promised >= CONVERGED:
+            next_state = descent.next_state(state, step)
+        if next_state is not None:
+            gain = state.objective - next_state.objective
             damping = max(damping * (0.1 if gain > 0.5 * promised else 0.5), 1e-9)
-            state, fresh = following, False
-            if gain < 0.7 * promised:  # derivatives have grown old
-                state, fresh = descent.state(state.point), True
-            if give_up is not None and damping < WHOLE_STEP and state.objective - 2.0 * promised > give_up:
+            state = next_state
+            has_new_derivatives = gain < 0.7 * promised
+            if has_new_derivatives:  # the gain is poor: the derivatives have grown old
+                state = descent.state(state.point)
+            is_near_newton = damping < WHOLE_STEP
+            if (
+                give_up is not None
+                and is_near_newton
+                and state.objective - 2.0 * promised > give_up
+            ):
                 break
-        elif not fresh:
-            state, fresh = descent.state(state.point), True
+        elif not has_new_derivatives:
+            state = descent.state(state.point)
+            has_new_derivatives = True
         elif promised < CONVERGED:
-            converged = damping < LARGEST_DAMPING  # else only short steps are left to promise little
+            converged = damping < LARGEST_DAMPING
             break
         else:
             damping = max(10.0 * damping, 1e-4)
-            if damping > 1e6:
+            if damping > HOPELESS_DAMPING:
                 break
-    if not fresh:
+    if not has_new_derivatives:
         state = descent.state(state.point)
-    return _finished(problem, candidate, state, converged)
+    return _with_evidence(problem, candidate, state, converged)
 
 
-def attempt(problem: Problem, candidate: Candidate, start: Point, **options: Any) -> CandidateFit | None:
-    """Return what `fit` does, or None where the candidate cannot be what the fit comes to; why, is kept."""
+def attempt(
+    problem: Problem,
+    candidate: Candidate,
+    start: Point,
+    *,
+    known: tuple[TrialDerivatives, ...] | None = None,
+    iterations: int = 60,
+    local_only: bool = False,
+    give_up: float | None = None,
+) -> CandidateFit | None:
+    """Return what `fit` returns, or None if the candidate cannot be fitted.
+
+    The reason is recorded by `Problem.record_refusal`.
+    """
     try:
-        return fit(problem, candidate, start, **options)
+        return fit(
+            problem,
+            candidate,
+            start,
+            known=known,
+            iterations=iterations,
+            local_only=local_only,
+            give_up=give_up,
+        )
     except DiscrepancyError as cause:
-        problem.refused(candidate, cause)
+        problem.record_refusal(candidate, cause)
         return None
 
 
-@np.errstate(over="ignore", invalid="ignore")  # a motion beyond all numbers has no probability
+@np.errstate(over="ignore", invalid="ignore")  # a motion that overflows has no probability
 def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
-    """Return -ln posterior of a candidate at a point, up to a constant shared by all candidates [nat].
+    """Return the negative log posterior of a candidate at a point [nat].
+
+    It is up to a constant that all candidates share.
 
     Raises
     ------
     ModelError
         If the structure cannot carry the effects.
     """
-    point = _bounded(problem, point)
-    responses = [problem.answer(number, point, candidate) for number in range(len(problem.trials))]
-    return _compared(problem, point, responses)[0]
+    point = _within_bounds(problem, point)
+    numbers = range(len(problem.trials))
+    responses = [problem.response_with(number, point, candidate) for number in numbers]
+    return _misfit_at(problem, point, responses).objective
 
 
-def _compared(
-    problem: Problem, point: Point, responses: Sequence[FloatArray]
-) -> tuple[float, tuple[FloatArray, ...], FloatArray]:
-    """Return -ln posterior, residuals of each trial, and their sums of squares by channel."""
-    residuals = tuple(problem.residual(number, point, one) for number, one in enumerate(responses))
-    sums = problem.group_sums(residuals)
+class _Misfit(NamedTuple):
+    """The negative log posterior [nat], the residuals of each trial, their squares by channel."""
+
+    objective: float
+    residuals: tuple[FloatArray, ...]
+    sums: FloatArray
+
+
+def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) -> _Misfit:
+    """Return the negative log posterior and the residuals, given the response of each trial."""
+    residuals = tuple(
+        problem.residual(number, point, response) for number, response in enumerate(responses)
+    )
+    sums = problem.sums_by_channel(residuals)
     prior = 0.5 * float(problem.shared.precision @ point.shared**2)
     prior += 0.5 * float(point.effect @ point.effect)
     for data, u in zip(problem.trials, point.local, strict=True):
         prior += 0.5 * float(data.unknowns.precision @ u**2)
     value = problem.misfit(sums) + prior
-    return value if np.isfinite(value) else np.inf, residuals, sums
+    if not np.isfinite(value):
+        value = np.inf
+    return _Misfit(value, residuals, sums)
 
 
 @dataclass
 class _Descent:
-    """What a descent needs at every point: problem, candidate, and the steps of its derivatives."""
+    """The descent of a fit.
+
+    States and steps of a candidate, and the last deviations of its effects.
+
+    Attributes
+    ----------
+    problem : Problem
+        The campaign and model.
+    candidate : Candidate
+        The effects that are fitted.
+    local_only : bool
+        Whether only the unknowns of the trials are fitted.
+    effect_deviation : (E,) array or None
+        The posterior deviations of the effect parameters at the last step, over which their finite
+        differences are taken; None before the first step.
+    """
 
     problem: Problem
     candidate: Candidate
     local_only: bool
-    deviation: FloatArray | None = None  # (E,) of the effect parameters, once known
+    effect_deviation: FloatArray | None = None
 
-    def state(self, point: Point, known: tuple[Linearisation, ...] | None = None) -> State:
-        """Return objective and derivatives at a point; `known` are derivatives by nuisances, near enough."""
-        parts = tuple(
-            self.problem.linearise(number, point, self.candidate, known=near, effect_steps=self.deviation)
-            for number, near in enumerate(known or [None] * len(self.problem.trials))
-        )
-        compared = _compared(self.problem, point, [part.response for part in parts])
-        return State(point, *compared, parts)
+    def state(self, point: Point, known: tuple[TrialDerivatives, ...] | None = None) -> FitState:
+        """Return the objective and the derivatives at a point.
 
-    def step(self, state: State, damping: float) -> tuple[Point, float]:
-        """Return the step and the decrease it promises [nat], and keep the deviations of the effects.
-
-        What is at the end of its range and would leave it stays (Bertsekas 1982, SIAM J. Control Optim. 20).
+        Parameters
+        ----------
+        point : Point
+            The values of all unknowns.
+        known : tuple of TrialDerivatives, optional
+            Derivatives with respect to shared unknowns and those of the trials that are near
+            enough; only the response and the derivatives with respect to effects are computed then.
         """
-        problem, first = self.problem, self.problem.shared.size
-        own = first + self.candidate.size
-        found = normal_equations(problem, state, self.candidate, problem.precisions(state.sums))
-        size = len(found.gradient)
-        effects = np.eye(size)[:, first:own]
-        self.deviation = np.sqrt(np.diag(solved(upper_factor(found.matrix), effects)[first:own]))
-        low, high = problem.shared.ends
-        at, downhill = state.point.shared, finite(found.gradient)[:first]
-        held = ((at <= low) & (downhill < 0.0)) | ((at >= high) & (downhill > 0.0))
-        free = np.arange(size) >= (own if self.local_only else 0)
-        free[:first] &= ~held
-        damped = (found.matrix + damping * np.diag(np.diag(found.matrix)))[np.ix_(free, free)]
-        step = np.zeros(size)
-        step[free] = solved(upper_factor(damped), found.gradient[free])
-        ends = np.cumsum([own, *(data.unknowns.size for data in problem.trials)])
-        local = tuple(step[a:b] for a, b in pairwise(ends.tolist()))
-        return Point(step[:first], local, step[first:own]), 0.5 * float(found.gradient @ step)
+        derivatives = tuple(
+            self.problem.linearise(
+                number,
+                point,
+                self.candidate,
+                known=known_derivatives,
+                effect_steps=self.effect_deviation,
+            )
+            for number, known_derivatives in enumerate(known or [None] * len(self.problem.trials))
+        )
+        misfit = _misfit_at(self.problem, point, [trial.response for trial in derivatives])
+        return FitState(
+            point=point,
+            objective=misfit.objective,
+            residuals=misfit.residuals,
+            sums=misfit.sums,
+            linearisations=derivatives,
+        )
 
-    def following(self, state: State, step: Point) -> State | None:
-        """Return the state after a step, or None if none better was found."""
-        for share in STEP_SHARES:
+    def step(self, state: FitState, damping: float) -> tuple[Point, float]:
+        """Return the damped step from a state, and the decrease of the objective it promises [nat].
+
+        An unknown at the end of its range that would leave it is held there (projected Newton
+        method, Bertsekas 1982, SIAM J. Control Optim. 20, 221-246).
+        """
+        problem = self.problem
+        first_effect = problem.shared.size
+        first_local = first_effect + self.candidate.size
+        precision = problem.precisions(state.sums)
+        equations = normal_equations(problem, state, self.candidate, precision)
+        size = len(equations.gradient)
+        # posterior deviations of the effect parameters
+        effect_columns = np.eye(size)[:, first_effect:first_local]
+        covariance = solve_factored(cholesky_factor(equations.matrix), effect_columns)
+        self.effect_deviation = np.sqrt(np.diag(covariance[first_effect:first_local]))
+        # unknowns that may move
+        low, high = problem.shared.ends
+        shared = state.point.shared
+        downhill = check_finite(equations.gradient)[:first_effect]
+        is_held_low = (shared <= low) & (downhill < 0.0)
+        is_held_high = (shared >= high) & (downhill > 0.0)
+        is_free = np.arange(size) >= (first_local if self.local_only else 0)
+        is_free[:first_effect] &= ~(is_held_low | is_held_high)
+        # Levenberg-Marquardt step
+        damped = equations.matrix + damping * np.diag(np.diag(equations.matrix))
+        damped = damped[np.ix_(is_free, is_free)]
+        step = np.zeros(size)
+        step[is_free] = solve_factored(cholesky_factor(damped), equations.gradient[is_free])
+        promised = 0.5 * float(equations.gradient @ step)
+        return self._step_by_kind(step), promised
+
+    def _step_by_kind(self, step: FloatArray) -> Point:
+        """Return the step of all unknowns (n,) as that of shared, effect and local unknowns."""
+        first_effect = self.problem.shared.size
+        first_local = first_effect + self.candidate.size
+        local_sizes = [data.unknowns.size for data in self.problem.trials]
+        ends = np.cumsum([first_local, *local_sizes]).tolist()
+        return Point(
+            shared=step[:first_effect],
+            local=tuple(step[begin:end] for begin, end in pairwise(ends)),
+            effect=step[first_effect:first_local],
+        )
+
+    def next_state(self, state: FitState, step: Point) -> FitState | None:
+        """Return the state after a step or a fraction of it; None if none lowers the objective."""
+        for fraction in STEP_FRACTIONS:
             try:
-                ahead = _ahead(self.problem, self.candidate, state.point, step, share)
-                if objective(self.problem, self.candidate, ahead) < state.objective:
-                    return self.state(ahead, state.linearisations)
-            except DiscrepancyError:  # outside what the structure can carry: a shorter step
+                point = _point_after(self.problem, self.candidate, state.point, step, fraction)
+                if objective(self.problem, self.candidate, point) < state.objective:
+                    return self.state(point, state.linearisations)
+            except DiscrepancyError:  # the structure cannot carry it: try a shorter step
                 continue
         return None
 
 
-def _finished(problem: Problem, candidate: Candidate, state: State, converged: bool) -> CandidateFit:
-    size = problem.shared.size + candidate.size
-    equations = normal_equations(problem, state, candidate, problem.precisions(state.sums))
-    factor = upper_factor(equations.matrix)
-    whole, spent = solved(factor, np.eye(len(factor))), np.zeros(len(problem.channel_names))
-    for data, (item, place) in zip(problem.trials, equations.trials, strict=True):
-        leverage = ((whole[np.ix_(place, place)] @ item.rows) * item.rows).sum(axis=0)
+def _with_evidence(
+    problem: Problem, candidate: Candidate, state: FitState, converged: bool
+) -> CandidateFit:
+    """Return the fit at a state, with its Laplace evidence, covariance and degrees of freedom."""
+    precision = problem.precisions(state.sums)
+    equations = normal_equations(problem, state, candidate, precision)
+    factor = cholesky_factor(equations.matrix)
+    covariance = solve_factored(factor, np.eye(len(factor)))
+    # degrees of freedom: the trace of the hat matrix, channel by channel
+    spent = np.zeros(len(problem.channel_names))
+    for data, (rows, index) in zip(problem.trials, equations.trials, strict=True):
+        trial_covariance = covariance[np.ix_(index, index)]
+        leverage = ((trial_covariance @ rows.rows) * rows.rows).sum(axis=0)
         np.add.at(spent, data.groups, leverage.reshape(data.weight.shape).sum(axis=0))
+    size = problem.shared.size + candidate.size
     return CandidateFit(
-        **vars(state), candidate=candidate, covariance=whole[:size, :size], spent=spent, converged=converged,
+        **vars(state),
+        candidate=candidate,
         log_evidence=-state.objective - float(np.log(np.diag(factor)).sum()),
-    )  # fmt: skip
+        covariance=covariance[:size, :size],
+        spent=spent,
+        converged=converged,
+    )
 
 
-def _ahead(problem: Problem, candidate: Candidate, point: Point, step: Point, share: float) -> Point:
-    """Return the point a share of a step ahead."""
-    local = tuple(u + share * du for u, du in zip(point.local, step.local, strict=True))
-    effect = candidate.stepped(point.effect, share * step.effect)
-    return _bounded(problem, Point(point.shared + share * step.shared, local, effect))
+def _point_after(
+    problem: Problem, candidate: Candidate, point: Point, step: Point, fraction: float
+) -> Point:
+    """Return the point after a fraction of a step, within the bounds of the unknowns."""
+    stepped = Point(
+        shared=point.shared + fraction * step.shared,
+        local=tuple(u + fraction * du for u, du in zip(point.local, step.local, strict=True)),
+        effect=candidate.stepped(point.effect, fraction * step.effect),
+    )
+    return _within_bounds(problem, stepped)
 
 
-def _bounded(problem: Problem, point: Point) -> Point:
+def _within_bounds(problem: Problem, point: Point) -> Point:
+    """Return the point with shared unknowns and effect parameters clipped to their ranges."""
+    low, high = problem.shared.ends
     return replace(
         point,
-        shared=np.clip(point.shared, *problem.shared.ends),
+        shared=np.clip(point.shared, low, high),
         effect=np.clip(point.effect, -LARGEST_EFFECT, LARGEST_EFFECT),
     )
 
 
-def free_shape(problem: Problem, named: CandidateFit, number: int) -> CandidateFit | None:
-    """Fit the family of one effect of a fit: its shape free, from the canonical one.
+def fit_free_shape(problem: Problem, named_fit: CandidateFit, number: int) -> CandidateFit | None:
+    """Return a fit in which the shape of one effect is free: the family of the effect.
+
+    The fit begins at the canonical shape. It is what the shape gate compares a name with.
 
     Parameters
     ----------
     problem : Problem
-        Of the fit.
-    named : CandidateFit
-        With canonical shapes.
+        The campaign and model.
+    named_fit : CandidateFit
+        The fit with canonical shapes.
     number : int
-        Of the effect among its terms.
+        The index of the effect among the terms of the candidate.
 
     Returns
     -------
     CandidateFit or None
-        None where no shape is to free, or the structure cannot follow.
+        None where the effect has no shape parameters, or the structure cannot carry it.
     """
-    parts = named.candidate.parts(named.effect)
+    parts = named_fit.candidate.split(named_fit.effect)
     term, values = parts[number]
     if not term.effect.shape:
         return None
-    canonical = [item.prior.normal(item.canonical) for item in term.effect.shape]
-    parts[number] = replace(term, free_shape=True), np.append(values, canonical)
-    terms, begin = zip(*parts, strict=True)
-    start = replace(named.point, effect=np.concatenate(begin))
+    canonical = [parameter.prior.normal(parameter.canonical) for parameter in term.effect.shape]
+    parts[number] = (replace(term, free_shape=True), np.append(values, canonical))
+    terms, effect_values = zip(*parts, strict=True)
+    start = replace(named_fit.point, effect=np.concatenate(effect_values))
     return attempt(problem, Candidate(terms), start)

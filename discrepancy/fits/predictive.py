@@ -1,7 +1,11 @@
-"""Residuals of a fit with what their variance should be, for locating, proof and report."""
+"""Residuals of a fit with their expected variance, for locating, proof and report.
+
+Posterior draws.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -12,168 +16,284 @@ from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import NINETY
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.beginnings import from_beginnings, refitted_from_beginnings
+from discrepancy.fits.beginnings import (
+    refit_from_first_readings,
+    with_initial_states_of_first_readings,
+)
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, objective, trial_rows
+from discrepancy.fits.fitting import (
+    LARGEST_EFFECT,
+    CandidateFit,
+    TrialRows,
+    fit,
+    objective,
+    trial_rows,
+)
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
+from discrepancy.fits.trial_data import TrialData
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.search_settings import SEARCH
 
 
-def residual_set(problem: Problem, found: CandidateFit, *, sensitivities: bool = True) -> ResidualSet:
+def residual_set(
+    problem: Problem, fitted: CandidateFit, *, sensitivities: bool = True
+) -> ResidualSet:
     """Return the fitted and the held-out trials of a campaign beside their predictions.
 
     Parameters
     ----------
     problem : Problem
-        Of the fit.
-    found : CandidateFit
-        With covariance.
+        The campaign and model that were fitted.
+    fitted : CandidateFit
+        The fit with its covariance.
     sensitivities : bool
-        Whether the exact covariance of the residuals is wanted (P columns a sample) or its diagonal only.
+        Whether the exact covariance of the residuals is computed (P columns for each sample), or
+        only its diagonal.
 
-    Notes
-    -----
-    With a remainder the leverage is that of the trials' own unknowns: what is shared takes a few samples of
-    all trials, and its uncertainty is that of the remainder, which χ² against the noise shall show. The noise
-    of channels without a record is what the fitted trials leave of them.
+    Notes ----- Where the fit has a residual process, the leverage is that of the trials' own
+    unknowns. What is shared takes a few samples of all trials, and its uncertainty is that of the
+    residual process, which a χ² against the noise shall show. The noise of channels without a
+    record is estimated from the residuals of the fitted trials.
     """
-    precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(found.sums))
-    fitted = _predicted(problem, found, found, precision, sensitivities=sensitivities)
+    precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(fitted.sums))
+    predictions = _Predictions(problem, fitted, fitted, precision)
+    trials = predictions.trials(sensitivities=sensitivities)
     if problem.campaign.held_out:
-        there, adapted = held_out_fit(problem, found)
-        fitted += _predicted(there, found, adapted, precision)
-    trials = {item.trial.name: item for item in fitted}
-    return ResidualSet(
-        problem.campaign.channels,
-        tuple(trials[trial.name] for trial in problem.campaign.trials if trial.name in trials),
+        held_out_problem, held_out = held_out_fit(problem, fitted)
+        trials += _Predictions(held_out_problem, fitted, held_out, precision).trials()
+    by_name = {trial.trial.name: trial for trial in trials}
+    in_order = [by_name[trial.name] for trial in problem.campaign.trials if trial.name in by_name]
+    return ResidualSet(problem.campaign.channels, tuple(in_order))
+
+
+def held_out_fit(problem: Problem, fitted: CandidateFit) -> tuple[Problem, CandidateFit]:
+    """Return the problem of the held-out trials, and a fit of their own unknowns.
+
+    Shared unknowns and effects stay as they were fitted, so the held-out trials test them.
+    """
+    candidate = fitted.candidate
+    held_out = problem.with_trials(problem.campaign.held_out)
+    start = replace(
+        held_out.start(candidate), shared=fitted.point.shared, effect=fitted.point.effect
     )
-
-
-def held_out_fit(problem: Problem, found: CandidateFit) -> tuple[Problem, CandidateFit]:
-    """Return the trials that are held out, and a fit with their own nuisances; what is shared stays."""
-    there = problem.with_trials(problem.campaign.held_out)
-    start = replace(there.start(found.candidate), shared=found.point.shared, effect=found.point.effect)
     if all(trial.name in problem.beginnings for trial in problem.campaign.held_out):
-        start = from_beginnings(there, start)
-    adapted = fit(there, found.candidate, start, local_only=True)
-    adapted = refitted_from_beginnings(there, adapted, local_only=True)
-    if adapted.chi_square > SEARCH.far * float(there.counts.sum()):
-        start = _nearest_releases(there, found.candidate, start)
-        again = fit(there, found.candidate, start, local_only=True)
-        adapted = min(adapted, again, key=lambda item: item.objective)
-    return there, adapted
+        start = with_initial_states_of_first_readings(held_out, start)
+    local_fit = fit(held_out, candidate, start, local_only=True)
+    local_fit = refit_from_first_readings(held_out, local_fit, local_only=True)
+    if local_fit.chi_square > SEARCH.far * float(held_out.counts.sum()):
+        start = _with_best_release_amplitudes(held_out, candidate, start)
+        second_fit = fit(held_out, candidate, start, local_only=True)
+        if second_fit.objective < local_fit.objective:
+            local_fit = second_fit
+    return held_out, local_fit
 
 
-RELEASES = tuple(np.linspace(-2.0, 2.0, 17).tolist())
-"""Amplitudes of a release from which the fit of a held-out trial may begin, in prior deviations; of a free
-initial state in tenths of the nominal one."""
+RELEASE_STEPS = tuple(np.linspace(-2.0, 2.0, 17).tolist())
+"""Amplitudes of a release from which the fit of a held-out trial may begin, about the nominal one:
+in prior deviations, of a free initial state in tenths of the nominal one."""
 
 
-def _nearest_releases(there: Problem, candidate: Candidate, start: Point) -> Point:
-    """Return a start at the amplitudes of releases that leave least of each trial.
+def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start: Point) -> Point:
+    """Return the start with the release amplitude of each trial at which its objective is least.
 
-    Where friction ends a motion each number of half swings has an optimum of its own.
+    Where friction ends a motion, each number of half swings has an optimum of its own, and a
+    descent finds only the nearest.
     """
-    nearest = list(start.local)
-    for number, data in enumerate(there.trials):
-        release, amplitude = data.trial.release, data.unknowns.zeros
-        if release is None or amplitude >= data.unknowns.size:
+    best_local = list(start.local)
+    for number, data in enumerate(held_out.trials):
+        release = data.trial.release
+        amplitude_index = data.unknowns.zeros
+        if release is None or amplitude_index >= data.unknowns.size:
             continue
-        nominal = 0.0 if release.at_rest else 1.0 / data.unknowns.scale[amplitude]
-        step = 1.0 if release.at_rest else 0.1 * nominal
+        nominal = 0.0
+        step = 1.0
+        if not release.at_rest:
+            nominal = 1.0 / data.unknowns.scale[amplitude_index]
+            step = 0.1 * nominal
         least = np.inf
-        for size in nominal + step * np.array(RELEASES):
+        for amplitude in nominal + step * np.array(RELEASE_STEPS):
             local = start.local[number].copy()
-            local[amplitude] = size
-            point = replace(start, local=(*nearest[:number], local, *nearest[number + 1 :]))
-            value = objective(there, candidate, point)
+            local[amplitude_index] = amplitude
+            trial_locals = (*best_local[:number], local, *best_local[number + 1 :])
+            value = objective(held_out, candidate, replace(start, local=trial_locals))
             if value < least:
-                least, nearest[number] = value, local
-    return replace(start, local=tuple(nearest))
+                least = value
+                best_local[number] = local
+    return replace(start, local=tuple(best_local))
 
 
-def _predicted(
-    problem: Problem, found: CandidateFit, adapted: CandidateFit, precision: FloatArray, *,
-    sensitivities: bool = False,
-) -> list[FittedTrial]:  # fmt: skip
-    """Return trials beside their predictions, by what was found and its nuisances as adapted to them.
+# ---------------------------------------------------------------- expected variances
 
-    `precision` (channels,) is that of the noise of the fitted trials over the recorded one.
+
+class _Projection(NamedTuple):
+    """What the uncertainty of the unknowns does to the prediction of a trial, over its noise.
+
+    Attributes
+    ----------
+    by_local : (L, N C) array
+        The changes by the trial's own unknowns, in coordinates in which they are independent with
+        variance 1, given the shared unknowns.
+    by_shared : (N C, Q + E) array
+        The changes by the shared unknowns and effects, in such coordinates too, with the trial's
+        own unknowns following them.
     """
-    root = np.linalg.cholesky(found.covariance + 1e-14 * np.eye(len(found.covariance)))
-    at, items = len(root), []
-    total = at + sum(data.unknowns.size for data in problem.trials)
-    counted = float(found.remainder is None)
-    for number, data in enumerate(problem.trials):
-        item = trial_rows(problem, number, adapted, adapted.candidate, precision)
-        deviation = data.deviation / np.sqrt(precision[data.groups])
-        local, shared = np.split(item.rows, [data.unknowns.size])
-        factor, along = item.followed()
-        own = solve_triangular(factor, local, trans="T")
-        # local unknowns follow the shared ones: J_s - J_l A^-1 B, then what is their own
-        follow = (shared - along.T @ local).T @ root[item.index]
-        taken, carried = np.einsum("kn,kn->n", own, own), np.einsum("nk,nk->n", follow, follow)
-        shape = adapted.residuals[number].shape
-        if adapted is not found:
-            leverage = np.maximum(counted * carried - taken, -1.0 + 1e-9)
-            variance = 1.0 + np.maximum(carried - taken, -1.0 + 1e-9).reshape(shape)
-        else:
-            leverage = np.minimum(taken + counted * carried, 1.0)
-            variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
-        if found.remainder is not None and data.trial.is_dynamic:
-            recorded = problem.freedom[data.groups] > 0.0  # in the others it is in the noise already
-            variance = variance + recorded * found.remainder.size[data.groups] ** 2
-        sensitive = None
-        if sensitivities:
-            sensitive = np.zeros((*shape, total))
-            sensitive[..., : len(root)] = follow.reshape(*shape, len(root))
-            sensitive[..., at : at + len(own)] = own.T.reshape(*shape, len(own))
-            at += len(own)
-        prediction = problem.prediction(number, adapted.point, adapted.responses[number])
-        residual = problem.residual(number, adapted.point, adapted.responses[number])
-        items.append(
-            FittedTrial(
-                trial=replace(data.trial, used=data.weight > 0.0),  # after a gap a filter leaves out more
-                prediction=prediction,
-                residual=residual * data.deviation,  # what a remainder takes up is what is left
-                noise_deviation=deviation,
-                predictive_deviation=deviation * np.sqrt(np.maximum(variance, 1e-9)),
-                leverage=leverage.reshape(shape),
-                rates=np.gradient(prediction, data.trial.time, axis=0) if data.trial.is_dynamic else None,
-                sensitivity=sensitive,
-            )
-        )
-    return items
+
+    by_local: FloatArray
+    by_shared: FloatArray
+
+    def local_variance(self) -> FloatArray:
+        """Return the variance (N C,) by the trial's own unknowns."""
+        return np.asarray(np.einsum("kn,kn->n", self.by_local, self.by_local))
+
+    def shared_variance(self) -> FloatArray:
+        """Return the variance (N C,) by the shared unknowns and effects."""
+        return np.asarray(np.einsum("nk,nk->n", self.by_shared, self.by_shared))
 
 
-# ---------------------------------------------------------------- draws of the effect
-
-
-LEAST_RISE = 0.6
-"""Rise of the misfit [nat] at the ends of a Gaussian 90 % interval below which the posterior is drawn from;
-NINETY^2 / 2 = 1.35 is expected."""
-SEED = 20211
-ROUNDS, LOOKED_AT, KEPT = 5, 400, 1000
-"""Rounds, points of each at which a density is looked at, and draws that are kept."""
-
-
-def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
-    """Return a fit with draws of its effect parameters if their posterior is wider than its covariance.
+class _Predictions:
+    """Trials beside their predictions, with the variance that their residuals should have.
 
     Parameters
     ----------
     problem : Problem
-        Of the fit.
+        The trials and the model.
+    fitted : CandidateFit
+        The fit of the fitted trials, whose covariance is that of the shared unknowns.
+    local_fit : CandidateFit
+        The fit of the trials' own unknowns: the same, or that of held-out trials.
+    precision : (channels,) array
+        The noise precision of each channel in the fitted trials, relative to the recorded one.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        fitted: CandidateFit,
+        local_fit: CandidateFit,
+        precision: FloatArray,
+    ) -> None:
+        self.problem = problem
+        self.fitted = fitted
+        self.local_fit = local_fit
+        self.precision = precision
+        covariance = fitted.covariance
+        self.root = np.linalg.cholesky(covariance + 1e-14 * np.eye(len(covariance)))
+        self.is_held_out = local_fit is not fitted
+
+    def trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
+        """Return the trials beside their predictions."""
+        fitted_trials = []
+        shared_count = len(self.root)
+        local_counts = [data.unknowns.size for data in self.problem.trials]
+        first_local = shared_count
+        for number, data in enumerate(self.problem.trials):
+            rows = trial_rows(
+                self.problem, number, self.local_fit, self.local_fit.candidate, self.precision
+            )
+            projection = self._projection(rows, data.unknowns.size)
+            sensitivity = None
+            if sensitivities:
+                shape = self.local_fit.residuals[number].shape
+                sensitivity = np.zeros((*shape, shared_count + sum(local_counts)))
+                by_shared = projection.by_shared.reshape(*shape, shared_count)
+                sensitivity[..., :shared_count] = by_shared
+                local_count = len(projection.by_local)
+                by_local = projection.by_local.T.reshape(*shape, local_count)
+                sensitivity[..., first_local : first_local + local_count] = by_local
+                first_local += local_count
+            fitted_trials.append(self._fitted_trial(number, data, projection, sensitivity))
+        return fitted_trials
+
+    def _projection(self, rows: TrialRows, local_count: int) -> _Projection:
+        """Return what the uncertainty of the unknowns does to the prediction of a trial."""
+        local_rows, shared_rows = np.split(rows.rows, [local_count])
+        factor, local_per_shared = rows.eliminate_local()
+        by_local = solve_triangular(factor, local_rows, trans="T")
+        # Schur complement: local unknowns follow the shared ones, J_s - J_l A^-1 B
+        following = (shared_rows - local_per_shared.T @ local_rows).T
+        return _Projection(by_local, following @ self.root[rows.index])
+
+    def _variances(
+        self, number: int, data: TrialData, projection: _Projection
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the leverage of the readings, and the variance of their prediction (both (N, C)).
+
+        Both are relative to the noise variance; see `FittedTrial`.
+        """
+        shape = self.local_fit.residuals[number].shape
+        process = self.fitted.residual_process
+        counted = float(process is None)  # 0: the residual process stands for shared unknowns
+        local = projection.local_variance()
+        shared = projection.shared_variance()
+        if self.is_held_out:
+            leverage = np.maximum(counted * shared - local, -1.0 + 1e-9)
+            variance = 1.0 + np.maximum(shared - local, -1.0 + 1e-9).reshape(shape)
+        else:
+            leverage = np.minimum(local + counted * shared, 1.0)
+            variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
+        if process is not None and data.trial.is_dynamic:
+            # without a noise record the process is part of the noise already
+            has_record = self.problem.freedom[data.groups] > 0.0
+            variance = variance + has_record * process.amplitude[data.groups] ** 2
+        return leverage.reshape(shape), variance
+
+    def _fitted_trial(
+        self, number: int, data: TrialData, projection: _Projection, sensitivity: FloatArray | None
+    ) -> FittedTrial:
+        """Return a trial beside its prediction."""
+        point = self.local_fit.point
+        response = self.local_fit.responses[number]
+        prediction = self.problem.prediction(number, point, response)
+        residual = self.problem.residual(number, point, response)
+        leverage, variance = self._variances(number, data, projection)
+        noise_deviation = data.deviation / np.sqrt(self.precision[data.groups])
+        rates = None
+        if data.trial.is_dynamic:
+            rates = np.gradient(prediction, data.trial.time, axis=0)
+        return FittedTrial(
+            # the whitening filter leaves out more samples after a gap
+            trial=replace(data.trial, used=data.weight > 0.0),
+            prediction=prediction,
+            residual=residual * data.deviation,
+            noise_deviation=noise_deviation,
+            predictive_deviation=noise_deviation * np.sqrt(np.maximum(variance, 1e-9)),
+            leverage=leverage,
+            rates=rates,
+            sensitivity=sensitivity,
+        )
+
+
+# ---------------------------------------------------------------- draws of the effect
+
+LEAST_RISE = 0.6
+"""Rise of the misfit at the ends of a Gaussian 90 % interval below which the posterior is sampled
+[nat]; a Gaussian posterior has NINETY^2 / 2 = 1.35."""
+SEED = 20211
+"""Seed of the draws."""
+ROUNDS = 5
+"""Rounds of adaptive importance sampling."""
+POINTS_PER_ROUND = 400
+"""Points of each round at which the density is evaluated."""
+KEPT_DRAWS = 1000
+"""Equally weighted draws that are returned."""
+
+
+def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
+    """Return a fit with posterior draws of its effects, if their posterior is not nearly Gaussian.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model that were fitted.
     fit : CandidateFit
-        With covariance.
+        The fit with its covariance.
 
     Returns
     -------
     CandidateFit
-        As it was where the misfit rises enough at the ends of the intervals along all principal directions;
-        else with `draws`. The same fit gives the same draws.
+        The same fit if the misfit rises enough at the ends of the Gaussian intervals along all
+        principal directions; else with `draws`. The same fit gives the same draws.
     """
     if not fit.candidate.size:
         return fit
@@ -181,51 +301,71 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     centre = fit.point.effect
 
     def energy(effect: FloatArray) -> float:
+        """Return -ln posterior of effect parameters (E,) relative to the fit [nat]."""
         if np.abs(effect).max() > LARGEST_EFFECT:
             return np.inf
         try:
-            rise = screen.rise(effect)
+            rise = screen.misfit_rise(effect)
         except DiscrepancyError:  # more than the structure can carry
             return np.inf
         return rise + 0.5 * float(effect @ effect - centre @ centre)
 
-    spread, directions = np.linalg.eigh(fit.effect_covariance)
-    axes = directions * np.sqrt(np.maximum(spread, 0.0))
-    rises = [energy(centre + side * NINETY * axis) for axis in axes.T for side in (-1.0, 1.0)]
+    variances, directions = np.linalg.eigh(fit.effect_covariance)
+    axes = directions * np.sqrt(np.maximum(variances, 0.0))
+    rises = []
+    for axis in axes.T:
+        rises.append(energy(centre - NINETY * axis))
+        rises.append(energy(centre + NINETY * axis))
     if min(rises) > LEAST_RISE:
         return fit
-    return replace(fit, draws=drawn_from(energy, centre, axes))
+    return replace(fit, draws=importance_draws(energy, centre, axes))
 
 
-def drawn_from(energy: Callable[[FloatArray], float], centre: FloatArray, axes: FloatArray) -> FloatArray:
-    """Return equally weighted draws of a density: adaptive multiple importance sampling.
+def importance_draws(
+    energy: Callable[[FloatArray], float], centre: FloatArray, axes: FloatArray
+) -> FloatArray:
+    """Return equally weighted draws of a density by adaptive multiple importance sampling.
 
-    Points of each round are drawn of a Cauchy density, whose tails reach far beyond it, with the moments that
-    all points before tell; each is weighed by the densities of all rounds together (Cornuet, Marin, Mira and
-    Robert 2012, Scand. J. Statist. 39, 798-812). Along a ridge that is bent and a hundred times longer than
-    wide the draws cover a part of it.
+    The points of each round are drawn of a Cauchy density, whose tails reach far beyond the
+    density, with the moments that all earlier points give. Each point is weighted by the proposals
+    of all rounds together (Cornuet, Marin, Mira and Robert 2012, Scand. J. Statist. 39, 798-812).
+    Along a ridge that is bent and a hundred times longer than wide, the draws cover a part of it
+    only.
 
     Parameters
     ----------
     energy : callable
-        -ln of the density at a point (E,), infinite where it vanishes.
-    centre : (E,) ndarray
-        About which points are drawn at first.
-    axes : (E, E) ndarray
-        Columns along which they are spread then.
+        Returns -ln of the density at a point (E,), infinite where it vanishes.
+    centre : (E,) array
+        The location of the first proposal.
+    axes : (E, E) array
+        The columns along which the first proposal extends, each as long as its standard deviation.
 
     Returns
     -------
-    (KEPT, E) ndarray
-        The same density gives the same draws.
+    (KEPT_DRAWS, E) array
+        The draws; the same density gives the same draws.
     """
-    generator, size = np.random.default_rng(SEED), len(centre)
-    mean, covariance = centre, axes @ axes.T
-    points, values, proposals = np.empty((0, size)), np.empty(0), []
+    generator = np.random.default_rng(SEED)
+    size = len(centre)
+    mean = centre
+    covariance = axes @ axes.T
+    points = np.empty((0, size))
+    energies = np.empty(0)
+    proposals = []
     for _ in range(ROUNDS):
-        proposals.append(multivariate_t(mean, covariance + 1e-12 * np.eye(size), df=1.0))
-        fresh = proposals[-1].rvs(LOOKED_AT, generator).reshape(LOOKED_AT, size)
-        points, values = np.concatenate((points, fresh)), np.append(values, [*map(energy, fresh)])
-        weight = softmax(-values - logsumexp([item.logpdf(points) for item in proposals], axis=0))
-        mean, covariance = weight @ points, np.atleast_2d(np.cov(points.T, aweights=weight))
-    return np.asarray(points[np.searchsorted(np.cumsum(weight)[:-1], stratified(generator, KEPT))])
+        # draw of a Cauchy density: Student's t of one degree of freedom
+        proposal = multivariate_t(mean, covariance + 1e-12 * np.eye(size), df=1.0)
+        proposals.append(proposal)
+        new_points = proposal.rvs(POINTS_PER_ROUND, generator).reshape(POINTS_PER_ROUND, size)
+        points = np.concatenate((points, new_points))
+        energies = np.append(energies, [energy(point) for point in new_points])
+        # weight all points by the mixture of all proposals
+        log_mixture = logsumexp([proposal.logpdf(points) for proposal in proposals], axis=0)
+        weight = softmax(-energies - log_mixture)
+        # adapt the next proposal
+        mean = weight @ points
+        covariance = np.atleast_2d(np.cov(points.T, aweights=weight))
+    # stratified resampling
+    quantiles = stratified(generator, KEPT_DRAWS)
+    return np.asarray(points[np.searchsorted(np.cumsum(weight)[:-1], quantiles)])

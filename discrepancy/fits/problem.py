@@ -1,13 +1,16 @@
 """Campaign and model brought together: standardised residuals of every trial and their derivatives.
 
-A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is coloured.
-The variance of each channel's noise is marginalised under the inverse gamma distribution that its record
-leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, RSS in units of s0^2.
+A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where the noise record is
+coloured. The variance of each channel's noise is marginalised under the inverse gamma distribution
+that its record leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, with
+n0 the degrees of freedom of the noise record, n the number of samples, and RSS the sum of squared
+residuals in units of s0^2.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import replace
+from functools import partial
 from math import inf
 
 import numpy as np
@@ -15,33 +18,48 @@ import numpy as np
 from discrepancy.campaign.noise import NoiseModel, noise_model, whiteness_is_tested
 from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Trial
 from discrepancy.catalogue.entry import Setting
-from discrepancy.errors import CampaignDataError, DiscrepancyError, said
+from discrepancy.errors import CampaignDataError, DiscrepancyError
 from discrepancy.system.interface import Model
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 from reporting.memory import ResultCache
 
-from .candidate import LEAST_STEP, PARAMETER_STEP, SHARED_STEP, Candidate, Linearisation, Point, moved
-from .trial_data import TrialData, global_unknowns, stand_in
+from .candidate import (
+    LEAST_STEP,
+    PARAMETER_STEP,
+    SHARED_STEP,
+    Candidate,
+    Point,
+    TrialDerivatives,
+    with_step,
+)
+from .trial_data import TrialData, global_unknowns, stand_in_deviation
 
-KEPT = 2000
-"""Responses that a problem keeps."""
+KEPT_RESPONSES = 2000
+"""Number of responses that a problem keeps in memory."""
 QUIETEST = 1e-12
 """Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
 
 
-def misfits(freedom: FloatArray, counts: FloatArray, sums: FloatArray) -> FloatArray:
-    """Return -ln L of each channel [nat], its noise variance marginalised, up to a constant.
+def channel_misfits(freedom: FloatArray, counts: FloatArray, sums: FloatArray) -> FloatArray:
+    """Return the misfit of each channel: -ln L with the noise variance marginalised [nat].
+
+    It is up to a constant. Where nothing is recorded of the noise, its scale has a flat prior.
 
     Parameters
     ----------
-    freedom, counts, sums : (...) ndarray
-        n0 of the noise record, number of samples, sum of squared standardised residuals.
+    freedom : (...) array
+        The degrees of freedom n0 of the noise record: 0 without a record, infinite where the noise
+        is known.
+    counts : (...) array
+        The number n of samples.
+    sums : (...) array
+        The sums of squared standardised residuals.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        known = 0.5 * (freedom + counts) * np.log1p(sums / freedom)
-        unknown = 0.5 * counts * np.log(np.maximum(sums, QUIETEST * counts))
-    return np.where(np.isinf(freedom), 0.5 * sums, np.where(freedom > 0.0, known, unknown))
+        recorded = 0.5 * (freedom + counts) * np.log1p(sums / freedom)
+        unrecorded = 0.5 * counts * np.log(np.maximum(sums, QUIETEST * counts))
+    return np.where(np.isinf(freedom), 0.5 * sums, np.where(freedom > 0.0, recorded, unrecorded))
 
 
 class Problem:
@@ -50,16 +68,29 @@ class Problem:
     Parameters
     ----------
     campaign : Campaign
-        With its noise records.
+        The trials and noise records.
     model : Model
         The model as it is.
     setting : Setting
-        Scales for the catalogue.
+        The scales by which the catalogue states its priors.
 
     Attributes
     ----------
-    beginnings : dict of str to (L,) ndarray
-        Own unknowns of trials as their first readings show them, by name, where they were looked for.
+    trials : tuple of TrialData
+        The trials that are compared, with their noise and unknowns.
+    shared : GlobalUnknowns
+        The layout of the unknowns that all hypotheses and trials share.
+    noise : dict of str to NoiseModel
+        The noise model of each channel.
+    freedom, counts : (channels,) array
+        The degrees of freedom of each noise record, and the number of samples of each channel.
+    refinement : int
+        The factor by which time steps are smaller than the model's own.
+    refusals : dict of str to str
+        Why an effect could not be fitted, by its identifier.
+    beginnings : dict of str to (L,) array
+        The unknowns of trials as fitted to their first readings, by the name of the trial, where
+        they were looked for.
 
     Raises
     ------
@@ -69,97 +100,158 @@ class Problem:
 
     def __init__(self, campaign: Campaign, model: Model, setting: Setting) -> None:
         if not campaign.fitted:
-            raise CampaignDataError(said("campaign.all_held_out", campaign=campaign))
-        self.campaign, self.setting, self.model = campaign, setting, model.remembering()
+            raise CampaignDataError(
+                f"The campaign {campaign.name!r} has no trial to fit: all are held out; mark fewer."
+            )
+        self.campaign = campaign
+        self.setting = setting
+        self.model = model.remembering()
         self.channel_names = tuple(campaign.channels)
         self.refinement = 1
-        self.noise: dict[str, NoiseModel] = {
-            name: noise_model(channel, stand_in(campaign, name))
-            for name, channel in campaign.channels.items()
-        }
-        self.freedom = np.array([item.degrees_of_freedom for item in self.noise.values()])
-        self.tests_whiteness = [whiteness_is_tested(channel) for channel in campaign.channels.values()]
+        self.noise: dict[str, NoiseModel] = {}
+        for name, channel in campaign.channels.items():
+            self.noise[name] = noise_model(channel, stand_in_deviation(campaign, name))
+        self.freedom = np.array([noise.degrees_of_freedom for noise in self.noise.values()])
+        channels = campaign.channels.values()
+        self.tests_whiteness = [whiteness_is_tested(channel) for channel in channels]
         self.refusals: dict[str, str] = {}
         self.beginnings: dict[str, FloatArray] = {}
-        self._take(campaign.fitted)
+        self._prepare_trials(campaign.fitted)
+        # a response needs a layout, and the layout first estimates of unknown gains
         self.shared = global_unknowns(campaign, model, campaign.fitted, {})
-        self.shared = global_unknowns(campaign, model, campaign.fitted, self._unit_responses())
+        self.shared = global_unknowns(campaign, model, campaign.fitted, self._data_over_model())
 
-    def _take(self, trials: Sequence[Trial]) -> None:
-        """Make trials ready to be compared."""
-        self.trials = tuple(TrialData.of(self.campaign, trial, self.noise, self.model) for trial in trials)
-        self.counts = np.zeros(len(self.channel_names))
+    def _prepare_trials(self, trials: Sequence[Trial]) -> None:
+        """Set the trials that are compared, the number of their samples, and an empty cache."""
+        self.trials = tuple(
+            TrialData.prepare(self.campaign, trial, self.noise, self.model) for trial in trials
+        )
+        self.counts = self._sample_counts()
+        self._responses = ResultCache(KEPT_RESPONSES)
+
+    def _sample_counts(self) -> FloatArray:
+        """Return the number of samples (channels,) of each channel in the trials."""
+        counts = np.zeros(len(self.channel_names))
         for data in self.trials:
-            np.add.at(self.counts, data.groups, data.weight.sum(axis=0))
-        self._responses = ResultCache(KEPT)
+            np.add.at(counts, data.groups, data.weight.sum(axis=0))
+        return counts
 
-    def refused(self, candidate: Candidate, cause: DiscrepancyError) -> None:
-        """Keep why an effect could not be evaluated or fitted alone; of several, any may be to blame."""
+    def record_refusal(self, candidate: Candidate, cause: DiscrepancyError) -> None:
+        """Record why a single effect could not be evaluated or fitted.
+
+        Of a set of effects nothing is recorded, as any of them may be the cause.
+        """
         if len(candidate.terms) == 1:
             self.refusals[candidate.terms[0].effect.identifier] = str(cause)
 
-    def _unit_responses(self) -> dict[str, float]:
-        """Estimate data over model for signals of unknown scale."""
-        found: dict[str, float] = {}
+    def _data_over_model(self) -> dict[str, float]:
+        """Return the ratio of readings to model for each channel of unknown scale.
+
+        It is negative where the channel moves against the model. The first trial in which the
+        channel moves decides.
+        """
+        ratios: dict[str, float] = {}
         point = self.start(Candidate())
         for number, data in enumerate(self.trials):
+            release = data.trial.release
             for column, name in enumerate(data.trial.channels):
-                channel = self.campaign.channels[name]
-                if channel.gain_deviation != inf or name in found:
+                has_unknown_scale = self.campaign.channels[name].gain_deviation == inf
+                if not has_unknown_scale or name in ratios:
                     continue
-                measured = data.trial.values[:, column] - np.median(data.trial.values[:, column])
+                readings = data.trial.values[:, column]
+                measured = readings - np.median(readings)
                 local = point.local[number]
-                if data.trial.release is not None and not data.trial.release.at_rest:
-                    local[data.unknowns.zeros] = 1.0 / data.unknowns.scale[data.unknowns.zeros]
+                if release is not None and not release.at_rest:
+                    first_amplitude = data.unknowns.zeros
+                    local[first_amplitude] = 1.0 / data.unknowns.scale[first_amplitude]
                 response, _ = self.response(number, point.shared, local, ModelPatch())
                 size = float(np.abs(response[:, column]).max())
                 if size > 0.0:
-                    same = data.trial.release is not None or measured @ response[:, column] > 0.0
-                    found[name] = float(np.abs(measured).max()) / size * (1.0 if same else -1.0)
-        return found
+                    has_same_sign = release is not None or measured @ response[:, column] > 0.0
+                    sign = 1.0 if has_same_sign else -1.0
+                    ratios[name] = float(np.abs(measured).max()) / size * sign
+        return ratios
 
     # -------------------------------------------------------------------------- values
 
     def start(self, candidate: Candidate) -> Point:
-        """Return the prior means, and the start of the candidate."""
+        """Return the point of the prior means, from which the fit of a candidate may begin."""
         return Point(
-            np.zeros(self.shared.size),
-            tuple(np.zeros(data.unknowns.size) for data in self.trials),
-            candidate.start(),
+            shared=np.zeros(self.shared.size),
+            local=tuple(np.zeros(data.unknowns.size) for data in self.trials),
+            effect=candidate.start(),
         )
+
+    def patch_in(self, number: int, candidate: Candidate, effect: FloatArray) -> ModelPatch:
+        """Return the patch of a candidate in a trial: empty where it does not act on such trials.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        candidate : Candidate
+            The effects.
+        effect : (E,) array
+            The scaled effect parameters.
+        """
+        if self.trials[number].trial.kind not in candidate.acts_on:
+            return ModelPatch()
+        return candidate.patch(self.setting, effect)
 
     def response(
         self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, finer: int = 1
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the response (N, C) of a trial without gain and zero, and its rates; kept while it is used.
+        """Return the response of a patched model in a trial, without gains and zeros.
 
-        Time steps are `refinement` times `finer` smaller than the model's own.
+        Responses are kept in memory.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        shared : (Q,) array
+            The scaled shared unknowns.
+        local : (L,) array
+            The scaled unknowns of the trial.
+        patch : ModelPatch
+            The effects.
+        finer : int
+            The factor by which time steps are smaller than those of the problem.
+
+        Returns
+        -------
+        response : (N, C) array
+            The response at the times of the readings [unit of the channel].
+        rates : (N, C) array or None
+            Its time derivative, where the model gives it.
         """
         data = self.trials[number]
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
         conditions = replace(conditions, refinement=self.refinement * finer)
 
-        def answer() -> tuple[FloatArray, FloatArray | None]:
+        def simulate() -> tuple[FloatArray, FloatArray | None]:
             observed = observe(self.model, self.campaign, data.trial, patch, conditions)
             return observed.values, observed.rates
 
-        return self._responses.get((number, patch.primitives, conditions.key), answer)
+        return self._responses.get((number, patch.primitives, conditions.key), simulate)
 
-    def answer(self, number: int, point: Point, candidate: Candidate, finer: int = 1) -> FloatArray:
-        """Return the response (N, C) of a trial beside the effects of a candidate, as `response` does."""
-        acts = self.trials[number].trial.kind in candidate.acts_on
-        patch = candidate.patch(self.setting, point.effect) if acts else ModelPatch()
-        return self.response(number, point.shared, point.local[number], patch, finer)[0]
+    def response_with(
+        self, number: int, point: Point, candidate: Candidate, finer: int = 1
+    ) -> FloatArray:
+        """Return the `response` (N, C) of a trial with the effects of a candidate."""
+        patch = self.patch_in(number, candidate, point.effect)
+        response, _ = self.response(number, point.shared, point.local[number], patch, finer)
+        return response
 
     def prediction(self, number: int, point: Point, response: FloatArray) -> FloatArray:
-        """Return the prediction (N, C) with gains and zeros."""
+        """Return the prediction (N, C) of the readings: the response with gains and zeros."""
         data = self.trials[number]
         gains = self.shared.gains(point.shared, data.trial.channels)
         zero = data.unknowns.zero(point.local[number], len(data.trial.channels))
         return np.asarray((1.0 + gains) * response + zero)
 
     def residual(self, number: int, point: Point, response: FloatArray) -> FloatArray:
-        """Return the standardised residuals (N, C) of a trial."""
+        """Return the standardised residuals (N, C) of a trial, given its response (N, C)."""
         data = self.trials[number]
         return data.standardised(data.trial.values - self.prediction(number, point, response))
 
@@ -171,175 +263,283 @@ class Problem:
         point: Point,
         candidate: Candidate,
         *,
-        known: Linearisation | None = None,
+        known: TrialDerivatives | None = None,
         effect_steps: FloatArray | None = None,
-    ) -> Linearisation:
-        """Return response and derivatives of a trial.
+    ) -> TrialDerivatives:
+        """Return the response of a trial and its derivatives, by finite differences.
 
         Parameters
         ----------
         number : int
-            Of the trial.
+            The index of the trial.
         point : Point
-            Where.
+            The values of all unknowns.
         candidate : Candidate
-            Effects that act.
-        known : Linearisation, optional
-            Derivatives by shared and local unknowns that are near enough.
-        effect_steps : (E,) ndarray, optional
-            Deviations of the effect parameters. Differences over one of them, at most a hundredth of the
-            prior's, average over the kinks of friction and hysteresis and do not reach beyond where the
-            parameters may lie.
+            The effects that act.
+        known : TrialDerivatives, optional
+            Derivatives with respect to shared unknowns and those of the trial that are near enough.
+        effect_steps : (E,) array, optional
+            The posterior deviations of the effect parameters. Differences over one of them, at most
+            a hundredth of the prior's, average over the kinks of friction and hysteresis and do not
+            reach beyond where the parameters may lie.
 
-        Notes
-        -----
-        What nuisances can do as well is left of a derivative by an effect once these are fitted: a
-        ten-thousandth where the effect moves frequencies. The curvature in a one-sided difference is more
-        than that, and would count as information.
+        Notes ----- Differences by effects are two-sided. What remains of such a derivative once the
+        nuisances are fitted is small: a ten-thousandth where the effect moves frequencies. The
+        curvature in a one-sided difference is larger than that, and would count as information.
         """
-        kind, response = self.trials[number].trial.kind, self.answer(number, point, candidate)
-        if known is not None:
-            parameters, by_local = known.parameters, known.local
+        kind = self.trials[number].trial.kind
+        response = self.response_with(number, point, candidate)
+        if known is None:
+            parameters, by_local = self._nuisance_derivatives(number, point, candidate)
         else:
-            parameters, by_local = self._by_nuisances(number, point, candidate)
+            parameters = known.parameters
+            by_local = known.local
         effect = np.zeros((candidate.size, *response.shape))
         steps = np.full(candidate.size, PARAMETER_STEP)
         if effect_steps is not None:
             steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
         for k, step in enumerate(steps.tolist()):
-            if kind in candidate.acting(k):
-                ends = [replace(point, effect=moved(point.effect, k, side * step)) for side in (1.0, -1.0)]
-                above, below = (self.answer(number, end, candidate) for end in ends)
-                effect[k] = (above - below) / (2.0 * step)
-        return Linearisation(response, parameters, by_local, effect)
+            if kind not in candidate.acts_on_with(k):
+                continue
+            point_above = replace(point, effect=with_step(point.effect, k, step))
+            point_below = replace(point, effect=with_step(point.effect, k, -step))
+            above = self.response_with(number, point_above, candidate)
+            below = self.response_with(number, point_below, candidate)
+            effect[k] = (above - below) / (2.0 * step)
+        return TrialDerivatives(response, parameters, by_local, effect)
 
-    def _by_nuisances(self, number: int, point: Point, candidate: Candidate) -> tuple[FloatArray, FloatArray]:
-        """Return the derivatives by the calibrated parameters and by the trial's own unknowns but zeros."""
-        data, shared, local = self.trials[number], point.shared, point.local[number]
-        acts = data.trial.kind in candidate.acts_on
-        patch = candidate.patch(self.setting, point.effect) if acts else ModelPatch()
-        response, rates = self.response(number, shared, local, patch)
+    def _nuisance_derivatives(
+        self, number: int, point: Point, candidate: Candidate
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the derivatives of a trial's response with respect to its nuisances.
+
+        They are those by the calibrated parameters (P, N, C), and those by the unknowns of the
+        trial except its zeros (I, N, C).
+        """
+        data = self.trials[number]
         unknowns = data.unknowns
-        first, _, last, at = unknowns.ends
+        shared = point.shared
+        local = point.local[number]
+        patch = self.patch_in(number, candidate, point.effect)
+        response, rates = self.response(number, shared, local, patch)
 
-        def slope(by_shared: FloatArray, by_local: FloatArray, step: float = PARAMETER_STEP) -> FloatArray:
-            return (self.response(number, by_shared, by_local, patch)[0] - response) / step
+        def slope(
+            shared_values: FloatArray, local_values: FloatArray, step: float = PARAMETER_STEP
+        ) -> FloatArray:
+            stepped, _ = self.response(number, shared_values, local_values, patch)
+            return (stepped - response) / step
 
-        # inwards from the end of a range
-        inwards = shared + SHARED_STEP > self.shared.ends[1]
-        steps = np.where(inwards, -SHARED_STEP, SHARED_STEP)[: self.shared.count]
-        parameters = [slope(moved(shared, k, step), local, step) for k, step in enumerate(steps.tolist())]
-        columns = [slope(shared, moved(local, k)) for k in range(first, last)]
+        # calibrated parameters: inwards from the upper end of a range
+        _, high = self.shared.ends
+        is_at_end = shared + SHARED_STEP > high
+        steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: self.shared.count]
+        parameters = [
+            slope(with_step(shared, k, step), local, step) for k, step in enumerate(steps.tolist())
+        ]
+        # initial state and constants of inputs
+        zeros_end, _, inputs_end, time_zero_end = unknowns.ends
+        columns = [slope(shared, with_step(local, k)) for k in range(zeros_end, inputs_end)]
         if unknowns.has_time_zero:
-            of_time = slope(shared, moved(local, last)) if rates is None else rates * unknowns.scale[last]
-            columns.append(of_time)
+            if rates is None:
+                columns.append(slope(shared, with_step(local, inputs_end)))
+            else:
+                columns.append(rates * unknowns.scale[inputs_end])
+        # health
         if len(unknowns.health_rows):
-            by_entry = np.zeros((len(unknowns.health_rows), *response.shape))
-            for region in range(data.trial.health.shape[1]):
-                entries = np.flatnonzero(unknowns.health_columns == region)
-                if not len(entries):
-                    continue
-                there = local.copy()
-                # away from the limits of the loss; rows do not act on each other
-                sign = np.where(there[at + entries] > 0.0, -1.0, 1.0)
-                there[at + entries] += sign * PARAMETER_STEP
-                change = slope(shared, there)
-                if data.trial.is_dynamic:
-                    by_entry[entries] = sign[:, np.newaxis, np.newaxis] * change
-                else:
-                    rows = unknowns.health_rows[entries]
-                    by_entry[entries, rows] = sign[:, np.newaxis] * change[rows]
-            columns.extend(by_entry)
+            columns.extend(
+                _health_derivatives(
+                    data, local, time_zero_end, response.shape, partial(slope, shared)
+                )
+            )
         shape = (-1, *response.shape)
         return np.array(parameters).reshape(shape), np.array(columns).reshape(shape)
 
-    def columns(
-        self, number: int, point: Point, parts: Linearisation, candidate: Candidate
+    def prediction_derivatives(
+        self, number: int, point: Point, derivatives: TrialDerivatives, candidate: Candidate
     ) -> tuple[FloatArray, IntArray]:
-        """Return derivatives of the prediction of a trial [channel's unit], and whose the later ones are.
+        """Return the derivatives of a trial's prediction.
+
+        Those of the response, with gains and zeros.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        point : Point
+            The values of all unknowns.
+        derivatives : TrialDerivatives
+            The response and its derivatives.
+        candidate : Candidate
+            The effects whose parameters are unknowns.
 
         Returns
         -------
-        columns : (L + K, N, C) ndarray
-            By the L unknowns of the trial, and by the K shared ones and effect parameters that touch it.
-        index : (K,) ndarray of int
-            Which these are, global unknowns first.
+        columns : (L + K, N, C) array
+            The derivatives with respect to the L unknowns of the trial, and to the K shared
+            unknowns and effect parameters that act on it [unit of the channel].
+        index : (K,) array of int
+            The indices of these K, among the Q shared unknowns and the effect parameters after
+            them.
         """
-        data, shared = self.trials[number], self.shared
-        channels, unknowns = data.trial.channels, data.unknowns
+        data = self.trials[number]
+        unknowns = data.unknowns
+        shared = self.shared
+        channels = data.trial.channels
+        response = derivatives.response
         gains = 1.0 + shared.gains(point.shared, channels)
-        known = np.array([k for k, name in enumerate(shared.gain_channels) if name in channels], dtype=int)
-        column = [channels.index(shared.gain_channels[k]) for k in known]
-        acting = np.array(
-            [k for k in range(candidate.size) if data.trial.kind in candidate.acting(k)], dtype=int
+        # zeros of the channels
+        by_zeros = np.zeros((unknowns.zeros, *response.shape))
+        zero_scale = unknowns.scale[: unknowns.zeros, np.newaxis]
+        by_zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = zero_scale
+        # gains of the channels
+        gain_numbers = np.array(
+            [k for k, name in enumerate(shared.gain_channels) if name in channels], dtype=int
         )
-        shape = parts.response.shape
-        zeros, of_gains = np.zeros((unknowns.zeros, *shape)), np.zeros((len(known), *shape))
-        zeros[np.arange(len(zeros)), :, unknowns.zero_columns] = unknowns.scale[: len(zeros), np.newaxis]
-        of_gains[np.arange(len(known)), :, column] = (
-            parts.response[:, column] * shared.scale[shared.count + known]
+        gain_columns = [channels.index(shared.gain_channels[k]) for k in gain_numbers]
+        by_gains = np.zeros((len(gain_numbers), *response.shape))
+        gain_scale = shared.scale[shared.count + gain_numbers]
+        by_gains[np.arange(len(gain_numbers)), :, gain_columns] = (
+            response[:, gain_columns] * gain_scale
         ).T
-        found = (zeros, parts.local * gains, parts.parameters * gains, of_gains, parts.effect[acting] * gains)
-        index = np.concatenate((np.arange(shared.count), shared.count + known, shared.size + acting))
-        return np.concatenate(found), index
+        # parameters of the effects that act on such trials
+        kind = data.trial.kind
+        effect_numbers = np.array(
+            [k for k in range(candidate.size) if kind in candidate.acts_on_with(k)], dtype=int
+        )
+        columns = np.concatenate(
+            (
+                by_zeros,
+                derivatives.local * gains,
+                derivatives.parameters * gains,
+                by_gains,
+                derivatives.effect[effect_numbers] * gains,
+            )
+        )
+        index = np.concatenate(
+            (
+                np.arange(shared.count),
+                shared.count + gain_numbers,
+                shared.size + effect_numbers,
+            )
+        )
+        return columns, index
 
     # -------------------------------------------------------------------------- likelihood
 
-    def group_sums(self, residuals: Sequence[FloatArray]) -> FloatArray:
-        """Return the sum of squared standardised residuals of each channel."""
+    def sums_by_channel(self, residuals: Sequence[FloatArray]) -> FloatArray:
+        """Return the sum of squares (channels,), given the residuals (N, C) of each trial."""
         sums = np.zeros(len(self.channel_names))
         for data, residual in zip(self.trials, residuals, strict=True):
             np.add.at(sums, data.groups, np.einsum("nc,nc->c", residual, residual))
         return sums
 
     def misfit(self, sums: FloatArray) -> float:
-        """Return -ln L with the noise variances marginalised, up to a constant."""
-        return float(misfits(self.freedom, self.counts, sums)[self.counts > 0].sum())
+        """Return -ln L with the noise variances marginalised, up to a constant [nat].
+
+        Parameters
+        ----------
+        sums : (channels,) array
+            The sum of squared standardised residuals of each channel.
+        """
+        misfits = channel_misfits(self.freedom, self.counts, sums)
+        return float(misfits[self.counts > 0].sum())
 
     def precisions(self, sums: FloatArray) -> FloatArray:
-        """Return the expected precision of each channel's noise over 1 / s0^2, given the residuals."""
+        """Return the expected noise precision (channels,) over 1 / s0^2, given sums of squares."""
         n0, n = self.freedom, self.counts
         with np.errstate(divide="ignore", invalid="ignore"):
-            left = np.where(n0 > 0.0, sums, np.maximum(sums, QUIETEST * n))
-            weights = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + left))
-        return np.where(n > 0, weights, 1.0)
+            squares = np.where(n0 > 0.0, sums, np.maximum(sums, QUIETEST * n))
+            precisions = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + squares))
+        return np.where(n > 0, precisions, 1.0)
+
+    # -------------------------------------------------------------------------- other problems
 
     def with_trials(self, trials: Sequence[Trial], model: Model | None = None) -> "Problem":
-        """Return the problem of other trials and another model, with the same noise and global unknowns."""
+        """Return the problem of other trials, and of another model if one is given.
+
+        Noise and shared unknowns stay the same.
+        """
         other = copy(self)
         if model is not None:
             other.model = model.remembering()
-        other._take(trials)
+        other._prepare_trials(trials)
         return other
 
     def first_samples(self, count: int) -> "Problem":
-        """Return the problem of the first samples of the trials in motion."""
+        """Return the problem in which only the first samples of the trials in motion count."""
         shorter = copy(self)
-        shorter.trials = tuple(
-            replace(data, weight=data.weight * (np.arange(len(data.weight)) < count)[:, None])
-            if data.trial.is_dynamic
-            else data
-            for data in self.trials
-        )
-        shorter.counts = np.zeros_like(self.counts)
-        for data in shorter.trials:
-            np.add.at(shorter.counts, data.groups, data.weight.sum(axis=0))
+        shorter_trials = []
+        for data in self.trials:
+            if data.trial.is_dynamic:
+                is_counted = np.arange(len(data.weight)) < count
+                data = replace(data, weight=data.weight * is_counted[:, None])
+            shorter_trials.append(data)
+        shorter.trials = tuple(shorter_trials)
+        shorter.counts = shorter._sample_counts()
         return shorter
 
     def widened(self, factors: FloatArray) -> "Problem":
-        """Return the problem with noise so many times (channels,) as wide in trials in motion, and known.
+        """Return the problem under a wider noise whose deviation is known.
 
-        At rest too, where nothing is known of it.
+        The noise is wider in trials in motion, and at rest too where no noise is recorded.
+
+        Parameters
+        ----------
+        factors : (channels,) array
+            The factor on the noise deviation of each channel.
         """
         wider = copy(self)
-        everywhere = self.freedom == 0.0
-        wider.trials = tuple(
-            replace(
-                data,
-                deviation=data.deviation
-                * np.where(everywhere[data.groups] | data.trial.is_dynamic, factors[data.groups], 1.0),
-            )
-            for data in self.trials
-        )
+        is_unrecorded = self.freedom == 0.0
+        wider_trials = []
+        for data in self.trials:
+            is_wider = is_unrecorded[data.groups] | data.trial.is_dynamic
+            factor = np.where(is_wider, factors[data.groups], 1.0)
+            wider_trials.append(replace(data, deviation=data.deviation * factor))
+        wider.trials = tuple(wider_trials)
         wider.freedom = np.where(factors != 1.0, inf, self.freedom)
         return wider
+
+
+def _health_derivatives(
+    data: TrialData,
+    local: FloatArray,
+    first: int,
+    shape: tuple[int, ...],
+    slope: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Return the derivatives (H, N, C) of a response with respect to the uncertain health entries.
+
+    The health of a static trial has a row for each reading, and a row changes its own reading only.
+    So all entries of a region are stepped at once, and each takes its own row of the difference.
+
+    Parameters
+    ----------
+    data : TrialData
+        The trial and its unknowns.
+    local : (L,) array
+        The scaled unknowns of the trial.
+    first : int
+        The index of the first health entry among them.
+    shape : tuple of int
+        The shape (N, C) of the response.
+    slope : callable
+        Returns the difference quotient (N, C) to other unknowns of the trial (L,), for a positive
+        step.
+    """
+    unknowns = data.unknowns
+    derivatives = np.zeros((len(unknowns.health_rows), *shape))
+    for region in range(data.trial.health.shape[1]):
+        entries = np.flatnonzero(unknowns.health_columns == region)
+        if not len(entries):
+            continue
+        stepped = local.copy()
+        # away from the limits of the stiffness loss
+        sign = np.where(stepped[first + entries] > 0.0, -1.0, 1.0)
+        stepped[first + entries] += sign * PARAMETER_STEP
+        change = slope(stepped)
+        if data.trial.is_dynamic:
+            derivatives[entries] = sign[:, np.newaxis, np.newaxis] * change
+        else:
+            rows = unknowns.health_rows[entries]
+            derivatives[entries, rows] = sign[:, np.newaxis] * change[rows]
+    return derivatives

@@ -1,15 +1,17 @@
-"""Screening: what an effect could explain, before any fit, to first order in the nuisances.
+"""Screening: how much an effect could explain, before any fit, to first order in the nuisances.
 
-With d the standardised change that an effect makes to the prediction at the fitted nuisances, J their
-derivatives and H the Hessian of the fit, the misfit after the nuisances have adapted is
+Let d be the standardised change that an effect makes to the prediction at the fitted nuisances, J
+the derivatives of the prediction by the nuisances, r the residuals, g the gradient and H the
+Hessian of the fit. The misfit after the nuisances have adapted is
 
-    F(d) = F(0) - b(d) + G(d, d) / 2,   G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
+    F(d) = F(0) - b(d) + G(d, d) / 2,
+    G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
 
-Changes of several effects add, so pairs and scales cost inner products only. G is also what separates two
-effects before data are looked at.
+Changes of several effects add, so pairs and scales of effects cost inner products only. G is also
+the measure that separates two effects before data are looked at.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from math import sqrt
@@ -23,64 +25,72 @@ from discrepancy.catalogue.entry import EffectParameter, ShapeParameter
 from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
 
-from .candidate import Candidate, Term
-from .fitting import LARGEST_EFFECT, CandidateFit, finite, normal_equations, upper_factor
+from .candidate import Candidate, EffectTerm
+from .fitting import LARGEST_EFFECT, CandidateFit, check_finite, cholesky_factor, normal_equations
 from .problem import Problem
 
 
 @dataclass(frozen=True)
-class Change:
-    """What an effect at given values does to the prediction, adapted nuisances taken off.
+class ScreenedChange:
+    """The change of the prediction by an effect at given values, without what nuisances can do.
 
     Attributes
     ----------
-    term : Term
-        The effect at a place.
-    start : (E,) ndarray
-        Scaled parameters.
-    vector : (D,) ndarray
-        Change and its projections, such that G(c, d) = c.sign.d.
-    fits : float
-        b(d): its overlap with the residual [nat].
-    size : float
-        G(d, d): squared distance from the model without it [sigma^2].
+    term : EffectTerm
+        The effect at its place.
+    start : (E,) array
+        The scaled parameters of the effect.
+    vector : (D,) array
+        The change and its projections on the nuisances, such that G(c, d) = (sign c).d with
+        `Screen.sign`.
+    overlap : float
+        b(d): the overlap of the change with the residuals [nat].
+    squared_size : float
+        G(d, d): the squared distance from the model without the change, in noise variances.
     """
 
-    term: Term
+    term: EffectTerm
     start: FloatArray
     vector: FloatArray
-    fits: float
-    size: float
+    overlap: float
+    squared_size: float
 
     @property
     def scale(self) -> float:
-        """Factor on the change that explains most."""
-        return self.fits / self.size if self.size > 0.0 else 0.0
+        """The factor on the change at which it explains most."""
+        return self.overlap / self.squared_size if self.squared_size > 0.0 else 0.0
 
     @property
     def gain(self) -> float:
-        """Decrease of the misfit at the best scale [nat]; none where a positive size would turn negative."""
-        return 0.5 * self.fits * self.scale if self.fits > 0.0 or self.term.may_turn else 0.0
+        """The decrease of the misfit at the best scale [nat].
+
+        0 where that has a sign the effect cannot have.
+        """
+        if self.overlap > 0.0 or self.term.may_be_negative:
+            return 0.5 * self.overlap * self.scale
+        return 0.0
 
     @property
     def best(self) -> FloatArray:
-        """The scaled parameters (E,) at which the magnitude is that of the best scale."""
-        return self.term.sized(self.start, self.scale, -0.7 * LARGEST_EFFECT, SEARCH.largest_start)
+        """The scaled parameters (E,) with the magnitude at the best scale: the start of a fit."""
+        lowest = -0.7 * LARGEST_EFFECT
+        return self.term.rescaled(self.start, self.scale, lowest, SEARCH.largest_start)
 
 
 class Screen:
-    """Inner products of changes at a fit.
+    """A fit as a screen for further effects: changes of its prediction and their inner products.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     fit : CandidateFit
-        Where the nuisances stand; its own effects stay as they are.
+        The fit at which nuisances are eliminated; its own effects stay as they are.
     record_noise : bool
-        Whether residuals count by the noise record (else by what the fit left).
-    effect_precision : (E,) ndarray, optional
-        Of the prior of the fit's own effect parameters, which follow a change with the nuisances then.
+        Whether residuals are weighted by the noise records, or by what the fit left.
+    effect_precision : (E,) array, optional
+        The prior precisions of the fit's own effect parameters; if given, these adapt to a change
+        as the nuisances do.
     """
 
     def __init__(
@@ -91,158 +101,239 @@ class Screen:
         record_noise: bool = True,
         effect_precision: FloatArray | None = None,
     ) -> None:
-        self.problem, self.fit = problem, fit
-        known = problem.freedom > 0.0
-        left = problem.precisions(fit.sums)
-        precision = np.where(known, 1.0, left) if record_noise else left
-        following = Candidate() if effect_precision is None else fit.candidate
-        found = normal_equations(problem, fit, following, precision, effect_precision)
-        self._trials, self._size = found.trials, len(found.gradient)
-        factor = upper_factor(found.matrix)
-        self._inverse = solve_triangular(factor, np.eye(self._size), trans="T", check_finite=False)
-        self._gradient = self._inverse @ found.gradient
-
-    def change(self, term: Term, start: FloatArray) -> Change:
-        """Return what a term does at scaled parameters, besides the effects of the fit."""
-        candidate = self.fit.candidate.plus(term)
-        effect = np.concatenate((self.fit.point.effect, start))
-        vector, fits, size = self._moved(candidate, effect, term.effect.acts_on)
-        return Change(term, start, vector, fits, max(size, 0.0))
-
-    def rise(self, effect: FloatArray) -> float:
-        """Return by how much the misfit rises [nat] when the fit's own effect parameters (E,) are these."""
-        candidate = self.fit.candidate
-        _, fits, size = self._moved(candidate, effect, candidate.acts_on)
-        return 0.5 * size - fits
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def _moved(
-        self, candidate: Candidate, effect: FloatArray, acting: frozenset[TrialKind]
-    ) -> tuple[FloatArray, float, float]:
-        """Return vector, b and G of the change to a candidate, in kinds of trials that it touches."""
-        problem, fit = self.problem, self.fit
-        patch = candidate.patch(problem.setting, effect)
-        changes: dict[int, FloatArray] = {}
-        for number, data in enumerate(problem.trials):
-            if data.trial.kind in acting:
-                response, _ = problem.response(number, fit.point.shared, fit.point.local[number], patch)
-                gains = 1.0 + problem.shared.gains(fit.point.shared, data.trial.channels)
-                changes[number] = data.standardised(gains * (response - fit.responses[number]))
-        return self.projected(changes)
-
-    def projected(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
-        """Return vector, b and G of standardised changes (N, C) of predictions, by number of the trial."""
-        total = np.zeros(self._size)
-        parts, fits, square = [], 0.0, 0.0
-        for number, (item, place) in enumerate(self._trials):
-            d: FloatArray = np.zeros(item.residual.shape)
-            if number in changes:
-                d = (changes[number] * item.root).ravel()
-                total[place] += item.rows @ d
-                fits += float(item.residual @ d)
-                square += float(d @ d)
-            parts.append(d)
-        y = self._inverse @ total
-        fits -= float(self._gradient @ y)
-        square -= float(y @ y)
-        finite(np.array((fits, square)))
-        return np.concatenate((*parts, y)), fits, square
-
-    def shrunk(self, change: Change) -> tuple[Change, float]:
-        """Return a change made so small that it is of first order, and by which factor.
-
-        Effects that move a frequency turn phases by many radians at their medians, which says nothing of what
-        they do in small.
-        """
-        whole = float((change.vector[self.sign > 0.0] ** 2).sum())  # before the nuisances take their share
-        factor = sqrt(SEARCH.first_order / whole) if whole > 0.0 else 1.0
-        if factor >= 1.0:
-            return change, 1.0
-        return self.change(change.term, change.term.sized(change.start, factor)), factor
-
-    def _peaks(self, term: Term) -> tuple[float, ...]:
-        """Return peaks of the residuals' mean spectrum at a term's channel, over the first frequency."""
-        if not term.effect.spectral:
-            return ()
-        problem = self.problem
-        spectra: dict[tuple[int, float], FloatArray] = {}
-        for data, residual in zip(problem.trials, self.fit.residuals, strict=True):
-            if data.trial.kind not in term.effect.acts_on or term.place not in data.trial.channels:
-                continue
-            series = residual[:, data.trial.channels.index(term.place)]
-            key = (len(series), data.trial.interval)
-            power = np.abs(np.fft.rfft(series - series.mean(), SEARCH.padded * len(series))) ** 2
-            spectra[key] = spectra.get(key, 0.0) + power
-        found: list[float] = []
-        for (count, interval), power in spectra.items():
-            resolution = 1.0 / (SEARCH.padded * count * interval)
-            inner = np.flatnonzero((power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])) + 1
-            best = inner[np.argsort(power[inner])[::-1][: 4 * SEARCH.peaks]]
-            kept: list[int] = []
-            for index in best:
-                if all(abs(index - other) > 2 * SEARCH.padded for other in kept) and len(kept) < SEARCH.peaks:
-                    kept.append(int(index))
-            first = problem.setting.scales.angular_frequency / (2.0 * np.pi)
-            found += [index * resolution / first for index in kept]
-        return tuple(found)
+        self.problem = problem
+        self.fit = fit
+        precision = problem.precisions(fit.sums)
+        if record_noise:
+            precision = np.where(problem.freedom > 0.0, 1.0, precision)
+        adapting = Candidate() if effect_precision is None else fit.candidate
+        equations = normal_equations(problem, fit, adapting, precision, effect_precision)
+        self._trials = equations.trials
+        self._nuisance_count = len(equations.gradient)
+        factor = cholesky_factor(equations.matrix)
+        self._inverse_factor = solve_triangular(
+            factor, np.eye(self._nuisance_count), trans="T", check_finite=False
+        )
+        self._gradient = self._inverse_factor @ equations.gradient
 
     @property
     def sign(self) -> FloatArray:
-        """Signs (D,) of the inner product: changes count, their projections are taken off."""
-        samples = sum(residual.size for residual in self.fit.residuals)
-        return np.repeat((1.0, -1.0), (samples, self._size))
+        """The signs (D,) of the inner product.
 
-    def changes(self, term: Term, *, fine: bool = True) -> Iterator[Change]:
-        """Yield the changes of a term over the grid of its parameters, where the model can follow.
-
-        Without `fine`, signed magnitudes are tried at one size only, enough for what is linear in them,
-        unless they ask for levels of their own.
+        1 for changes, -1 for their projections on nuisances.
         """
-        followed, refusal = False, None
-        for start in grid(term, self._peaks(term), fine=fine):
+        samples = sum(residual.size for residual in self.fit.residuals)
+        return np.repeat((1.0, -1.0), (samples, self._nuisance_count))
+
+    # ---------------------------------------------------------------- changes of the prediction
+
+    def change(self, term: EffectTerm, start: FloatArray) -> ScreenedChange:
+        """Return the change by a term at scaled parameters (E,), beside the effects of the fit."""
+        candidate = self.fit.candidate.with_term(term)
+        effect = np.concatenate((self.fit.point.effect, start))
+        vector, overlap, size = self._change_to(candidate, effect, term.effect.acts_on)
+        return ScreenedChange(term, start, vector, overlap, max(size, 0.0))
+
+    def misfit_rise(self, effect: FloatArray) -> float:
+        """Return the rise of the misfit [nat] at other effect parameters (E,) of the fit."""
+        candidate = self.fit.candidate
+        _, overlap, size = self._change_to(candidate, effect, candidate.acts_on)
+        return 0.5 * size - overlap
+
+    @np.errstate(over="ignore", invalid="ignore")
+    def _change_to(
+        self, candidate: Candidate, effect: FloatArray, kinds: frozenset[TrialKind]
+    ) -> tuple[FloatArray, float, float]:
+        """Return vector, overlap b and size G of the change to a candidate, in kinds of trials."""
+        problem = self.problem
+        point = self.fit.point
+        patch = candidate.patch(problem.setting, effect)
+        changes: dict[int, FloatArray] = {}
+        for number, data in enumerate(problem.trials):
+            if data.trial.kind not in kinds:
+                continue
+            response, _ = problem.response(number, point.shared, point.local[number], patch)
+            gains = 1.0 + problem.shared.gains(point.shared, data.trial.channels)
+            changes[number] = data.standardised(gains * (response - self.fit.responses[number]))
+        return self.project(changes)
+
+    def project(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
+        """Return vector, overlap b and size G of changes, without what nuisances can do.
+
+        Parameters
+        ----------
+        changes : mapping of int to (N, C) array
+            The standardised changes of predictions, by the index of the trial.
+
+        Returns
+        -------
+        vector : (D,) array
+            The changes of all trials, and their projections on the nuisances.
+        overlap, size : float
+            b(d) and G(d, d) of the module's text.
+        """
+        by_nuisance = np.zeros(self._nuisance_count)  # J d
+        trial_changes = []
+        overlap = 0.0
+        size = 0.0
+        for number, (rows, index) in enumerate(self._trials):
+            d: FloatArray = np.zeros(rows.residual.shape)
+            if number in changes:
+                d = (changes[number] * rows.root).ravel()
+                by_nuisance[index] += rows.rows @ d
+                overlap += float(rows.residual @ d)
+                size += float(d @ d)
+            trial_changes.append(d)
+        projections = self._inverse_factor @ by_nuisance
+        overlap -= float(self._gradient @ projections)
+        size -= float(projections @ projections)
+        check_finite(np.array((overlap, size)))
+        return np.concatenate((*trial_changes, projections)), overlap, size
+
+    def shrunk(self, change: ScreenedChange) -> tuple[ScreenedChange, float]:
+        """Return a change made so small that it is linear in its magnitude, and the factor.
+
+        At its median, an effect that moves a frequency turns phases by many radians, which says
+        nothing of what it does at a small magnitude.
+        """
+        is_reading = self.sign > 0.0
+        squared_size = float((change.vector[is_reading] ** 2).sum())
+        factor = sqrt(SEARCH.first_order / squared_size) if squared_size > 0.0 else 1.0
+        if factor >= 1.0:
+            return change, 1.0
+        return self.change(change.term, change.term.rescaled(change.start, factor)), factor
+
+    def changes(self, term: EffectTerm, *, fine: bool = True) -> Iterator[ScreenedChange]:
+        """Yield the changes by a term over a grid of its parameters, where the model can follow.
+
+        Parameters
+        ----------
+        term : EffectTerm
+            The effect at its place.
+        fine : bool
+            Whether signed magnitudes are tried at a small size too. One size is enough for an
+            effect that is linear in its magnitude.
+        """
+        has_change = False
+        refusal = None
+        for start in parameter_grid(term, self._spectral_peaks(term), fine=fine):
             try:
                 change = self.change(term, start)
             except DiscrepancyError as cause:  # such as a spring softer than what is taken from it
                 refusal = cause
             else:
-                followed = True
+                has_change = True
                 yield change
-        if refusal is not None and not followed:
-            self.problem.refused(self.fit.candidate.plus(term), refusal)
+        if refusal is not None and not has_change:
+            self.problem.record_refusal(self.fit.candidate.with_term(term), refusal)
+
+    # ---------------------------------------------------------------- lines in the spectrum
+
+    def _spectral_peaks(self, term: EffectTerm) -> tuple[float, ...]:
+        """Return the peak frequencies of the residuals in a term's channel.
+
+        They are relative to the first frequency of the structure.
+
+        Empty where the effect has no spectral parameter. Records of the same length and interval
+        are summed to one spectrum.
+        """
+        if not term.effect.spectral:
+            return ()
+        spectra: dict[tuple[int, float], FloatArray] = {}
+        for data, residual in zip(self.problem.trials, self.fit.residuals, strict=True):
+            trial = data.trial
+            if trial.kind not in term.effect.acts_on or term.place not in trial.channels:
+                continue
+            series = residual[:, trial.channels.index(term.place)]
+            padded_length = SEARCH.padded * len(series)
+            power = np.abs(np.fft.rfft(series - series.mean(), padded_length)) ** 2
+            key = (len(series), trial.interval)
+            spectra[key] = spectra.get(key, 0.0) + power
+        first_frequency = self.problem.setting.scales.angular_frequency / (2.0 * np.pi)
+        peaks: list[float] = []
+        for (count, interval), power in spectra.items():
+            resolution = 1.0 / (SEARCH.padded * count * interval)
+            for index in _largest_peaks(power):
+                peaks.append(index * resolution / first_frequency)
+        return tuple(peaks)
 
 
-def grid(term: Term, peaks: tuple[float, ...] = (), *, fine: bool = True) -> Iterator[FloatArray]:
-    """Yield scaled parameters to try: magnitudes at one value or at levels of theirs, since changes scale.
+def _largest_peaks(power: FloatArray) -> list[int]:
+    """Return the indices of the largest peaks of a spectrum, none on the flank of another."""
+    is_peak = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])
+    peaks = np.flatnonzero(is_peak) + 1
+    largest = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.peaks]]
+    chosen: list[int] = []
+    for index in largest:
+        is_apart = all(abs(index - other) > 2 * SEARCH.padded for other in chosen)
+        if is_apart and len(chosen) < SEARCH.peaks:
+            chosen.append(int(index))
+    return chosen
 
-    A spectral parameter is tried at the given peaks.
+
+# ---------------------------------------------------------------- grid of parameters
+
+
+def parameter_grid(
+    term: EffectTerm, peaks: Sequence[float] = (), *, fine: bool = True
+) -> Iterator[FloatArray]:
+    """Yield scaled parameters (E,) of a term to try, over the product of the values of each.
+
+    The first magnitude is tried at one value or at levels of its own, since a change scales with
+    it. A spectral parameter is tried at the given peaks.
+
+    Parameters
+    ----------
+    term : EffectTerm
+        The effect at its place.
+    peaks : sequence of float
+        The frequencies of peaks in the residuals, over the first frequency.
+    fine : bool
+        Whether a signed magnitude is tried at a small size too.
     """
+    others = sum(not parameter.magnitude for parameter in term.parameters)
+    levels = SEARCH.levels_of_many
+    if others < len(SEARCH.levels):
+        levels = SEARCH.levels[others]
     axes: list[tuple[float, ...]] = []
-    scaled = False
-    count = sum(not item.magnitude for item in term.parameters)
-    levels = SEARCH.levels[count] if count < len(SEARCH.levels) else SEARCH.levels_of_many
-    for item in term.parameters:
-        if item.magnitude:
-            signed = item.prior.value(0.0) == 0.0
-            if item.levels and not scaled:
-                axes.append(_spread_levels(item))
-                scaled = True
-            elif scaled:
-                axes.append((-1.0, 0.0, 1.0) if signed else (0.0,))
-            else:
-                axes.append((1.0, *((SEARCH.linear,) if fine else ())) if signed else (0.0,))
-                scaled = True
-        elif item.name == term.effect.spectral and peaks:
-            axes.append(tuple(float(np.clip(item.prior.normal(peak), -3.0, 3.0)) for peak in peaks))
-        elif item.levels:
-            axes.append(_spread_levels(item))
-        elif item in term.effect.shape:
-            axes.append((item.prior.normal(item.canonical),))
+    has_magnitude = False
+    for parameter in term.parameters:
+        if parameter.magnitude:
+            axes.append(_magnitude_levels(parameter, is_first=not has_magnitude, fine=fine))
+            has_magnitude = True
+        elif parameter.name == term.effect.spectral and peaks:
+            scaled_peaks = [
+                float(np.clip(parameter.prior.normal(peak), -3.0, 3.0)) for peak in peaks
+            ]
+            axes.append(tuple(scaled_peaks))
+        elif parameter.levels:
+            axes.append(_prior_quantiles(parameter))
+        elif parameter in term.effect.shape:
+            axes.append((parameter.prior.normal(parameter.canonical),))
         else:
             axes.append(levels)
     for values in product(*axes):
         yield np.array(values)
 
 
-def _spread_levels(item: EffectParameter | ShapeParameter) -> tuple[float, ...]:
-    """Return the scaled values of a parameter that asks for so many, evenly over its prior."""
-    return tuple(float(ndtri((k + 0.5) / item.levels)) for k in range(item.levels))
+def _magnitude_levels(
+    parameter: EffectParameter | ShapeParameter, *, is_first: bool, fine: bool
+) -> tuple[float, ...]:
+    """Return the scaled values at which a magnitude is tried.
+
+    The first magnitude of a term scales its change, which needs fewer values.
+    """
+    is_signed = parameter.prior.value(0.0) == 0.0
+    if parameter.levels and is_first:
+        return _prior_quantiles(parameter)
+    if not is_signed:
+        return (0.0,)
+    if not is_first:
+        return (-1.0, 0.0, 1.0)
+    return (1.0, SEARCH.linear) if fine else (1.0,)
+
+
+def _prior_quantiles(parameter: EffectParameter | ShapeParameter) -> tuple[float, ...]:
+    """Return as many scaled values as a parameter has levels, evenly over its prior probability."""
+    count = parameter.levels
+    return tuple(float(ndtri((k + 0.5) / count)) for k in range(count))

@@ -1,9 +1,10 @@
-"""A trial ready to be compared: noise of its channels, samples that count, unknowns.
+"""A trial ready to be compared: the noise of its channels, the samples that count, its unknowns.
 
-Each unknown is a scaled variable u with prior N(0, 1), or flat where nothing is known; the value is
-centre + scale u. Global ones, which every hypothesis shares: calibrated parameters, gains of channels. Local
-to a trial: zeros of its channels, initial state and time zero of a ring-down, an unknown initial state and
-constants of inputs of a driven trial, health where it is uncertain.
+Each unknown is a scaled variable u with prior N(0, 1), or a flat prior where nothing is known; its
+value is centre + scale u. Global unknowns are shared by all hypotheses and trials: calibrated
+parameters and gains of channels. Local unknowns belong to one trial: zeros of its channels, initial
+state and time zero of a ring-down, an unknown initial state and constants of inputs of a driven
+trial, and health where it is uncertain.
 """
 
 from collections.abc import Mapping
@@ -11,36 +12,61 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate
 from math import inf, isinf, prod
+from typing import NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.campaign.records import Campaign, FloatArray, IntArray, Quantity, Start, Trial, TrialKind
+from discrepancy.campaign.records import (
+    Campaign,
+    FloatArray,
+    IntArray,
+    Quantity,
+    Start,
+    Trial,
+    TrialKind,
+)
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 
 FREE_MOTION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""
-LEAST_LOSS, LARGEST_LOSS = -0.5, 0.95
-"""Limits of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero, where most of
-a flight is, would stop fits: half of the readings of a healthy wing pull below it."""
+LEAST_LOSS = -0.5
+"""Lower limit of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero,
+where most of a flight is, would stop fits: half of the readings of a healthy wing pull below it."""
+LARGEST_LOSS = 0.95
+"""Upper limit of an uncertain stiffness loss."""
+
+
+class ScaledPrior(NamedTuple):
+    """The prior of a shared unknown with value centre + scale u; precision 1 of u, or 0 if flat."""
+
+    centre: float
+    scale: float
+    precision: float
 
 
 @dataclass(frozen=True)
 class GlobalUnknowns:
-    """Layout of the global unknowns: calibrated parameters, then gains of channels.
+    """The layout of the unknowns that all hypotheses and trials share.
+
+    First come the P calibrated parameters, then the gains of channels.
 
     Attributes
     ----------
-    centre, scale, precision : (Q,) ndarray
-        Prior means (of gains their errors), deviations, and precisions of the scaled variables: 1, or 0 for a
-        flat prior.
-    low, high : (P,) ndarray
-        Ranges of the calibrated parameters.
+    centre : (Q,) array
+        The prior means; of gains those of their errors.
+    scale : (Q,) array
+        The prior standard deviations.
+    precision : (Q,) array
+        The prior precisions of the scaled variables: 1, or 0 for a flat prior.
+    low, high : (P,) array
+        The ranges of the calibrated parameters.
     gain_channels : tuple of str
-        Channels whose gain is unknown.
+        The channels whose gain is unknown.
     fixed_gain : dict of str to float
-        Gain errors of signals that define the scale of the release amplitudes, which are not fitted.
+        The gain errors of signals that define the scale of the release amplitudes; they are not
+        fitted.
     """
 
     centre: FloatArray
@@ -53,52 +79,58 @@ class GlobalUnknowns:
 
     @property
     def size(self) -> int:
-        """Number of global unknowns."""
+        """The number Q of global unknowns."""
         return len(self.scale)
 
     @property
     def count(self) -> int:
-        """Number P of calibrated parameters."""
+        """The number P of calibrated parameters."""
         return len(self.low)
 
     @cached_property
     def ends(self) -> FloatArray:
-        """Least and greatest of the scaled variables (2, Q), by the ranges of the model."""
-        found = np.tile([[-inf], [inf]], self.size)
-        free = np.flatnonzero(self.scale[: self.count])
+        """The least and greatest value of each scaled variable (2, Q), by the model's ranges."""
+        scaled_ends = np.tile([[-inf], [inf]], self.size)
+        uncertain = np.flatnonzero(self.scale[: self.count])
         ends = np.array([self.low, self.high])
-        found[:, free] = (ends[:, free] - self.centre[free]) / self.scale[free]
-        return found
+        centre = self.centre[uncertain]
+        scaled_ends[:, uncertain] = (ends[:, uncertain] - centre) / self.scale[uncertain]
+        return scaled_ends
 
     def parameters(self, u: FloatArray) -> FloatArray:
-        """Return the calibrated parameters, kept within the range of the model."""
+        """Return the calibrated parameters (P,), clipped to the range of the model, of u (Q,)."""
         return np.clip((self.centre + self.scale * u)[: self.count], self.low, self.high)
 
     def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
-        """Return the gain errors (C,) of channels."""
+        """Return the gain errors (C,) of channels, given the scaled variables u (Q,)."""
         values = (self.centre + self.scale * u)[self.count :]
-        found = self.fixed_gain | dict(zip(self.gain_channels, values, strict=True))
-        return np.array([found.get(name, 0.0) for name in channels])
+        gains = self.fixed_gain | dict(zip(self.gain_channels, values, strict=True))
+        return np.array([gains.get(name, 0.0) for name in channels])
 
 
 @dataclass(frozen=True)
 class LocalUnknowns:
-    """Unknowns of one trial: zeros, initial state, constants of inputs, time zero, health, in this order.
+    """The layout of the unknowns of one trial.
+
+    They are zeros, initial state, constants of inputs, time zero and health, in this order.
 
     Attributes
     ----------
-    scale, precision : (L,) ndarray
-        Value of a unit of each scaled variable, and its prior precision.
-    zero_columns : (Z,) ndarray of int
-        Columns whose zero is unknown.
+    scale : (L,) array
+        The prior standard deviations of the unknowns.
+    precision : (L,) array
+        The prior precisions of the scaled variables: 1, or 0 for a flat prior.
+    zero_columns : (Z,) array of int
+        The columns of channels whose zero is unknown.
     initial_shape : tuple of int
-        (R, 1) or (R, 2): entries of the initial state that are unknown.
-    offset_inputs : (O,) ndarray of int
-        Recorded inputs that lack a constant.
+        The shape of the unknown entries of the initial state: (R, 1) for displacements, (R, 2) for
+        displacements and velocities.
+    offset_inputs : (O,) array of int
+        The indices of recorded inputs that lack a constant.
     has_time_zero : bool
-        Whether it is unknown.
-    health_rows, health_columns : (H,) ndarray of int
-        Uncertain entries of the health, those of the first region first.
+        Whether the time of the release is unknown.
+    health_rows, health_columns : (H,) array of int
+        The uncertain entries of the health, those of the first region first.
     """
 
     scale: FloatArray
@@ -112,32 +144,48 @@ class LocalUnknowns:
 
     @property
     def size(self) -> int:
-        """Number of local unknowns."""
+        """The number L of local unknowns."""
         return len(self.scale)
 
     @property
     def zeros(self) -> int:
-        """Number Z of unknown zeros."""
+        """The number Z of unknown zeros."""
         return len(self.zero_columns)
 
     @cached_property
     def ends(self) -> list[int]:
-        """Where zeros, initial state, constants of inputs and time zero end."""
-        counts = (self.zeros, prod(self.initial_shape), len(self.offset_inputs), self.has_time_zero)
+        """The indices after zeros, initial state, constants of inputs, and time zero."""
+        counts = (
+            self.zeros,
+            prod(self.initial_shape),
+            len(self.offset_inputs),
+            int(self.has_time_zero),
+        )
         return list(accumulate(counts))
 
     def zero(self, u: FloatArray, columns: int) -> FloatArray:
-        """Return the zeros (C,) of the trial's channels."""
+        """Return the zeros (C,) of the trial's channels, given the scaled variables u (L,)."""
         values = np.zeros(columns)
         values[self.zero_columns] = (self.scale * u)[: self.zeros]
         return values
 
     def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
-        """Return the conditions of the trial's response."""
+        """Return the conditions under which the model responds in the trial.
+
+        Parameters
+        ----------
+        trial : Trial
+            The trial.
+        parameters : (P,) array
+            The calibrated parameters.
+        u : (L,) array
+            The scaled variables of the trial.
+        """
         _, entries, constants, time_zero, losses = np.split(self.scale * u, self.ends)
         rows, width = self.initial_shape
-        initial, offset = np.zeros((rows, 2)), np.zeros(len(trial.inputs))
+        initial = np.zeros((rows, 2))
         initial[:, :width] = entries.reshape(rows, width)
+        offset = np.zeros(len(trial.inputs))
         offset[self.offset_inputs] = constants
         health = trial.health[:1] if trial.is_dynamic else trial.health
         if losses.size:
@@ -149,83 +197,139 @@ class LocalUnknowns:
 
 
 def global_unknowns(
-    campaign: Campaign, model: Model, trials: tuple[Trial, ...], unit_responses: dict[str, float]
+    campaign: Campaign, model: Model, trials: tuple[Trial, ...], data_over_model: dict[str, float]
 ) -> GlobalUnknowns:
-    """Return the layout of the global unknowns.
+    """Return the layout of the unknowns that all hypotheses and trials share.
 
     Parameters
     ----------
     campaign : Campaign
-        Its `parameters` replace priors of the model.
+        The campaign, whose `parameters` replace priors of the model.
     model : Model
-        With calibrated parameters.
+        The model with its calibrated parameters.
     trials : tuple of Trial
-        Trials that are fitted; only gains of channels in them are unknowns.
-    unit_responses : dict of str to float
-        For signals of unknown scale: data over model, as a first estimate of 1 + gain.
+        The trials that are fitted; only gains of channels in them are unknowns.
+    data_over_model : dict of str to float
+        The ratio of readings to model for channels of unknown scale: a first estimate of 1 + gain.
     """
-    rows = [(*prior, 1.0) for prior in model.stated(campaign)]  # centre, scale, precision
-    used = {name for trial in trials for name in trial.channels}
-    names: list[str] = []
-    fixed: dict[str, float] = {}
+    priors = [ScaledPrior(*prior, 1.0) for prior in model.stated(campaign)]
+    used_channels = {name for trial in trials for name in trial.channels}
+    gain_channels: list[str] = []
+    fixed_gain: dict[str, float] = {}
     for name, channel in campaign.channels.items():
-        estimate = unit_responses.get(name, 1.0) - 1.0
-        free = isinf(channel.gain_deviation)
-        if name not in used or channel.gain_deviation == 0.0:
+        if name not in used_channels or channel.gain_deviation == 0.0:
             continue
-        if free and channel.quantity is Quantity.SIGNAL and not fixed:
-            fixed[name] = estimate  # it defines the scale of the release amplitudes
+        estimate = data_over_model.get(name, 1.0) - 1.0
+        has_unknown_scale = isinf(channel.gain_deviation)
+        if has_unknown_scale and channel.quantity is Quantity.SIGNAL and not fixed_gain:
+            fixed_gain[name] = estimate  # it defines the scale of the release amplitudes
             continue
-        names.append(name)
-        flat = (estimate, max(abs(1.0 + estimate), 1e-12), 0.0)
-        rows.append(flat if free else (0.0, channel.gain_deviation, 1.0))
-    centre, scale, precision = np.array(rows, dtype=np.float64).reshape(-1, 3).T
-    ranges = np.array([(item.low, item.high) for item in model.parameters], dtype=np.float64)
-    low, high = ranges.reshape(-1, 2).T
-    return GlobalUnknowns(centre, scale, precision, low, high, tuple(names), fixed)
+        gain_channels.append(name)
+        if has_unknown_scale:
+            gain_scale = max(abs(1.0 + estimate), 1e-12)
+            priors.append(ScaledPrior(estimate, gain_scale, 0.0))
+        else:
+            priors.append(ScaledPrior(0.0, channel.gain_deviation, 1.0))
+    centre, scale, precision = np.array(priors, dtype=np.float64).reshape(-1, 3).T
+    ranges = [(parameter.low, parameter.high) for parameter in model.parameters]
+    low, high = np.array(ranges, dtype=np.float64).reshape(-1, 2).T
+    return GlobalUnknowns(
+        centre=centre,
+        scale=scale,
+        precision=precision,
+        low=low,
+        high=high,
+        gain_channels=tuple(gain_channels),
+        fixed_gain=fixed_gain,
+    )
 
 
-def local_unknowns(campaign: Campaign, trial: Trial, deviation: FloatArray, model: Model) -> LocalUnknowns:
-    """Return the layout of the unknowns of one trial; `deviation` (C,) scales zeros nothing is known of."""
-    zeros = np.array([campaign.channels[name].offset_deviation for name in trial.channels])
-    columns = np.flatnonzero(zeros > 0.0)
-    free = np.isinf(zeros[columns])
+def local_unknowns(
+    campaign: Campaign, trial: Trial, deviation: FloatArray, model: Model
+) -> LocalUnknowns:
+    """Return the layout of the unknowns of one trial.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign of the trial.
+    trial : Trial
+        The trial.
+    deviation : (C,) array
+        The noise deviation of each channel, which scales a zero with a flat prior.
+    model : Model
+        The model, which gives the sizes of an unknown initial state.
+    """
+    # zeros
+    zero_deviations = np.array(
+        [campaign.channels[name].offset_deviation for name in trial.channels]
+    )
+    zero_columns = np.flatnonzero(zero_deviations > 0.0)
+    zero_scale = zero_deviations[zero_columns]
+    is_flat = np.isinf(zero_scale)
+    zero_scale = np.where(is_flat, deviation[zero_columns], zero_scale)
+    # initial state and time zero
     release = trial.release if trial.kind is TrialKind.RINGDOWN else None
-    shape, entries, time_zero = (0, 1), np.zeros(0), np.zeros(0)
+    initial_shape = (0, 1)
+    initial_scale = np.zeros(0)
+    time_zero_scale = np.zeros(0)
     if release is not None:
-        shape = (release.mode_count, 1 if release.at_rest else 2)
-        entries = np.full(prod(shape), release.deviation if release.at_rest else FREE_MOTION)
-        time_zero = np.full(int(release.time_zero_deviation > 0.0), release.time_zero_deviation)
+        initial_shape = (release.mode_count, 1 if release.at_rest else 2)
+        deviation_of_entries = release.deviation if release.at_rest else FREE_MOTION
+        initial_scale = np.full(prod(initial_shape), deviation_of_entries)
+        if release.time_zero_deviation > 0.0:
+            time_zero_scale = np.full(1, release.time_zero_deviation)
     elif trial.begins is Start.UNKNOWN:
         sizes = model.initial_sizes(campaign, trial)
-        shape = (-(-len(sizes) // 2), 2)
-        entries = FREE_MOTION * np.pad(sizes, (0, len(sizes) % 2))
-    offsets = np.array([item.offset_deviation for item in trial.inputs])
-    inputs = np.flatnonzero(offsets > 0.0)
-    uncertain = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
-    of_health, rows = np.nonzero(uncertain.T)  # region by region, as their derivatives are taken
-    known = np.where(free, deviation[columns], zeros[columns])
-    scale = np.concatenate((known, entries, offsets[inputs], time_zero, uncertain[rows, of_health]))
-    precision = np.concatenate((~free, np.ones(len(scale) - len(free))))
-    return LocalUnknowns(scale, precision, columns, shape, inputs, bool(time_zero.size), rows, of_health)
+        initial_shape = (-(-len(sizes) // 2), 2)  # rounded up
+        initial_scale = FREE_MOTION * np.pad(sizes, (0, len(sizes) % 2))
+    # constants of inputs
+    offset_deviations = np.array([recorded.offset_deviation for recorded in trial.inputs])
+    offset_inputs = np.flatnonzero(offset_deviations > 0.0)
+    # health, region by region, as its derivatives are taken
+    health_deviation = trial.health_deviation[:1] if trial.is_dynamic else trial.health_deviation
+    health_columns, health_rows = np.nonzero(health_deviation.T)
+    scale = np.concatenate(
+        (
+            zero_scale,
+            initial_scale,
+            offset_deviations[offset_inputs],
+            time_zero_scale,
+            health_deviation[health_rows, health_columns],
+        )
+    )
+    precision = np.concatenate((~is_flat, np.ones(len(scale) - len(is_flat))))
+    return LocalUnknowns(
+        scale=scale,
+        precision=precision,
+        zero_columns=zero_columns,
+        initial_shape=initial_shape,
+        offset_inputs=offset_inputs,
+        has_time_zero=bool(time_zero_scale.size),
+        health_rows=health_rows,
+        health_columns=health_columns,
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class TrialData:
-    """One trial, ready to be compared.
+    """One trial, ready to be compared with a model.
 
     Attributes
     ----------
     trial : Trial
-        As measured.
-    deviation : (C,) ndarray
-        s0 of each column, of the whitened samples in dynamic trials [channel's unit].
-    groups : (C,) ndarray of int
-        Noise group (channel number) of each column.
+        The trial as measured.
+    deviation : (C,) array
+        The noise deviation s0 of each column; of whitened samples where the noise is whitened [unit
+        of the channel].
+    groups : (C,) array of int
+        The index of each column's channel among those of the campaign.
     unknowns : LocalUnknowns
-        Of this trial.
-    weight : (N, C) ndarray
+        The layout of the unknowns of this trial.
+    weight : (N, C) array
         1 where a sample counts, else 0.
+    noise : tuple of NoiseModel
+        The noise model of each column.
     """
 
     trial: Trial
@@ -236,7 +340,7 @@ class TrialData:
     noise: tuple[NoiseModel, ...]
 
     def standardised(self, columns: FloatArray) -> FloatArray:
-        """Return columns (..., N, C) over s0, whitened in time, zero where a sample does not count."""
+        """Return columns (..., N, C) over s0 and whitened; 0 where a sample does not count."""
         scaled = columns / self.deviation
         for number, noise in enumerate(self.noise):
             if noise.applies(self.trial.whitened_at):
@@ -244,23 +348,47 @@ class TrialData:
         return np.asarray(scaled * self.weight)
 
     @classmethod
-    def of(
+    def prepare(
         cls, campaign: Campaign, trial: Trial, models: Mapping[str, NoiseModel], model: Model
     ) -> "TrialData":
-        """Return a trial of a campaign with its noise, by the noise models of the channels."""
-        names = list(campaign.channels)
+        """Return a trial of a campaign with its noise, its unknowns, and the samples that count.
+
+        Parameters
+        ----------
+        campaign : Campaign
+            The campaign of the trial.
+        trial : Trial
+            The trial.
+        models : mapping of str to NoiseModel
+            The noise model of each channel.
+        model : Model
+            The model that the trial is compared with.
+        """
+        channel_names = list(campaign.channels)
         noise = tuple(models[name] for name in trial.channels)
-        whitened = [item.applies(trial.whitened_at) for item in noise]
-        single, innovation = [m.static_deviation for m in noise], [m.standard_deviation for m in noise]
-        deviation = trial.noise_factor * np.where(whitened, innovation, single)
-        groups = np.array([names.index(name) for name in trial.channels])
+        is_whitened = [channel_noise.applies(trial.whitened_at) for channel_noise in noise]
+        sample_deviation = [channel_noise.static_deviation for channel_noise in noise]
+        innovation_deviation = [channel_noise.standard_deviation for channel_noise in noise]
+        deviation = trial.noise_factor * np.where(
+            is_whitened, innovation_deviation, sample_deviation
+        )
+        # the whitening filter smears a sample that is left out over its order
         weight = trial.used.astype(np.float64)
-        for number in np.flatnonzero(whitened):  # the filter smears what is left out over its order
-            for row in np.flatnonzero(~trial.used[:, number]):
-                weight[row : row + len(noise[number].autoregression) + 1, number] = 0.0
-        return cls(trial, deviation, groups, local_unknowns(campaign, trial, deviation, model), weight, noise)
+        for column in np.flatnonzero(is_whitened):
+            order = len(noise[column].autoregression)
+            for row in np.flatnonzero(~trial.used[:, column]):
+                weight[row : row + order + 1, column] = 0.0
+        return cls(
+            trial=trial,
+            deviation=deviation,
+            groups=np.array([channel_names.index(name) for name in trial.channels]),
+            unknowns=local_unknowns(campaign, trial, deviation, model),
+            weight=weight,
+            noise=noise,
+        )
 
 
-def stand_in(campaign: Campaign, name: str) -> float:
-    """Return what stands in for a noise deviation of which nothing is known: a thousandth of the range."""
-    return 1e-3 * max(1e-12, *(float(np.ptp(values)) for _, values, _ in campaign.records(name)))
+def stand_in_deviation(campaign: Campaign, name: str) -> float:
+    """Return what stands in for an unknown noise deviation: a thousandth of the channel's range."""
+    ranges = [float(np.ptp(values)) for _, values, _ in campaign.records(name)]
+    return 1e-3 * max(1e-12, *ranges)

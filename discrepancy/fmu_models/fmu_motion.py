@@ -17,7 +17,9 @@ from discrepancy.fmu_models.readout import Readout, SampledOutputs, sample
 from discrepancy.fmu_models.system_motion import LawPorts, system_motion
 from discrepancy.system.excitation import Excitation, Load
 from fe.compilation import compiled_kernel
-from fe.runtime.motion import ALIKE, Laws, static_solution
+from fe.runtime.motion import static_solution
+from fe.runtime.port_laws import PortLaws
+from fe.runtime.time_steps import LENGTH_TOLERANCE
 from fmu_asset.door.runs import Run, StateSpace
 
 CONVERGED = 1e-4
@@ -45,7 +47,7 @@ class FmuSimulator(FmuAtRest):
         self,
         excitation: FmuExcitation,
         trial: Trial,
-        laws: Laws,
+        laws: PortLaws,
         readout: Readout,
         refinement: int = 1,
     ) -> SampledOutputs:
@@ -84,7 +86,7 @@ class FmuSimulator(FmuAtRest):
         stepped = self._stepped_motion(excitation, trial, end, laws, readout.columns, refinement)
         return sample(stepped.values, stepped.step, readout, readout.derivatives)
 
-    def _law_ports(self, excitation: FmuExcitation, laws: Laws) -> LawPorts:
+    def _law_ports(self, excitation: FmuExcitation, laws: PortLaws) -> LawPorts:
         """Return where laws act on the linear system, with the ports at the undisturbed outputs."""
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
@@ -102,7 +104,7 @@ class FmuSimulator(FmuAtRest):
         system: StateSpace,
         excitation: FmuExcitation,
         trial: Trial,
-        laws: Laws,
+        laws: PortLaws,
         ports: LawPorts,
         readout: Readout,
         end: float,
@@ -136,7 +138,7 @@ class FmuSimulator(FmuAtRest):
         # the samples themselves if they are even, else steps: many lengths of steps would take long
         times = readout.times
         stamps, sample_rows = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
-        is_even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= ALIKE * stamps[-1]
+        is_even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= LENGTH_TOLERANCE * stamps[-1]
         if not is_even:
             stamps = excitation.step * np.arange(ceil(end / excitation.step - 1e-6) + 1.0)
         start, memory = self._start_with_laws(system, excitation, laws, ports, amounts)
@@ -181,7 +183,7 @@ class FmuSimulator(FmuAtRest):
         self,
         system: StateSpace,
         excitation: FmuExcitation,
-        laws: Laws,
+        laws: PortLaws,
         ports: LawPorts,
         amounts: Mapping[str, float],
     ) -> "StartState":
@@ -218,7 +220,7 @@ class FmuSimulator(FmuAtRest):
         excitation: FmuExcitation,
         trial: Trial,
         end: float,
-        laws: Laws,
+        laws: PortLaws,
         columns: Sequence[int],
         refinement: int,
     ) -> "SteppedOutputs":
@@ -268,7 +270,7 @@ class FmuSimulator(FmuAtRest):
         outputs = outputs_by(parts)[:, list(columns)]
         return SteppedOutputs(outputs, fixed_step or longest / parts)
 
-    def _settled_with_laws(self, run: Run, laws: Laws, trial: str) -> "SettledRun":
+    def _settled_with_laws(self, run: Run, laws: PortLaws, trial: str) -> "SettledRun":
         """Return a run that has settled with laws under its first loads."""
         outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
@@ -291,7 +293,7 @@ class FmuSimulator(FmuAtRest):
         _, outputs, _ = self.begun(run)
         return outputs[None]
 
-    def _outputs_with_laws(self, run: Run, laws: Laws, trial: str) -> FloatArray:
+    def _outputs_with_laws(self, run: Run, laws: PortLaws, trial: str) -> FloatArray:
         """Return the outputs (K, C) of a run with laws; NaN if the coupling is unstable."""
         run, memory = self._settled_with_laws(run, laws, trial)
         ports = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
@@ -356,7 +358,7 @@ class FmuSimulator(FmuAtRest):
 
     def _parts_for(
         self,
-        laws: Laws,
+        laws: PortLaws,
         kind: Hashable,
         step: float,
         outputs_by: Callable[[int], FloatArray],
@@ -382,10 +384,10 @@ class FmuSimulator(FmuAtRest):
         ModelError
             If the steps do not converge.
         """
-        strength = float(np.max(np.abs(laws.values[:, 0])))
+        strength = float(np.max(np.abs(laws.parameters[:, 0])))
         # roughness asks for short steps
-        exponents = np.round(np.clip(laws.values[:, 1:3], -9.0, 9.0), 1)
-        key = (kind, laws.ports, laws.numbers.tobytes(), exponents.tobytes())
+        exponents = np.round(np.clip(laws.parameters[:, 1:3], -9.0, 9.0), 1)
+        key = (kind, laws.ports, laws.law_numbers.tobytes(), exponents.tobytes())
         refinement = self._refinements.get(key, Refinement(1, 0.0))
         parts = refinement.parts
         if strength <= 2.0 * refinement.strength:

@@ -12,7 +12,8 @@ from discrepancy.fmu_models.description import FmuModelDescription
 from discrepancy.fmu_models.fmu_excitation import FmuExcitation
 from discrepancy.fmu_models.identified_fmu import LINEAR, RECORD, IdentifiedFmu
 from fe.compilation import compiled_kernel
-from fe.runtime.motion import Laws, StaticSolution, static_solution
+from fe.runtime.motion import StaticSolution, static_solution
+from fe.runtime.port_laws import PortLaws
 from fmu_asset.door.runs import State
 
 STATIC_ITERATIONS = 30
@@ -126,7 +127,7 @@ class FmuAtRest(IdentifiedFmu):
         return np.asarray((displacements[1:] - displacements[0]).T / np.diag(pushes))
 
     def at_rest(
-        self, states: Sequence[State], loads: Mapping[str, FloatArray], laws: Laws, trial: str
+        self, states: Sequence[State], loads: Mapping[str, FloatArray], laws: PortLaws, trial: str
     ) -> FloatArray:
         """Return the outputs (L, C) where laws follow the load path; the FMU confirms the result.
 
@@ -170,7 +171,7 @@ class FmuAtRest(IdentifiedFmu):
                 self.rest([state], row_loads)
 
     def loads_less_laws(
-        self, loads: Mapping[str, FloatArray], laws: Laws, forces: FloatArray
+        self, loads: Mapping[str, FloatArray], laws: PortLaws, forces: FloatArray
     ) -> dict[str, FloatArray]:
         """Return loads (L,) by input, less the forces (L, J) of laws.
 
@@ -191,7 +192,7 @@ class FmuAtRest(IdentifiedFmu):
 
     def rest_with_laws(
         self,
-        laws: Laws,
+        laws: PortLaws,
         outputs_under: Callable[[FloatArray], FloatArray],
         outputs: FloatArray,
         state: State,

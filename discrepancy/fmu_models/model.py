@@ -24,8 +24,8 @@ from discrepancy.system.model_file import DescribedModel
 from discrepancy.system.response import Conditions, Outputs, PortedSystem, Response
 from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.time_history import RecordedHistory, subdivide
-from fe.runtime.motion import Laws, laws_of
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
+from fe.runtime.port_laws import PortLaws, port_laws
 from fmu_asset.door.runs import State, StateSpace
 from reporting.words import comma_list
 
@@ -362,9 +362,9 @@ class FmuModel(DescribedModel):
 
     # ------------------------------------------------------------ trials in the FMU's terms
 
-    def _laws(self, patch: ModelPatch) -> Laws:
+    def _laws(self, patch: ModelPatch) -> PortLaws:
         """Return the laws of a patch at the ports."""
-        return laws_of(patch.of(PortForce), self.ports)
+        return port_laws(patch.of(PortForce), self.ports)
 
     def _load_change(self, patch: ModelPatch) -> LoadChange:
         """Return the change of loads by what the FMU does not carry itself."""
@@ -372,7 +372,7 @@ class FmuModel(DescribedModel):
         return LoadChange.of_patch(item for item in patch if item.kind not in effects)
 
     def _excitation(
-        self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: Laws
+        self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: PortLaws
     ) -> FmuExcitation:
         """Return what moves the FMU in a dynamic trial."""
         state = self._state(trial, conditions, patch)

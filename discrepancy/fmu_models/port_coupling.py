@@ -12,9 +12,10 @@ import numpy as np
 from discrepancy.campaign.records import FloatArray
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import Boundaries, Laws, steps_under
 from fe.runtime.motion_arrays import ModalMotion
-from fe.runtime.motion_arrays import State as ModalState
+from fe.runtime.motion_arrays import ModalState as ModalState
+from fe.runtime.port_laws import PortLaws
+from fe.runtime.time_steps import Boundaries, loaded_steps
 
 
 class PortCoupling:
@@ -36,7 +37,7 @@ class PortCoupling:
 
     def __init__(
         self,
-        laws: Laws,
+        laws: PortLaws,
         ports: Sequence[str],
         speed_gain: FloatArray,
         step: float,
@@ -53,13 +54,13 @@ class PortCoupling:
         self._step = step
         boundaries = Boundaries(np.array([0.0, step]), np.arange(2), np.array([step]))
         no_displacement = np.zeros((2, len(laws)))
-        self._steps = steps_under(
+        self._steps = loaded_steps(
             masses, boundaries, np.zeros((1, count)), np.zeros((1, count)), no_displacement
         )
         self._law_arrays = tuple(
-            laws.at(
-                laws.rows(masses.ports, count),
-                laws.rows(masses.actions, count),
+            laws.port_arrays(
+                laws.port_rows(masses.ports, count),
+                laws.port_rows(masses.actions, count),
                 np.zeros(len(laws)),
                 0.0,
                 self._steps.transition,
@@ -67,13 +68,13 @@ class PortCoupling:
         )
         # state and results of the step
         self._has_memory = memory is not None
-        memory = laws.memory() if memory is None else memory
+        memory = laws.unloaded_memory() if memory is None else memory
         self._state = ModalState(np.zeros(count), np.zeros(count), memory)
         self._results = ModalMotion(
             q=np.zeros((2, count)),
             v=np.zeros((2, count)),
             port_forces=np.zeros((2, len(laws))),
-            lagged=np.zeros((2, len(laws))),
+            lagged_forces=np.zeros((2, len(laws))),
             memory=memory,
         )
 
@@ -95,9 +96,9 @@ class PortCoupling:
         h = self._step
         self._state.q[:] = positions
         self._state.v[:] = speeds
-        self._steps.push[:] = np.concatenate((0.5 * h * h * accelerations, h * accelerations))
-        self._steps.begin[:] = accelerations
-        self._steps.end[:] = accelerations
+        self._steps.increment[:] = np.concatenate((0.5 * h * h * accelerations, h * accelerations))
+        self._steps.begin_force[:] = accelerations
+        self._steps.end_force[:] = accelerations
         compiled_kernel().integrate(
             tuple(self._steps),
             0,

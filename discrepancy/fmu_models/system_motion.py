@@ -12,7 +12,9 @@ from discrepancy.system.time_history import SMOOTH_PARTS, equivalent_ramps
 from fe.compilation import compiled_kernel
 from fe.runtime.arrays import IntArray
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Begin, Laws, advance, steps_under, substeps
+from fe.runtime.motion import InitialMotion, integrate_motion
+from fe.runtime.port_laws import NO_LAWS, PortLaws
+from fe.runtime.time_steps import loaded_steps, step_boundaries
 from fmu_asset.door.runs import StateSpace
 
 MOST_SYSTEMS = 64
@@ -55,7 +57,7 @@ def system_motion(
     system: StateSpace,
     excitation: Excitation,
     start: FloatArray,
-    laws: Laws = NO_LAWS,
+    laws: PortLaws = NO_LAWS,
     ports: LawPorts = NO_PORTS,
     refinement: int = 1,
     memory: FloatArray | None = None,
@@ -87,7 +89,7 @@ def system_motion(
     )
     modal = coupled.modal
     # steps under the forces
-    boundaries = substeps(
+    boundaries = step_boundaries(
         modal,
         laws,
         excitation.sample_times,
@@ -99,18 +101,18 @@ def system_motion(
         lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time
     )
     direct_displacement = excitation.loads_at(boundaries.time, system.direct[ports.columns].T)
-    steps = steps_under(modal, boundaries, begin, end, direct_displacement)
+    steps = loaded_steps(modal, boundaries, begin, end, direct_displacement)
     # ports follow from the state at the begin
     port_rows = system.outputs[ports.columns[coupled.first_laws]]
     rest_positions = ports.rest_positions[coupled.first_laws]
     positions = port_rows @ start + rest_positions
     speeds = port_rows @ system.generator @ start
-    first = Begin(
+    first = InitialMotion(
         q=np.concatenate((positions, 0.0 * start)),
         v=np.concatenate((speeds, start)),
         memory=memory,
     )
-    motion = advance(modal, laws, steps, first, compiled_kernel())
+    motion = integrate_motion(modal, laws, steps, first, compiled_kernel())
     # what acts on the system, laws too
     forces = excitation.loads_at(excitation.sample_times, np.eye(system.push.shape[1]))
     np.subtract.at(forces.T, ports.force_numbers, motion.port_forces.T)

@@ -1,10 +1,10 @@
-"""The share of the mean square error that a hypothesis takes away, and how it is told.
+"""The share of the mean square error that a hypothesis removes, and it in words.
 
-It is 1 - (rms after / rms before)^2 of the residuals without and with the hypothesis. Both are divided by the
-same noise, and by nothing else: what a posterior leaves open makes no error smaller.
+It is 1 - (rms after / rms before)^2 of the residuals without and with the hypothesis. Both are
+divided by the same noise, and by nothing else: what a posterior leaves open makes no error smaller.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import isfinite, nan
 
@@ -17,107 +17,138 @@ from discrepancy.proof_record import ClosedShare
 from reporting.words import counted
 
 BLOCKS_OF_TRIAL = 12
-"""Blocks into which the record of a trial in motion is cut at most."""
+"""Largest number of blocks into which the record of a trial in motion is cut."""
 SHORTEST_BLOCK = 8
-"""Samples of a block at least."""
+"""Least number of samples of a block."""
 LEAST_BLOCKS = 5
-"""Blocks of all trials below which a bootstrap tells no interval."""
+"""Number of blocks of all trials below which there is no bootstrap interval."""
 BOOTSTRAP_DRAWS = 2000
+"""Number of bootstrap draws."""
 BOOTSTRAP_SEED = 0
+"""Seed of the bootstrap."""
 NOMINAL_UNIT = "signal"
-"""What figures call the unit of a signal of which nothing is known."""
-CHANNELS_TOLD = 3
-"""Channels whose errors a sentence tells; of more those with the largest error before."""
+"""Unit in figures of a signal about which nothing is known."""
+CHANNELS_MENTIONED = 3
+"""Number of channels whose errors a sentence mentions: those with the largest error before."""
 
 
-def over_noise_of(residuals: ResidualSet, reference: ResidualSet) -> ResidualSet:
-    """Return residuals whose noise is that of a reference: of the same trials by another hypothesis.
+def with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> ResidualSet:
+    """Return residuals over the noise of a reference, so that errors of two hypotheses compare.
 
-    The two differ where no noise is recorded: there it is what each hypothesis leaves in fitted trials.
+    The two differ where no noise is recorded: there it is what each hypothesis leaves in the fitted
+    trials.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The residuals of a hypothesis.
+    reference : ResidualSet
+        The residuals of the same trials by another hypothesis.
     """
-    noise = {item.trial.name: item.noise_deviation for item in reference.trials}
-    trials = (replace(item, noise_deviation=noise[item.trial.name]) for item in residuals.trials)
+    noise = {fitted.trial.name: fitted.noise_deviation for fitted in reference.trials}
+    trials = [
+        replace(fitted, noise_deviation=noise[fitted.trial.name]) for fitted in residuals.trials
+    ]
     return replace(residuals, trials=tuple(trials))
 
 
 @dataclass(frozen=True, eq=False)
 class SquaredErrors:
-    """Sums of squared residuals over the noise, by block of the records (B,), before and after."""
+    """Sums of squared residuals over the noise, by block of the records.
+
+    Attributes
+    ----------
+    before, after : (B,) array
+        The sums of each block without and with a hypothesis.
+    """
 
     before: FloatArray
     after: FloatArray
 
     @property
     def share(self) -> float:
-        """1 - (rms after / rms before)^2."""
+        """The share of the mean square error that is removed: 1 - (rms after / rms before)^2."""
         return 1.0 - float(self.after.sum() / self.before.sum())
 
     def interval(self) -> tuple[float, float]:
-        """Return the 90 % interval of the share by draws of blocks (Kuensch 1989, Ann. Statist. 17, 1217).
+        """Return the 90 % interval of the share by a block bootstrap.
 
+        Blocks are drawn with replacement (Kuensch 1989, Ann. Statist. 17, 1217-1241). The ends are
         nan with fewer than five blocks.
         """
         count = len(self.before)
         if count < LEAST_BLOCKS:
             return nan, nan
         generator = np.random.default_rng(BOOTSTRAP_SEED)
-        times = generator.multinomial(count, np.full(count, 1.0 / count), BOOTSTRAP_DRAWS)
-        before = times @ self.before
-        shares = 1.0 - (times @ self.after)[before > 0.0] / before[before > 0.0]
+        times_drawn = generator.multinomial(count, np.full(count, 1.0 / count), BOOTSTRAP_DRAWS)
+        before = times_drawn @ self.before
+        after = times_drawn @ self.after
+        has_error = before > 0.0
+        shares = 1.0 - after[has_error] / before[has_error]
         low, high = np.quantile(shares, (0.05, 0.95))
         return float(low), float(high)
 
 
 def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
-    """Return the squared residuals of the same trials without and with a hypothesis, over the same noise."""
-    rows = []
-    for without, with_effect in zip(before.trials, after.trials, strict=True):
-        used = without.used & with_effect.used
-        squares = [
-            np.where(used, item.residual / without.noise_deviation, 0.0) ** 2
-            for item in (without, with_effect)
-        ]
+    """Return the squared residuals of trials without and with a hypothesis, over the same noise."""
+    block_sums = []
+    for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
+        noise = without_effect.noise_deviation
+        used = without_effect.used & with_effect.used
+        squares_before = np.where(used, without_effect.residual / noise, 0.0) ** 2
+        squares_after = np.where(used, with_effect.residual / noise, 0.0) ** 2
         samples = np.arange(len(used))
-        for block in np.array_split(samples, _block_count(without)):
-            rows.append([float(square[block].sum()) for square in squares])
-    sums_before, sums_after = np.array(rows).T
+        for block in np.array_split(samples, _block_count(without_effect)):
+            sums = (float(squares_before[block].sum()), float(squares_after[block].sum()))
+            block_sums.append(sums)
+    sums_before, sums_after = np.array(block_sums).T
     return SquaredErrors(sums_before, sums_after)
 
 
-def _block_count(item: FittedTrial) -> int:
-    """Return the number of blocks of a trial: one at rest, where neighbouring loads are no repetition."""
-    if not item.trial.is_dynamic:
+def _block_count(fitted: FittedTrial) -> int:
+    """Return the number of blocks of a trial.
+
+    One at rest, where neighbouring loads are no repetition.
+    """
+    if not fitted.trial.is_dynamic:
         return 1
-    return min(BLOCKS_OF_TRIAL, max(1, len(item.used) // SHORTEST_BLOCK))
+    return min(BLOCKS_OF_TRIAL, max(1, len(fitted.used) // SHORTEST_BLOCK))
 
 
 def closed_share(before: ResidualSet, after: ResidualSet) -> ClosedShare | None:
-    """Return the share of the mean square error that a hypothesis takes away; None if there is no error.
+    """Return the share of the mean square error that a hypothesis removes.
+
+    None if there is no error.
 
     Parameters
     ----------
     before, after : ResidualSet
-        All trials of a campaign without and with the hypothesis. Those held out count if there are any, else
-        those fitted.
+        All trials of a campaign without and with the hypothesis. Those held out count if there are
+        any, else those fitted.
     """
-    trials, first, second = "fitted", before, after
+    trials = "fitted"
     if before.held_out is not None and after.held_out is not None:
-        trials, first, second = "held-out", before.held_out, after.held_out
-    errors = squared_errors(first, second)
+        trials = "held-out"
+        before = before.held_out
+        after = after.held_out
+    errors = squared_errors(before, after)
     if not errors.before.sum() > 0.0:
         return None
-    return ClosedShare(errors.share, *errors.interval(), trials, len(first.trials))
+    low, high = errors.interval()
+    return ClosedShare(errors.share, low, high, trials, len(before.trials))
 
 
 def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
-    """Return the root mean square residual of each channel with a used sample [channel's unit]."""
-    found: dict[str, float] = {}
+    """Return the rms residual of each channel with a used sample [unit of the channel]."""
+    rms: dict[str, float] = {}
     for name in residuals.measured:
-        records = of_channel(residuals.trials, name)
-        squares = np.concatenate([item.residual[used, column] ** 2 for item, column, used in records])
-        if squares.size:
-            found[name] = float(np.sqrt(squares.mean()))
-    return found
+        squares = []
+        for fitted, column, used in of_channel(residuals.trials, name):
+            squares.append(fitted.residual[used, column] ** 2)
+        all_squares = np.concatenate(squares)
+        if all_squares.size:
+            rms[name] = float(np.sqrt(all_squares.mean()))
+    return rms
 
 
 # ---------------------------------------------------------------- words
@@ -140,11 +171,11 @@ def _percent(share: float) -> str:
 
 
 def trials_text(closed: ClosedShare) -> str:
-    """Return in which trials a share was found."""
-    fitted = "not fitted" if closed.trials == "held-out" else "fitted"
+    """Return in words which trials a share is of."""
+    role = "not fitted" if closed.trials == "held-out" else "fitted"
     if closed.trial_count == 1:
-        return f"one trial that was {fitted}"
-    return f"{counted(closed.trial_count, 'trial')} that were {fitted}"
+        return f"one trial that was {role}"
+    return f"{counted(closed.trial_count, 'trial')} that were {role}"
 
 
 def errors_text(
@@ -155,44 +186,56 @@ def errors_text(
     Parameters
     ----------
     channels : mapping of str to Channel
-        By name.
+        The channels by name.
     before, after : mapping of str to float
-        rms by channel [channel's unit].
+        The rms error of each channel without and with the hypothesis [unit of the channel].
     """
+    # the largest error over its noise first
     names = sorted(before, key=lambda name: -before[name] / _noise_of(channels[name], before[name]))
     parts = []
-    for name in names[:CHANNELS_TOLD]:
+    for name in names[:CHANNELS_MENTIONED]:
         factor, unit = UNITS[channels[name].quantity].drawn
-        ends = f"{factor * before[name]:.3g} to {factor * after.get(name, nan):.3g}"
-        parts.append(f"{name} {ends}" if unit == NOMINAL_UNIT else f"{name} {ends} {unit}")
-    more = len(names) - CHANNELS_TOLD
-    if more > 0:
-        parts.append(f"{more} more in the report")
+        change = f"{factor * before[name]:.3g} to {factor * after.get(name, nan):.3g}"
+        if unit != NOMINAL_UNIT:
+            change = f"{change} {unit}"
+        parts.append(f"{name} {change}")
+    remaining = len(names) - CHANNELS_MENTIONED
+    if remaining > 0:
+        parts.append(f"{remaining} more in the report")
     return ", ".join(parts)
 
 
-def _noise_of(channel: Channel, otherwise: float) -> float:
-    """Return the recorded noise of a channel, or something else where none is recorded."""
+def _noise_of(channel: Channel, fallback: float) -> float:
+    """Return the recorded noise deviation of a channel, or a fallback without a record; never 0."""
     recorded = channel.noise.standard_deviation if channel.noise is not None else 0.0
-    return recorded or otherwise or 1.0
+    return recorded or fallback or 1.0
 
 
 def closed_text(before: ResidualSet, after: ResidualSet, closed: ClosedShare) -> str:
-    """Return share, trials and errors in words that follow "it explains"."""
-    first, second = compared_trials(before, after, closed)
-    errors = errors_text(before.channels, rms_by_channel(first), rms_by_channel(second))
-    where = trials_text(closed)
+    """Return the share in words, such as "it explains 93 % of the mean square error in ...".
+
+    Parameters
+    ----------
+    before, after : ResidualSet
+        All trials of a campaign without and with the hypothesis.
+    closed : ClosedShare
+        The share.
+    """
+    compared_before, compared_after = compared_trials(before, after, closed)
+    rms_before = rms_by_channel(compared_before)
+    errors = errors_text(before.channels, rms_before, rms_by_channel(compared_after))
+    trials = trials_text(closed)
     if closed.grew:
-        return f"it makes the error in {where} larger (rms of {errors})"
-    return f"it explains {share_text(closed)} of the mean square error in {where} (rms of {errors})"
+        return f"it makes the error in {trials} larger (rms of {errors})"
+    return (
+        f"it explains {share_text(closed)} of the mean square error in {trials} (rms of {errors})"
+    )
 
 
 def compared_trials(
     before: ResidualSet, after: ResidualSet, closed: ClosedShare
 ) -> tuple[ResidualSet, ResidualSet]:
     """Return the trials that a share is of, without and with the hypothesis."""
-    pairs: Sequence[ResidualSet | None] = (before.fitted, after.fitted)
     if closed.trials == "held-out":
-        pairs = (before.held_out, after.held_out)
-    first, second = pairs
-    return first or before, second or after
+        return before.held_out or before, after.held_out or after
+    return before.fitted or before, after.fitted or after

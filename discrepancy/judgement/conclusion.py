@@ -1,23 +1,23 @@
-"""What every verdict on a search says alike, and what is too small to be a name.
+"""What all verdicts on a search have in common: the record of a verdict, and its sentences.
 
-A gain of half a thousandth is a nuisance of instruments, not a cause.
+Also here: which errors of instruments are too small to be a name, when a gap is there, and which
+effects could not be tested.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import floor, isnan, log10, nan
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from discrepancy.campaign.records import TrialKind
+from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import NINETY, Effect, EffectParameter, Setting, ShapeParameter
-from discrepancy.errors import said
+from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
-from discrepancy.missing_force.explained import Explained
 from discrepancy.search.starts import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import (
@@ -29,48 +29,118 @@ from discrepancy.verdict import (
     Hypothesis,
     Moment,
     NamedEffect,
+    RemainderEstimate,
     Verdict,
     VerdictKind,
 )
-from fe.runtime.patch import Clock, LoadGain, ModelPatch, SensorGain
+from fe.runtime.patch import Clock, LoadGain, ModelPatch, Primitive, SensorGain
 from reporting.words import listing
 
-Hypothetic = CandidateFit | Explained
-"""A hypothesis as it is compared: as a whole simulation, or along the missing force."""
+
+class ComparedHypothesis(Protocol):
+    """A fitted hypothesis as it is compared.
+
+    A simulation (`CandidateFit`), or a fit to the missing force.
+    """
+
+    @property
+    def candidate(self) -> Candidate:
+        """The effects."""
+
+    @property
+    def effect(self) -> FloatArray:
+        """The scaled effect parameters (E,)."""
+
+    @property
+    def shared(self) -> FloatArray:
+        """The scaled shared unknowns (Q,)."""
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The covariance (Q + E, Q + E) of shared unknowns and effect parameters."""
+
+    @property
+    def log_evidence(self) -> float:
+        """The log evidence [nat]."""
+
+    def __hash__(self) -> int:
+        """Return the hash of the object: each fit is one of its own."""
 
 
-class Outcome(NamedTuple):
-    """A verdict, the search that it rests on, and the fit that stands for it."""
+class VerdictOutcome(NamedTuple):
+    """A verdict, the search that it rests on, and the fit that stands for it.
+
+    The fit is that of the named set, of the family, of the most probable member of a group, or of
+    what is too small to tell; else the one without effect.
+    """
 
     verdict: Verdict
     search: Search
     fit: CandidateFit
 
 
+class WeightedHypothesis(NamedTuple):
+    """A hypothesis and its probability among those compared."""
+
+    hypothesis: ComparedHypothesis
+    probability: float
+
+
 @dataclass(frozen=True)
 class Conclusion:
-    """What every verdict on a search says alike: hypotheses with their probabilities, as they are told."""
+    """The hypotheses of a search with their probabilities, from which verdicts on it are made.
 
-    found: Search
+    Attributes
+    ----------
+    search : Search
+        The search.
+    log_bayes_factor : float
+        ln of the evidence of the best hypothesis over that of the model without effect.
+    hypotheses : sequence of WeightedHypothesis
+        The hypotheses that the verdict lists, in their order.
+    """
+
+    search: Search
     log_bayes_factor: float
-    rows: Sequence[tuple[Hypothetic, float]]
+    hypotheses: Sequence[WeightedHypothesis]
 
     @classmethod
-    def of(
-        cls, found: Search, best: CandidateFit, probabilities: Mapping[tuple[str, ...], float]
+    def from_probabilities(
+        cls, search: Search, best: CandidateFit, probabilities: Mapping[tuple[str, ...], float]
     ) -> "Conclusion":
-        """Return what is said of the sets of effects of a search, the best of them given."""
-        setting = found.problem.setting
-        places = sum(np.log(len(term.effect.places(setting))) for term in best.candidate.terms)
-        rows = [(found.best_of(names), probability) for names, probability in probabilities.items()]
-        return cls(found, float(best.log_evidence - places - found.nothing.log_evidence), rows)
+        """Return the conclusion on the sets of effects of a search.
+
+        Parameters
+        ----------
+        search : Search
+            The search.
+        best : CandidateFit
+            The best set of effects; its evidence is divided by the number of places it was chosen
+            from.
+        probabilities : mapping of tuple of str to float
+            The probability of each set of identifiers, the most probable first.
+        """
+        setting = search.problem.setting
+        log_places = sum(np.log(len(term.effect.places(setting))) for term in best.candidate.terms)
+        no_effect = search.compared_no_effect
+        log_bayes_factor = float(best.log_evidence - log_places - no_effect.log_evidence)
+        hypotheses = [
+            WeightedHypothesis(search.best_of(names), probability)
+            for names, probability in probabilities.items()
+        ]
+        return cls(search, log_bayes_factor, hypotheses)
 
     @cached_property
     def inclusion(self) -> dict[str, float]:
-        """The probability that each effect takes part."""
-        held = [(set(plain_names(item.candidate.identifiers)), p) for item, p in self.rows]
-        names = (effect.identifier for effect in self.found.effects)
-        return {name: sum(probability for own, probability in held if name in own) for name in names}
+        """The probability of each effect to be in the set that explains the data, by identifier."""
+        inclusion = {}
+        for effect in self.search.effects:
+            total: float = 0
+            for hypothesis, probability in self.hypotheses:
+                if effect.identifier in plain_names(hypothesis.candidate.identifiers):
+                    total += probability
+            inclusion[effect.identifier] = total
+        return inclusion
 
     def outcome(
         self,
@@ -78,106 +148,220 @@ class Conclusion:
         sentence: str,
         probability: float,
         fit: CandidateFit | None = None,
-        **more: Any,
-    ) -> Outcome:
-        """Return a verdict with the fit that stands for it: that without effect if none is given."""
-        told = tuple(hypothesis(self.found.problem, item, p) for item, p in self.rows)
+        *,
+        effects: tuple[NamedEffect, ...] = (),
+        group: tuple[str, ...] = (),
+        family: str = "",
+        gates: tuple[Gate, ...] = (),
+        resembles: tuple[str, ...] = (),
+        remainders: tuple[RemainderEstimate, ...] = (),
+    ) -> VerdictOutcome:
+        """Return a verdict with the fit that stands for it.
+
+        Parameters
+        ----------
+        kind, sentence, probability
+            What is concluded, see `Verdict`.
+        fit : CandidateFit, optional
+            The fit that stands for the verdict; the one without effect if left out.
+        effects, group, family, gates, resembles, remainders
+            Further attributes of the `Verdict`.
+        """
+        records = [
+            hypothesis_record(self.search.problem, hypothesis, hypothesis_probability)
+            for hypothesis, hypothesis_probability in self.hypotheses
+        ]
         verdict = Verdict(
             kind,
             sentence,
             probability,
             self.log_bayes_factor,
-            hypotheses=told,
+            effects=effects,
+            group=group,
+            family=family,
+            gates=gates,
+            hypotheses=tuple(records),
             inclusion=self.inclusion,
-            **more,
+            resembles=resembles,
+            remainders=remainders,
         )
-        return Outcome(verdict, self.found, self.found.none if fit is None else fit)
+        return VerdictOutcome(verdict, self.search, self.search.no_effect if fit is None else fit)
 
-    def named(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...], **more: Any) -> Outcome:
-        """Return the verdict that names the effects of a fit; the first gate is that of absolute fit."""
-        named = named_effects(self.found.problem, fit)
-        limit = "" if gates[0].passed else f" {gates[0].reason}"
-        told = {"what": effects_text(named), "certain": probability_text(probability), "limit": limit}
-        more |= {"effects": named, "gates": gates}
-        return self.outcome(VerdictKind.NAMED, said("verdict.named", **told), probability, fit, **more)
+    def named(
+        self,
+        fit: CandidateFit,
+        probability: float,
+        gates: tuple[Gate, ...],
+        remainders: tuple[RemainderEstimate, ...] = (),
+    ) -> VerdictOutcome:
+        """Return the verdict that names the effects of a fit.
 
-    def family(self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]) -> Outcome:
+        Parameters
+        ----------
+        fit : CandidateFit
+            The fit.
+        probability : float
+            The probability of the set.
+        gates : tuple of Gate
+            The outcomes of the tests, that of absolute fit first.
+        remainders : tuple of RemainderEstimate
+            What the fit leaves beside the noise.
+        """
+        effects = named_effects(self.search.problem, fit)
+        probability_clause = f"probability {probability_text(probability)}"
+        sentence = f"The model lacks {effects_text(effects)} ({probability_clause})."
+        absolute_fit = gates[0]
+        if not absolute_fit.passed:
+            sentence += f" {absolute_fit.reason}"
+        return self.outcome(
+            VerdictKind.NAMED,
+            sentence,
+            probability,
+            fit,
+            effects=effects,
+            gates=gates,
+            remainders=remainders,
+        )
+
+    def family(
+        self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]
+    ) -> VerdictOutcome:
         """Return the verdict that names the family of a fit with a free shape."""
-        drawn = with_draws(self.found.problem, fit)
-        named = named_effects(self.found.problem, drawn)
-        family = ", ".join(sorted({effect.family for effect in named if effect.shape}))
-        beside = ", ".join(effect.name for effect in named if not effect.shape)
-        sentence = said("verdict.family", family=family, beside=f", beside {beside}" if beside else "")
-        more = {"effects": named, "family": family, "gates": gates}
-        return self.outcome(VerdictKind.FAMILY, sentence, probability, drawn, **more)
+        fit_with_draws = with_draws(self.search.problem, fit)
+        effects = named_effects(self.search.problem, fit_with_draws)
+        family = ", ".join(sorted({effect.family for effect in effects if effect.shape}))
+        others = ", ".join(effect.name for effect in effects if not effect.shape)
+        beside = f", beside {others}" if others else ""
+        sentence = f"An effect of the family {family} is missing, with a shape of its own{beside}."
+        return self.outcome(
+            VerdictKind.FAMILY,
+            sentence,
+            probability,
+            fit_with_draws,
+            effects=effects,
+            family=family,
+            gates=gates,
+        )
+
+
+# ---------------------------------------------------------------- records of hypotheses
 
 
 def plain_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return identifiers without the mark of a free shape."""
+    """Return identifiers of effects without the mark of a free shape."""
     return tuple(name.removesuffix(FREE_SHAPE) for name in names)
 
 
-def hypothesis(problem: Problem, item: Hypothetic, probability: float) -> Hypothesis:
-    """Return the record of a hypothesis; along the missing force no readings are compared."""
-    effects, parameters = named_effects(problem, item), calibrated_parameters(problem, item)
-    chi_square, freedom = nan, nan
-    if isinstance(item, CandidateFit):
-        chi_square, freedom = item.chi_square, float(problem.counts.sum() - item.spent.sum())
-    return Hypothesis(effects, item.log_evidence, probability, chi_square, freedom, parameters)
+def hypothesis_record(
+    problem: Problem, hypothesis: ComparedHypothesis, probability: float
+) -> Hypothesis:
+    """Return the record of a hypothesis for the verdict.
+
+    χ² and its degrees of freedom are nan for a hypothesis that was fitted to the missing force, as
+    no readings are compared then.
+    """
+    chi_square = nan
+    freedom = nan
+    if isinstance(hypothesis, CandidateFit):
+        chi_square = hypothesis.chi_square
+        freedom = float(problem.counts.sum() - hypothesis.spent.sum())
+    return Hypothesis(
+        effects=named_effects(problem, hypothesis),
+        log_evidence=hypothesis.log_evidence,
+        probability=probability,
+        chi_square=chi_square,
+        degrees_of_freedom=freedom,
+        parameters=calibrated_parameters(problem, hypothesis),
+    )
 
 
-def named_effects(problem: Problem, found: Hypothetic) -> tuple[NamedEffect, ...]:
-    """Return the effects of a hypothesis with values and 90 % intervals of their parameters.
+def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[NamedEffect, ...]:
+    """Return the effects of a hypothesis with the values and 90 % intervals of their parameters.
 
     Intervals are those of its draws, where it has any, else of its covariance.
     """
-    spread = NINETY * np.sqrt(np.diag(found.covariance)[len(found.shared) :])
-    low, high = found.effect - spread, found.effect + spread
-    draws = getattr(found, "draws", None)
-    if draws is not None:
-        ends = np.quantile(draws, (0.05, 0.95), axis=0)
+    low, high = _scaled_interval(hypothesis)
+    first = 0
+    effects = []
+    for term, values in hypothesis.candidate.split(hypothesis.effect):
+        estimates = []
+        for index, parameter in enumerate(term.parameters):
+            bounds = (float(low[first + index]), float(high[first + index]))
+            estimates.append(_estimate(parameter, float(values[index]), bounds))
+        first += len(estimates)
+        count = len(term.effect.parameters)
+        effects.append(
+            NamedEffect(
+                identifier=term.effect.identifier,
+                name=term.effect.name,
+                place=term.place,
+                family=term.effect.family,
+                parameters=tuple(estimates[:count]),
+                shape=tuple(estimates[count:]),
+                patch=term.patch(problem.setting, values),
+            )
+        )
+    return tuple(effects)
+
+
+def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatArray]:
+    """Return the ends of the 90 % intervals of the scaled effect parameters, (E,) each."""
+    value = hypothesis.effect
+    if isinstance(hypothesis, CandidateFit) and hypothesis.draws is not None:
+        low, high = np.quantile(hypothesis.draws, (0.05, 0.95), axis=0)
         # the most probable value may be one of many optima along a ridge
-        low, high = np.minimum(ends[0], found.effect), np.maximum(ends[1], found.effect)
-    bounds = iter(zip(low, high, strict=True))
-    named = []
-    for term, part in found.candidate.parts(found.effect):
-        rows = [_estimate(item, u, *next(bounds)) for item, u in zip(term.parameters, part, strict=True)]
-        effect, count = term.effect, len(term.effect.parameters)
-        patch = term.patch(problem.setting, part)
-        whose = (effect.identifier, effect.name, term.place, effect.family)
-        named.append(NamedEffect(*whose, tuple(rows[:count]), tuple(rows[count:]), patch))
-    return tuple(named)
+        return np.minimum(low, value), np.maximum(high, value)
+    variances = np.diag(hypothesis.covariance)[len(hypothesis.shared) :]
+    half_width = NINETY * np.sqrt(variances)
+    return value - half_width, value + half_width
 
 
-def _estimate(item: EffectParameter | ShapeParameter, *scaled: float) -> Estimate:
-    """Return an estimate at a scaled value and the ends of its interval."""
-    value, *ends = (item.prior.value(float(u)) for u in scaled)
-    return Estimate(item.name, value, min(ends), max(ends), item.unit, item.description)
-
-
-def calibrated_parameters(problem: Problem, found: Hypothetic) -> tuple[CalibratedParameter, ...]:
-    """Return the calibrated parameters of the model as a hypothesis has them, within the model's range."""
-    layout = problem.shared
-    values = layout.parameters(found.shared)
-    variance = np.diag(found.covariance)[: layout.count]
-    spread = layout.scale[: layout.count] * np.sqrt(np.maximum(variance, 0.0))
-    return tuple(
-        CalibratedParameter(item.name, float(value), float(deviation), item.unit)
-        for item, value, deviation in zip(problem.model.parameters, values, spread, strict=True)
+def _estimate(
+    parameter: EffectParameter | ShapeParameter, scaled: float, bounds: tuple[float, float]
+) -> Estimate:
+    """Return a parameter with its interval, given its scaled value and scaled interval."""
+    ends = [parameter.prior.value(bound) for bound in bounds]
+    return Estimate(
+        name=parameter.name,
+        value=parameter.prior.value(scaled),
+        low=min(ends),
+        high=max(ends),
+        unit=parameter.unit,
+        description=parameter.description,
     )
+
+
+def calibrated_parameters(
+    problem: Problem, hypothesis: ComparedHypothesis
+) -> tuple[CalibratedParameter, ...]:
+    """Return the calibrated parameters of the model in a hypothesis, within their ranges."""
+    layout = problem.shared
+    values = layout.parameters(hypothesis.shared)
+    variances = np.diag(hypothesis.covariance)[: layout.count]
+    deviations = layout.scale[: layout.count] * np.sqrt(np.maximum(variances, 0.0))
+    parameters = []
+    for parameter, value, deviation in zip(
+        problem.model.parameters, values, deviations, strict=True
+    ):
+        parameters.append(
+            CalibratedParameter(parameter.name, float(value), float(deviation), parameter.unit)
+        )
+    return tuple(parameters)
 
 
 # ---------------------------------------------------------------- words
 
 
 def effects_text(effects: Iterable[NamedEffect]) -> str:
-    """Return effects with their places."""
-    found = (f"{item.name} at {item.place}" if item.place else item.name for item in effects)
-    return listing(dict.fromkeys(found))
+    """Return effects with their places in words, such as "friction at slide and gain at g1"."""
+    texts = []
+    for effect in effects:
+        texts.append(f"{effect.name} at {effect.place}" if effect.place else effect.name)
+    return listing(dict.fromkeys(texts))
 
 
 def probability_text(probability: float) -> str:
-    """Return a probability that is neither rounded to one nor to zero."""
+    """Return a probability in words that is neither rounded to one nor to zero."""
     if isnan(probability):
         return "not known"
     if probability > 0.9995:
@@ -187,156 +371,241 @@ def probability_text(probability: float) -> str:
     return f"{probability:.3f}"
 
 
-def below_limit(names: Sequence[str], coloured: str = "") -> str:
-    """Return the sentence on what is too small to tell from noise, and what is nearest to it."""
+def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
+    """Return the sentence on effects that are too small to be told from noise.
+
+    Parameters
+    ----------
+    names : sequence of str
+        The identifiers of the effects, of which the first are mentioned.
+    noise_clause : str
+        A clause on the noise, such as " that is coloured".
+    """
     nearest = f"; the nearest are {', '.join(names[:4])}" if names else ""
-    return said("verdict.below_limit", coloured=coloured, nearest=nearest)
+    return (
+        "Something may be missing, but too small for these data to tell from noise"
+        f"{noise_clause}{nearest}."
+    )
 
 
 LEAST_SIZE = 1e-3
-"""Size of a gain, tare or clock error over what it acts on, below which it is a nuisance and no name."""
+"""Size of a gain, tare or clock error over what it acts on, below which it is a nuisance and no
+name."""
 UNSTATED_GAIN = 1e-2
-"""The same of the gain of a channel of which no deviation is stated, beside a law that explains as much: a
-calibration that nobody stated is not exact."""
+"""The same for the gain of a channel without a stated deviation, beside a law that explains as
+much: a calibration that nobody stated is not exact."""
 
 
-def is_one_driven_channel(problem: Problem) -> bool:
-    """Whether a campaign is of driven trials and one channel: no error of it has a pattern of its own."""
-    driven = all(trial.kind in (TrialKind.DRIVEN, TrialKind.FORCED) for trial in problem.campaign.trials)
-    return driven and len(problem.channel_names) == 1
+def has_one_driven_channel(problem: Problem) -> bool:
+    """Return whether a campaign has driven trials and one channel only.
+
+    No error of that channel has a pattern of its own then.
+    """
+    driven_kinds = (TrialKind.DRIVEN, TrialKind.FORCED)
+    is_driven = all(trial.kind in driven_kinds for trial in problem.campaign.trials)
+    return is_driven and len(problem.channel_names) == 1
 
 
 def is_small(problem: Problem, patch: ModelPatch, *, unstated: float = LEAST_SIZE) -> bool:
-    """Whether a patch is errors of instruments only, too small over what they act on to be a name.
+    """Return whether a patch has only errors of instruments that are too small to be a name.
 
-    `unstated`: the least size of a gain of a channel of which no deviation is stated.
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model, by whose scales sizes are measured.
+    patch : ModelPatch
+        The patch.
+    unstated : float
+        The least size of a gain of a channel without a stated deviation.
     """
-    channels, scales = problem.campaign.channels, problem.setting.scales
-    sizes = []
-    for item in patch:
-        least = LEAST_SIZE
-        if isinstance(item, LoadGain):
-            size = max(abs(item.gain), abs(item.tare) / scales.force if scales.force > 0.0 else 0.0)
-        elif isinstance(item, SensorGain):
-            size = abs(item.gain)
-            if item.channel in channels and channels[item.channel].gain_deviation == 0.0:
-                least = unstated
-        elif isinstance(item, Clock):
-            size = max(abs(item.rate), abs(item.zero) * scales.angular_frequency)
-        else:
+    ratios = []
+    for primitive in patch:
+        size = _instrument_error(problem, primitive)
+        if size is None:
             return False
-        sizes.append(size / least)
-    return max(sizes, default=1.0) < 1.0
+        has_unstated_gain = isinstance(primitive, SensorGain) and _is_exact(problem, primitive)
+        least = unstated if has_unstated_gain else LEAST_SIZE
+        ratios.append(size / least)
+    return max(ratios, default=1.0) < 1.0
 
 
-# ---------------------------------------------------------------- beside a verdict: when, and what else
+def _is_exact(problem: Problem, gain: SensorGain) -> bool:
+    """Return whether a campaign states no deviation of the gain of a channel."""
+    channel = problem.campaign.channels.get(gain.channel)
+    return channel is not None and channel.gain_deviation == 0.0
+
+
+def _instrument_error(problem: Problem, primitive: Primitive) -> float | None:
+    """Return the size of an error of an instrument over what it acts on.
+
+    None for other primitives.
+    """
+    scales = problem.setting.scales
+    if isinstance(primitive, LoadGain):
+        tare = abs(primitive.tare) / scales.force if scales.force > 0.0 else 0.0
+        return max(abs(primitive.gain), tare)
+    if isinstance(primitive, SensorGain):
+        return abs(primitive.gain)
+    if isinstance(primitive, Clock):
+        return max(abs(primitive.rate), abs(primitive.zero) * scales.angular_frequency)
+    return None
+
+
+# ---------------------------------------------------------------- when there is a gap
 
 NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
-"""Verdicts by which the model stands as it is."""
-TOLD = 3
-"""Windows that are told one by one; of more the largest is, and all are in the file. So many effects that
-were not tested are called by name."""
+"""Kinds of verdicts by which the model stands as it is."""
+MOST_MENTIONED = 3
+"""Windows, or effects that were not tested, that a sentence mentions one by one."""
 
 
 def moment_text(moment: Moment) -> str:
-    """Return a time with its 90 % interval, by two digits of its width."""
+    """Return a time with its 90 % interval, to two digits of its width."""
     width = moment.high - moment.low
     places = max(0, 1 - floor(log10(width))) if width > 0.0 else 6
-    low, high = f"{moment.low:.{places}f}", f"{moment.high:.{places}f}"
-    return f"{moment.value:.{places}f} s ({low} to {high})"
+    interval = f"{moment.low:.{places}f} to {moment.high:.{places}f}"
+    return f"{moment.value:.{places}f} s ({interval})"
 
 
 def window_text(window: GapWindow) -> str:
-    """Return since when and until when, in words."""
+    """Return in words since when and until when there is a gap."""
     if window.begin is None and window.end is None:
         return "throughout the record"
-    since = f"since {moment_text(window.begin)}" if window.begin else "from the first sample"
-    return since + (f" until {moment_text(window.end)}" if window.end else ", to the end of the record")
+    since = "from the first sample"
+    if window.begin:
+        since = f"since {moment_text(window.begin)}"
+    if window.end:
+        return f"{since} until {moment_text(window.end)}"
+    return f"{since}, to the end of the record"
 
 
 def when_sentence(windows: Sequence[GapWindow]) -> str:
-    """Return when the gap of the model as it was is there, in one sentence; empty without a gap in time."""
-    found = [window for window in windows if not window.with_effect]
-    if not found:
+    """Return a sentence on when the model without effect has a gap; empty without a gap in time.
+
+    Parameters
+    ----------
+    windows : sequence of GapWindow
+        The windows of gaps, of the model without effect and of the best hypothesis.
+    """
+    without_effect = [window for window in windows if not window.with_effect]
+    if not without_effect:
         return ""
-    if all(window.begin is None and window.end is None for window in found):
+    if all(window.begin is None and window.end is None for window in without_effect):
         return "The gap is there throughout the records."
-    told = sorted(found, key=lambda window: (window.begin is None, -window.size))
-    if len(told) > TOLD:
-        most = max(found, key=lambda window: window.size)
-        return f"The gap comes and goes, {len(found)} times; the largest is {_where(most)}."
-    return f"The gap is there {'; '.join(_where(window) for window in told)}."
+    if len(without_effect) > MOST_MENTIONED:
+        largest = max(without_effect, key=lambda window: window.size)
+        count = len(without_effect)
+        return f"The gap comes and goes, {count} times; the largest is {_sized_window(largest)}."
+    # those that begin in a record first, the largest of each first
+    ordered = sorted(without_effect, key=lambda window: (window.begin is None, -window.size))
+    return f"The gap is there {'; '.join(_sized_window(window) for window in ordered)}."
 
 
-def _where(window: GapWindow) -> str:
-    return f"in {window.trial!r} {window_text(window)}, {_times(window.size)} the noise"
+def _sized_window(window: GapWindow) -> str:
+    """Return in words in which trial and when a gap is, and how large."""
+    size = f"{window.size:.2g}"
+    if "e+0" in size:
+        size = f"{float(size):,.0f}"
+    return f"in {window.trial!r} {window_text(window)}, {size} times the noise"
 
 
-def _times(size: float) -> str:
-    two = f"{size:.2g}"
-    return f"{float(two):,.0f} times" if "e+0" in two else f"{two} times"
+def with_date(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
+    """Return the sentence of a verdict, and when its gap is there if that says something.
 
-
-def dated(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
-    """Return the sentence of a verdict, with when the gap is there where that tells something."""
+    Parameters
+    ----------
+    verdict : Verdict
+        The verdict.
+    windows : sequence of GapWindow
+        The windows of gaps.
+    """
     when = acting_sentence(verdict.effects)
-    telling = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
-    if not when and verdict.kind not in NO_GAP and telling:
+    is_informative = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
+    if not when and verdict.kind not in NO_GAP and is_informative:
         when = when_sentence(windows)
     return f"{verdict.sentence} {when}".strip()
 
 
 def begins_inside(windows: Sequence[GapWindow]) -> bool:
-    """Whether the gap of the model as it was has a begin in a record: something happened there."""
+    """Return whether a gap of the model without effect begins inside a record.
+
+    Something happened there.
+    """
     return any(window.begin is not None for window in windows if not window.with_effect)
 
 
 def acting_sentence(effects: Sequence[NamedEffect]) -> str:
-    """Return when effects in windows act, in one sentence each; empty for those that always act."""
+    """Return a sentence for each effect that acts in windows of time only.
+
+    Empty if all always act.
+    """
     sentences = []
     for effect in effects:
         windows = effect.patch.primitives[0].windows if len(effect.patch) else ()
-        parts = []
+        if not windows:
+            continue
+        texts = []
         for trial, begin, end in windows:
             since = "from the first sample" if begin is None else f"from {begin:.6g} s"
             until = "on" if end is None else f"until {end:.6g} s"
-            parts.append(f"{since} {until} in {trial!r}")
-        more = f"; and in {len(parts) - TOLD} more" if len(parts) > TOLD else ""
-        if parts:
-            sentences.append(f"{effect.name} acts {'; '.join(parts[:TOLD])}{more}.")
+            texts.append(f"{since} {until} in {trial!r}")
+        mentioned = "; ".join(texts[:MOST_MENTIONED])
+        if len(texts) > MOST_MENTIONED:
+            mentioned += f"; and in {len(texts) - MOST_MENTIONED} more"
+        sentences.append(f"{effect.name} acts {mentioned}.")
     return " ".join(sentences)
 
 
+# ---------------------------------------------------------------- what was not compared
+
+
 def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect]) -> Verdict:
-    """Return a verdict on a group or on several effects that says what could not be tested.
+    """Return the verdict with a sentence on the effects that could not be tested.
 
-    A cause that needs another trial or a port is no member of a group, however like one it acts: those that
-    are easily taken for a member are named.
-    """
-    several = verdict.kind in (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART) and len(verdict.effects) > 1
-    if verdict.kind is not VerdictKind.GROUP and not several:
-        return verdict
-    untested = [effect for effect in effects if effect.unavailable(setting) is not None]
-    if not untested:
-        return verdict
-    known = {effect.identifier: effect for effect in effects}
-    members = [known[item.identifier] for item in verdict.effects if item.identifier in known]
-    untested.sort(key=lambda effect: not any(are_related(effect, member) for member in members))
-    rest = len(untested) - TOLD
-    names = [effect.name for effect in untested[:TOLD]] + ([f"{rest} more"] if rest > 0 else [])
-    sentence = said("remarks.untested", sentence=verdict.sentence, names=listing(names))
-    return replace(verdict, sentence=sentence)
+    Only a verdict on a group or on several effects gets one.
 
-
-def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:
-    """Return what else a named effect could be, from the likenesses that the catalogue declares.
+    A cause that needs another trial or a port is no member of a group, however similar its action
+    is. Those that are easily taken for a member are mentioned first.
 
     Parameters
     ----------
     verdict : Verdict
-        With its effects.
+        The verdict.
+    setting : Setting
+        The campaign and model.
+    effects : sequence of Effect
+        The catalogue.
+    """
+    is_name = verdict.kind in (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
+    names_several = is_name and len(verdict.effects) > 1
+    if verdict.kind is not VerdictKind.GROUP and not names_several:
+        return verdict
+    untested = [effect for effect in effects if effect.unavailable(setting) is not None]
+    if not untested:
+        return verdict
+    by_identifier = {effect.identifier: effect for effect in effects}
+    members = []
+    for named_effect in verdict.effects:
+        if named_effect.identifier in by_identifier:
+            members.append(by_identifier[named_effect.identifier])
+    untested.sort(key=lambda effect: not any(are_related(effect, member) for member in members))
+    names = [effect.name for effect in untested[:MOST_MENTIONED]]
+    remaining = len(untested) - MOST_MENTIONED
+    if remaining > 0:
+        names.append(f"{remaining} more")
+    untested_sentence = f"These trials cannot test all effects that may act so: {listing(names)}."
+    return replace(verdict, sentence=f"{verdict.sentence} {untested_sentence}")
+
+
+def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:
+    """Return a remark on what else a named effect could be, by the likenesses in the catalogue.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        The verdict with its effects.
     compared : iterable of Effect
-        Effects that could act and were compared with the named ones.
+        The effects that could act and were compared with the named ones.
 
     Returns
     -------
@@ -345,22 +614,39 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     """
     if verdict.kind is not VerdictKind.NAMED:
         return None
-    effects = {effect.identifier: effect for effect in compared}
     named = {effect.identifier: effect.name for effect in verdict.effects}
-    alike = {
-        identifier for identifier, effect in effects.items() if not set(effect.confusable).isdisjoint(named)
-    }
-    alike |= {other for name in named.keys() & effects.keys() for other in effects[name].confusable}
-    alike -= named.keys()
+    compared_by_identifier = {effect.identifier: effect for effect in compared}
+    likenesses = _likenesses(set(named), compared_by_identifier)
+    tried = sorted(likenesses & compared_by_identifier.keys())
+    untried = sorted(likenesses - compared_by_identifier.keys())
     does = "does" if len(named) == 1 else "do together"
-    text = said("remarks.look_alike", names=" and ".join(named.values()), does=does)
-    tried, untried = sorted(alike & effects.keys()), sorted(alike - effects.keys())
-    missed = said("remarks.not_compared", names=", ".join(untried), was=_was(untried)) if untried else ""
+    remark = (
+        "A cause that the catalogue lacks and that acts on these trials as "
+        f"{' and '.join(named.values())} {does}, within the noise, would be given the same name."
+    )
+    not_compared = f"{', '.join(untried)} {_was(untried)} not compared."
     if tried:
-        words = said("remarks.compared", names=", ".join(tried), was=_was(tried))
-        return f"{text}{words}{f'; {missed}' if missed else '.'}"
-    return f"{text} Of what is known to look alike, {missed}" if missed else text
+        remark += (
+            f" Of what is known to look alike, {', '.join(tried)} {_was(tried)} compared, "
+            "with less evidence"
+        )
+        return f"{remark}; {not_compared}" if untried else f"{remark}."
+    if untried:
+        return f"{remark} Of what is known to look alike, {not_compared}"
+    return remark
 
 
-def _was(items: list[str]) -> str:
-    return "was" if len(items) == 1 else "were"
+def _likenesses(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
+    """Return the identifiers of effects that look like a named one, as either of both declares."""
+    likenesses = set()
+    for identifier, effect in compared.items():
+        if not named.isdisjoint(effect.confusable):
+            likenesses.add(identifier)
+    for identifier in named & compared.keys():
+        likenesses.update(compared[identifier].confusable)
+    return likenesses - named
+
+
+def _was(names: Sequence[str]) -> str:
+    """Return the verb of one or several names."""
+    return "was" if len(names) == 1 else "were"

@@ -1,21 +1,24 @@
-"""The gate of consistency: what a named effect leaves must not follow loads, runs, or its own channel.
+"""The test of consistency.
 
-An effect that is not in the catalogue can be imitated by one that is, closely enough for the sum of squares
-of many thousand samples. The difference then lies along few directions: the response of one kind of test has
-another size, slope over the span or zero than the name allows. A score test (Rao 1948, Proc. Camb. Phil. Soc.
-44) looks along these directions only, with nuisances and effect free to follow.
+What a named effect leaves must not follow loads, runs, or its own channel.
+
+An effect that is not in the catalogue can be imitated by one that is, closely enough for the sum of
+squares of many thousand samples. The difference then lies along few directions: the response of one
+kind of test has another size, slope over the span or zero than the name allows. A score test (Rao
+1948, Proc. Camb. Phil. Soc. 44, 50-57) looks along these directions only, with nuisances and effect
+free to follow.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from math import isinf
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import chi2, f
 
 from discrepancy.campaign.records import FloatArray, Quantity, TrialKind
-from discrepancy.errors import said
-from discrepancy.fits.candidate import Term
+from discrepancy.fits.candidate import EffectTerm
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
@@ -25,32 +28,37 @@ from fe.runtime.patch import SENSORS
 from reporting.words import counted
 
 CONSISTENCY_LEVEL = 1e-3
-"""Level of the gate, by Bonferroni over its tests; a true name fails it this often."""
+"""Level of the test, by Bonferroni over its parts; a true name fails it this often."""
 IDENTIFIED = 0.5
-"""Posterior over prior deviation of an effect parameter below which its prior does not count in the test."""
+"""Posterior over prior deviation of an effect parameter below which its prior does not count in the
+test."""
 SEPARATE = 1e-6
-"""Share of a direction that must be left when all else has followed."""
+"""Share of a direction that must remain when nuisances and effect have followed."""
 LEAST_FREEDOM = 20.0
-"""Degrees of freedom from which the noise of the readings concerned is known well enough."""
+"""Degrees of freedom from which on the noise of the channels concerned is known well enough."""
 LEAST_STATIONS = 3
+"""Stations along the span from which on a slope over it is tested."""
+
+Direction = Mapping[int, FloatArray]
+"""The change of the prediction (N, C) of each trial, by the index of the trial."""
 
 
 @dataclass(frozen=True)
 class ScoreTest:
-    """Outcome of a score test.
+    """The outcome of a score test.
 
     Attributes
     ----------
     name : str
-        What was freed.
+        The name of the group of directions that was tested.
     statistic : float
-        Fall of the sum of squares (in units of the noise) that the directions promise.
+        The fall of the sum of squares, in units of the noise, that the directions promise.
     count : int
-        Number of directions that can be told from what is free already.
+        The number of directions that can be told from nuisances and effect.
     p_value : float
-        Of a fall as large, if the fit is right.
+        The probability of a fall as large if the fit is right.
     strongest : str
-        The direction that departs most by itself, with its size in deviations.
+        The direction that departs most by itself, with its size in standard deviations.
     """
 
     name: str
@@ -60,190 +68,362 @@ class ScoreTest:
     strongest: str
 
 
-Direction = Mapping[int, FloatArray]
-"""Change of the prediction (N, C) by trial number."""
-
-
-def consistency_gate(problem: Problem, fit: CandidateFit) -> Gate:
-    """Judge whether what is left departs along loads, runs or the channel of the effect.
+def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
+    """Test whether the residuals of a fit follow loads, runs or the channel of its effect.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     fit : CandidateFit
-        What would be named.
+        The fit of the effects that would be named.
 
     Returns
     -------
     Gate
-        `passed` is None where there is no static trial, no flight, and no effect of a single channel, or too
-        few readings.
+        The outcome. `passed` is None where there is no static trial, no flight, and no effect of a
+        single channel, or too few readings.
     """
     tests = score_tests(problem, fit, directions(problem, fit))
     if not tests:
-        return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, said("consistency.not_judged"))
+        reason = (
+            "No trial under a stated load, or too few readings: what is left cannot be judged by "
+            "load."
+        )
+        return Gate("consistency", None, np.nan, CONSISTENCY_LEVEL, reason)
     worst = min(tests, key=lambda test: test.p_value)
     statistic = min(1.0, worst.p_value * len(tests))
     passed = statistic >= CONSISTENCY_LEVEL
-    along = counted(worst.count, "direction")
-    reason = said(f"consistency.{'passed' if passed else 'failed'}", worst=worst, along=along)
+    if passed:
+        reason = "What is left follows neither loads, runs nor the effect's own channel."
+    else:
+        reason = (
+            f"What is left follows the {worst.name}: χ² {worst.statistic:.0f} along "
+            f"{counted(worst.count, 'direction')}, most of all {worst.strongest}."
+        )
     return Gate("consistency", passed, statistic, CONSISTENCY_LEVEL, reason)
+
+
+# ---------------------------------------------------------------- score tests
 
 
 def score_tests(
     problem: Problem, fit: CandidateFit, groups: Mapping[str, Mapping[str, Direction]]
 ) -> list[ScoreTest]:
-    """Test groups of directions at a fit, each group by itself.
+    """Return the score test of each group of directions at a fit.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     fit : CandidateFit
-        Converged, with its linearisations.
+        The fit, converged, with its derivatives.
     groups : mapping of str to mapping of str to Direction
-        Names of tests, names of their directions.
+        The directions of each test by their names.
 
     Returns
     -------
     list of ScoreTest
-        Of the groups of which a direction is left and whose channels have enough readings.
+        The tests of the groups that have a direction left and enough readings.
     """
-    # effect parameters that the data determine follow without their prior: that they are unlikely says
-    # nothing of what they leave
-    determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
-    screen = Screen(problem, fit, record_noise=False, effect_precision=np.where(determined, 0.0, 1.0))
-    sign, tests = screen.sign, []
+    # An effect parameter that the data determine follows without its prior: that its value is
+    # unlikely says nothing of what the effect leaves.
+    is_determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
+    effect_precision = np.where(is_determined, 0.0, 1.0)
+    screen = Screen(problem, fit, record_noise=False, effect_precision=effect_precision)
+    tests = []
     for name, group in groups.items():
-        labels, vectors, slopes = [], [], []
-        for label, direction in group.items():
-            changes = {number: problem.trials[number].standardised(c) for number, c in direction.items()}
-            vector, slope, _ = screen.projected(changes)
-            size = float(np.linalg.norm(vector[sign > 0.0]))
-            if size > 0.0:
-                labels.append(label)
-                vectors.append(vector / size)
-                slopes.append(slope / size)
-        if not labels:
-            continue
-        gradient, information = np.array(slopes), (np.array(vectors) * sign) @ np.array(vectors).T
-        values, modes = np.linalg.eigh(information)
-        kept = values > SEPARATE
-        count, statistic = int(kept.sum()), float(np.sum((modes.T @ gradient)[kept] ** 2 / values[kept]))
-        freedom, share = _freedom(problem, fit, group.values())
-        if not count or freedom - count < LEAST_FREEDOM:
-            continue
-        own = np.diag(information)
-        alone = np.abs(gradient) / np.sqrt(np.where(own > SEPARATE, own, np.inf))
-        most = int(np.argmax(alone))
-        strongest = f"{labels[most]} ({alone[most]:.1f} deviations)"
-        tests.append(ScoreTest(name, statistic, count, _p_value(statistic, count, freedom, share), strongest))
+        projected = _projected_directions(problem, screen, group)
+        if projected.labels:
+            test = _score_test(name, projected, _noise_freedom(problem, fit, group.values()))
+            if test is not None:
+                tests.append(test)
     return tests
 
 
-def _p_value(statistic: float, count: int, freedom: float, share: float) -> float:
-    """Return the tail probability; the noise is known with `freedom`, `share` of it left by the unknowns."""
-    if isinf(freedom):
-        return float(chi2.sf(statistic, count))
-    scaled = statistic * share
-    if scaled >= freedom:
-        return 0.0
-    return float(f.sf((scaled / count) / ((freedom - scaled) / (freedom - count)), count, freedom - count))
+class _ProjectedDirections(NamedTuple):
+    """Directions of unit length, without what nuisances and effect can do.
+
+    Attributes
+    ----------
+    labels : list of str
+        The names of the K directions.
+    gradient : (K,) array
+        The slope of the misfit along each direction: their scores.
+    information : (K, K) array
+        The inner products of the directions: the Fisher information of their sizes.
+    """
+
+    labels: list[str]
+    gradient: FloatArray
+    information: FloatArray
 
 
-def _freedom(problem: Problem, fit: CandidateFit, directions: Iterable[Direction]) -> tuple[float, float]:
-    """Return degrees of freedom of the noise of the channels concerned, and their share not spent."""
+def _projected_directions(
+    problem: Problem, screen: Screen, group: Mapping[str, Direction]
+) -> _ProjectedDirections:
+    """Return a group of directions without what nuisances and effect can do."""
+    sign = screen.sign
+    labels = []
+    vectors = []
+    slopes = []
+    for label, direction in group.items():
+        changes = {}
+        for number, change in direction.items():
+            changes[number] = problem.trials[number].standardised(change)
+        vector, slope, _ = screen.project(changes)
+        length = float(np.linalg.norm(vector[sign > 0.0]))
+        if length > 0.0:
+            labels.append(label)
+            vectors.append(vector / length)
+            slopes.append(slope / length)
+    if not labels:
+        return _ProjectedDirections(labels, np.zeros(0), np.zeros((0, 0)))
+    information = (np.array(vectors) * sign) @ np.array(vectors).T
+    return _ProjectedDirections(labels, np.array(slopes), information)
+
+
+class _NoiseFreedom(NamedTuple):
+    """The degrees of freedom of the noise of channels, and their share not spent by the fit."""
+
+    freedom: float
+    share: float
+
+
+def _noise_freedom(
+    problem: Problem, fit: CandidateFit, group: Iterable[Direction]
+) -> _NoiseFreedom:
+    """Return the degrees of freedom of the noise of the channels that directions change."""
     channels: set[int] = set()
-    for direction in directions:
-        for number, column in direction.items():
-            channels.update(problem.trials[number].groups[np.any(column != 0.0, axis=0)].tolist())
-    rows = sorted(channels)
-    known = problem.freedom[rows] + problem.counts[rows]
-    if np.any(np.isinf(known)):
-        return np.inf, 1.0
-    left = float(np.sum(known - fit.spent[rows]))
-    return left, left / float(known.sum())
+    for direction in group:
+        for number, change in direction.items():
+            is_changed = np.any(change != 0.0, axis=0)
+            channels.update(problem.trials[number].groups[is_changed].tolist())
+    numbers = sorted(channels)
+    freedom = problem.freedom[numbers] + problem.counts[numbers]
+    if np.any(np.isinf(freedom)):
+        return _NoiseFreedom(np.inf, 1.0)
+    remaining = float(np.sum(freedom - fit.spent[numbers]))
+    return _NoiseFreedom(remaining, remaining / float(freedom.sum()))
+
+
+def _score_test(
+    name: str, projected: _ProjectedDirections, noise: _NoiseFreedom
+) -> ScoreTest | None:
+    """Return the score test of a group of directions; None if nothing can be tested.
+
+    The statistic is g' I^+ g, with g the gradient and I^+ the pseudo-inverse of the information.
+    """
+    gradient = projected.gradient
+    values, modes = np.linalg.eigh(projected.information)
+    is_separate = values > SEPARATE
+    count = int(is_separate.sum())
+    components = (modes.T @ gradient)[is_separate]
+    statistic = float(np.sum(components**2 / values[is_separate]))
+    if not count or noise.freedom - count < LEAST_FREEDOM:
+        return None
+    # the strongest direction by itself
+    single_information = np.diag(projected.information)
+    single_information = np.where(single_information > SEPARATE, single_information, np.inf)
+    deviations = np.abs(gradient) / np.sqrt(single_information)
+    strongest = int(np.argmax(deviations))
+    return ScoreTest(
+        name=name,
+        statistic=statistic,
+        count=count,
+        p_value=_p_value(statistic, count, noise),
+        strongest=f"{projected.labels[strongest]} ({deviations[strongest]:.1f} deviations)",
+    )
+
+
+def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
+    """Return the tail probability of a score statistic of some directions.
+
+    Χ², or F for an estimated noise.
+    """
+    if isinf(noise.freedom):
+        return float(chi2.sf(statistic, count))
+    scaled = statistic * noise.share
+    if scaled >= noise.freedom:
+        return 0.0
+    remaining_freedom = noise.freedom - count
+    ratio = (scaled / count) / ((noise.freedom - scaled) / remaining_freedom)
+    return float(f.sf(ratio, count, remaining_freedom))
+
+
+# ---------------------------------------------------------------- directions
+
+
+class _DirectionGroups:
+    """Directions that are collected, by group and label."""
+
+    def __init__(self) -> None:
+        self.groups: dict[str, dict[str, dict[int, FloatArray]]] = {}
+
+    def add(self, group: str, label: str, number: int, change: FloatArray) -> None:
+        """Add the change of a trial's prediction (N, C) to a direction."""
+        self.groups.setdefault(group, {}).setdefault(label, {})[number] = change
 
 
 def directions(problem: Problem, fit: CandidateFit) -> Mapping[str, Mapping[str, Direction]]:
-    """Return the directions of each test by name.
+    """Return the directions of each test by their names.
 
-    Loads at rest and in flight: size, zero (at rest only) and slope over the span of the response, by load
-    place. Runs: a zero that all channels of a quantity share. The channel of an effect: the size of its
-    response by kind of trial and load place, and its drift.
+    Loads at rest and in flight: size, zero (at rest only) and slope over the span of the response,
+    by place of the load. Runs: a zero that all channels of a quantity share. The channel of an
+    effect: the size of its response by kind of trial and place of the load, and its drift.
     """
-    own = [channel for term in fit.candidate.terms if (channel := _own_channel(problem, term))]
-    found: dict[str, dict[str, dict[int, FloatArray]]] = {}
-    last = max(abs(data.trial.start) for data in problem.trials) or 1.0
+    collected = _DirectionGroups()
+    own_channels = _own_channels(problem, fit)
+    last_start = max(abs(data.trial.start) for data in problem.trials) or 1.0
     for number, data in enumerate(problem.trials):
-        trial, kind = data.trial, data.trial.kind
-
-        def add(group: str, label: str, column: FloatArray, number: int = number) -> None:
-            found.setdefault(group, {}).setdefault(label, {})[number] = column
-
         response = _response(problem, fit, number)
-        static = kind is TrialKind.STATIC
-        place = f"under load at {_place(data)}"
-        if static or kind is TrialKind.FLIGHT:
-            group, where = ("static loads", place) if static else ("loads of flight", "in flight")
-            add(group, f"the size {where}", response)
-            along = _along_span(problem, data)
-            if static:
-                zero = response[np.argmax(np.abs(trial.force))]
-                add(group, f"the zero {where}", np.broadcast_to(zero, response.shape))
-            if along is not None:
-                add(group, f"the slope over the span {where}", response * along)
-        quantities = [problem.campaign.channels[name].quantity for name in trial.channels]
-        for quantity in sorted(set(quantities)) if static else ():
-            columns = np.array([item is quantity for item in quantities]) * _scale(problem, quantity)
-            where = f"in run {trial.run}" if trial.run else "in the runs without a label"
-            label = f"the zero of {quantity.value} {where}"
-            add("zeros of the static runs", label, np.broadcast_to(columns, data.weight.shape))
-        for channel in own:
-            if channel in trial.channels:
-                column = np.array([name == channel for name in trial.channels])
-                drift = _scale(problem, problem.campaign.channels[channel].quantity) * trial.start / last
-                where = place if static else f"in the trials {kind.value}"
-                add(f"channel {channel}", f"the size {where}", response * column)
-                add(f"channel {channel}", "the zero over time", drift * np.ones(response.shape) * column)
-    return found
+        if data.trial.kind in (TrialKind.STATIC, TrialKind.FLIGHT):
+            _add_loads(collected, problem, number, response)
+        if data.trial.kind is TrialKind.STATIC:
+            _add_runs(collected, problem, number)
+        for channel in own_channels:
+            if channel in data.trial.channels:
+                _add_channel(collected, problem, number, channel, response, last_start)
+    return collected.groups
+
+
+def _add_loads(
+    collected: _DirectionGroups, problem: Problem, number: int, response: FloatArray
+) -> None:
+    """Add size, zero and slope over the span of the response (N, C) of a trial under load."""
+    data = problem.trials[number]
+    is_static = data.trial.kind is TrialKind.STATIC
+    group = "static loads" if is_static else "loads of flight"
+    where = _load_place(data) if is_static else "in flight"
+    collected.add(group, f"the size {where}", number, response)
+    if is_static:
+        zero = response[np.argmax(np.abs(data.trial.force))]
+        collected.add(group, f"the zero {where}", number, np.broadcast_to(zero, response.shape))
+    along_span = _along_span(problem, data)
+    if along_span is not None:
+        label = f"the slope over the span {where}"
+        collected.add(group, label, number, response * along_span)
+
+
+def _add_runs(collected: _DirectionGroups, problem: Problem, number: int) -> None:
+    """Add the zeros of a static trial's run that all channels of a quantity share."""
+    data = problem.trials[number]
+    trial = data.trial
+    quantities = [problem.campaign.channels[name].quantity for name in trial.channels]
+    where = f"in run {trial.run}" if trial.run else "in the runs without a label"
+    for quantity in sorted(set(quantities)):
+        is_quantity = np.array([other is quantity for other in quantities])
+        zero = is_quantity * _zero_scale(problem, quantity)
+        label = f"the zero of {quantity.value} {where}"
+        collected.add(
+            "zeros of the static runs", label, number, np.broadcast_to(zero, data.weight.shape)
+        )
+
+
+def _add_channel(
+    collected: _DirectionGroups,
+    problem: Problem,
+    number: int,
+    channel: str,
+    response: FloatArray,
+    last_start: float,
+) -> None:
+    """Add the size of an effect's channel in a trial, and its drift over the trials.
+
+    Parameters
+    ----------
+    collected : _DirectionGroups
+        The directions.
+    problem : Problem
+        The campaign and model.
+    number : int
+        The index of the trial.
+    channel : str
+        The channel of the effect.
+    response : (N, C) array
+        The response of the trial.
+    last_start : float
+        The start of the last trial [s].
+    """
+    data = problem.trials[number]
+    kind = data.trial.kind
+    is_channel = np.array([name == channel for name in data.trial.channels])
+    zero = _zero_scale(problem, problem.campaign.channels[channel].quantity)
+    where = f"in the trials {kind.value}"
+    if kind is TrialKind.STATIC:
+        where = _load_place(data)
+    group = f"channel {channel}"
+    collected.add(group, f"the size {where}", number, response * is_channel)
+    drift = zero * data.trial.start / last_start * np.ones(response.shape) * is_channel
+    collected.add(group, "the zero over time", number, drift)
 
 
 def _response(problem: Problem, fit: CandidateFit, number: int) -> FloatArray:
-    """Return what a trial's motion or load does to the readings (N, C)."""
-    trial, response = problem.trials[number].trial, fit.responses[number]
-    if trial.kind is TrialKind.STATIC:  # temperature and the offset of a run are no response to the load
+    """Return what the motion or load of a trial does to its readings (N, C)."""
+    trial = problem.trials[number].trial
+    response = fit.responses[number]
+    if trial.kind is TrialKind.STATIC:
+        # temperature and the offset of a run are no response to the load
         response = response - response[np.argmin(np.abs(trial.force))]
-    return np.asarray((1.0 + problem.shared.gains(fit.point.shared, trial.channels)) * response)
+    gains = problem.shared.gains(fit.point.shared, trial.channels)
+    return np.asarray((1.0 + gains) * response)
 
 
-def _scale(problem: Problem, quantity: Quantity) -> float:
-    """Return a size for zeros, the same in all trials, however noisy each was."""
-    channels = problem.campaign.channels.values()
-    return min(problem.noise[item.name].static_deviation for item in channels if item.quantity is quantity)
+def _zero_scale(problem: Problem, quantity: Quantity) -> float:
+    """Return the size of a zero of a quantity.
+
+    The least noise of its channels, the same in all trials.
+    """
+    deviations = []
+    for channel in problem.campaign.channels.values():
+        if channel.quantity is quantity:
+            deviations.append(problem.noise[channel.name].static_deviation)
+    return min(deviations)
 
 
-def _place(data: TrialData) -> str:
+def _load_place(data: TrialData) -> str:
+    """Return the place of a static load in words."""
     place = data.trial.load_place
-    return place if isinstance(place, str) else f"({place[0]:g}, {place[1]:g})"
+    name = place if isinstance(place, str) else f"({place[0]:g}, {place[1]:g})"
+    return f"under load at {name}"
 
 
 def _along_span(problem: Problem, data: TrialData) -> FloatArray | None:
-    """Return the station of each channel (C,) from their mean over their range; 0 where it is not known."""
+    """Return the station of each channel (C,) from their mean, over their range.
+
+    0 where it is not known.
+
+    None with too few stations.
+    """
     stations = [problem.campaign.channels[name].station for name in data.trial.channels]
-    known = np.array([np.nan if station is None else station for station in stations])
-    values = known[np.isfinite(known)]
-    if len(np.unique(values)) < LEAST_STATIONS:
+    values = np.array([np.nan if station is None else station for station in stations])
+    is_known = np.isfinite(values)
+    known = values[is_known]
+    if len(np.unique(known)) < LEAST_STATIONS:
         return None
-    return np.asarray(np.where(np.isfinite(known), (known - values.mean()) / np.ptp(values), 0.0))
+    return np.asarray(np.where(is_known, (values - known.mean()) / np.ptp(known), 0.0))
 
 
-def _own_channel(problem: Problem, term: Term) -> str:
-    """Return the channel that a term acts on if it is one alone, else nothing."""
+def _own_channels(problem: Problem, fit: CandidateFit) -> Sequence[str]:
+    """Return the channel of each effect of a fit that acts on one channel alone."""
+    channels = []
+    for term in fit.candidate.terms:
+        channel = _own_channel(problem, term)
+        if channel:
+            channels.append(channel)
+    return channels
+
+
+def _own_channel(problem: Problem, term: EffectTerm) -> str:
+    """Return the channel that a term acts on, if it acts on one channel alone.
+
+    Else an empty name.
+    """
     patch = term.patch(problem.setting, term.start() + 1.0)
-    channels = {getattr(item, "channel", "") for item in patch if isinstance(item, SENSORS)}
-    if len(channels) != 1 or not all(isinstance(item, SENSORS) for item in patch):
+    if not all(isinstance(primitive, SENSORS) for primitive in patch):
+        return ""
+    channels = {getattr(primitive, "channel", "") for primitive in patch}
+    if len(channels) != 1:
         return ""
     (channel,) = channels
     return channel if channel in problem.campaign.channels else ""

@@ -1,4 +1,4 @@
-"""Zeros and gains that a campaign calls exact, and that close the model's misfit when they are left free."""
+"""Zeros and gains that a campaign states as exact, but that close the misfit when they are free."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,112 +8,156 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
-from discrepancy.fits.beginnings import refitted_from_beginnings
+from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 
 LEAST_DROP = 16.0
-"""Least drop of a channel's sum of squares that a constant or a scale must promise: four deviations."""
+"""Least drop of a channel's sum of squares that a free zero or gain must promise: four
+deviations."""
 MOST_FITS = 3
-"""Channels that are left free one by one, the most promising first."""
+"""Number of channels that are set free one by one, the most promising first."""
 LEAST_SHARE = 0.9
-"""Least share of the misfit of all channels that is closed once it is fitted."""
+"""Least share of the misfit of all channels that a free zero or gain must close once it is
+fitted."""
 WIDE_GAIN = 1.0
 """Relative deviation that stands for a gain of which nothing is known."""
 
 
-class _Freedom(NamedTuple):
-    """A nuisance that a campaign may rule out: its key in `[[channel]]`, its name, and a wide deviation."""
+class _Nuisance(NamedTuple):
+    """A nuisance of a channel that a campaign may state to be exact.
+
+    Attributes
+    ----------
+    key : str
+        The key of its deviation in `[[channel]]`.
+    noun : str
+        Its name.
+    wide_deviation : float
+        The deviation with which it is free.
+    """
 
     key: str
     noun: str
-    wide: float
+    wide_deviation: float
 
 
-_ZERO = _Freedom("offset_deviation", "zero", inf)
-_GAIN = _Freedom("gain_deviation", "gain", WIDE_GAIN)
+_ZERO = _Nuisance("offset_deviation", "zero", inf)
+_GAIN = _Nuisance("gain_deviation", "gain", WIDE_GAIN)
 
 
-def exact_sensor_remarks(problem: Problem, none: CandidateFit) -> list[str]:
-    """Return a sentence for each exact zero, else gain, that explains what the model leaves.
+def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]:
+    """Return a sentence for each zero or gain that the campaign wrongly states as exact.
 
-    Those of which a constant or a scale promises most by its first step are left free and fitted, one by one
-    and then together; the promise alone would not tell, for other unknowns hide it. They are told where that
-    closes nine tenths of the misfit of all channels.
+    Such a zero or gain explains what the model leaves. The channels whose zero (or gain) promises
+    most by its first step are set free and fitted, one by one and then together; the promise alone
+    would not decide, as other unknowns hide it. They are reported where that closes nine tenths of
+    the misfit of all channels.
 
     Parameters
     ----------
     problem : Problem
         The campaign and the model.
-    none : CandidateFit
-        The model without any effect, fitted to it.
+    no_effect : CandidateFit
+        The fit of the model without any effect.
     """
-    for freedom in (_ZERO, _GAIN):
-        promises = {name: _promised_drop(problem, none, name, freedom) for name in problem.channel_names}
-        promising = sorted((name for name in promises if promises[name] > 0.0), key=promises.__getitem__)
-        alone = [[name] for name in promising[::-1][:MOST_FITS]]
-        together = [promising] if len(promising) > 1 else []
-        for names in (*alone, *together):
-            share = _closed_share(problem, none, names, freedom)
+    for nuisance in (_ZERO, _GAIN):
+        drops: dict[str, float] = {}
+        for name in problem.channel_names:
+            drop = _promised_drop(problem, no_effect, name, nuisance)
+            if drop > 0.0:
+                drops[name] = drop
+        promising = sorted(drops, key=lambda name: drops[name])
+        sets_of_channels = [[name] for name in promising[::-1][:MOST_FITS]]
+        if len(promising) > 1:
+            sets_of_channels.append(promising)
+        for names in sets_of_channels:
+            share = _closed_share(problem, no_effect, names, nuisance)
             if share >= LEAST_SHARE:
-                return [_sentence(name, freedom, share) for name in names]
+                return [_remark(name, nuisance, share) for name in names]
     return []
 
 
-def _sentence(name: str, freedom: _Freedom, share: float) -> str:
+def _remark(name: str, nuisance: _Nuisance, share: float) -> str:
+    """Return the sentence on a channel whose exact zero or gain explains a share of the misfit."""
     return (
-        f"The {freedom.noun} of the channel {name!r} is exact in the campaign; give `{freedom.key}`: left "
-        f"free, it closes {100.0 * share:.0f} % of the misfit of the model without any effect."
+        f"The {nuisance.noun} of the channel {name!r} is exact in the campaign; give "
+        f"`{nuisance.key}`: left free, it closes {100.0 * share:.0f} % of the misfit of the model "
+        "without any effect."
     )
 
 
-def _promised_drop(problem: Problem, none: CandidateFit, name: str, freedom: _Freedom) -> float:
-    """Return the drop of a sum of squares that a free zero or gain promises.
+def _promised_drop(
+    problem: Problem, no_effect: CandidateFit, name: str, nuisance: _Nuisance
+) -> float:
+    """Return the drop of a channel's sum of squares that a free zero or gain promises.
 
-    Zero where it is not worth a fit, the campaign does not call it exact, or nobody knows its noise.
+    It is 0 where a fit is not worth it, the campaign does not state it as exact, or the noise of
+    the channel is not known.
     """
     channel = problem.campaign.channels[name]
-    if channel.noise is None or getattr(channel, freedom.key) != 0.0:
+    if channel.noise is None or getattr(channel, nuisance.key) != 0.0:
         return 0.0
-    residuals, directions = _of_channel(problem, none, name, freedom)
-    sizes = [float(direction @ direction) for direction in directions]
-    slopes = [float(r @ direction) for r, direction in zip(residuals, directions, strict=True)]
-    if freedom is _GAIN:  # one of all trials, while each trial has its own zero
-        sizes, slopes = [sum(sizes)], [sum(slopes)]
-    drop = sum(slope**2 / size for slope, size in zip(slopes, sizes, strict=True) if size > 0.0)
+    squared_lengths = []
+    slopes = []
+    for residual, derivative in _channel_derivatives(problem, no_effect, name, nuisance):
+        squared_lengths.append(float(derivative @ derivative))
+        slopes.append(float(residual @ derivative))
+    if nuisance is _GAIN:  # all trials have the same gain, while each has its own zero
+        squared_lengths = [sum(squared_lengths)]
+        slopes = [sum(slopes)]
+    drop = 0.0
+    for slope, squared_length in zip(slopes, squared_lengths, strict=True):
+        if squared_length > 0.0:
+            drop += slope**2 / squared_length
     return drop if drop > LEAST_DROP else 0.0
 
 
-def _of_channel(
-    problem: Problem, none: CandidateFit, name: str, freedom: _Freedom
-) -> tuple[list[FloatArray], list[FloatArray]]:
-    """Return the residuals of a channel in each trial that has it, and their slopes by its zero or gain."""
-    residuals: list[FloatArray] = []
-    directions: list[FloatArray] = []
+class _ChannelDerivative(NamedTuple):
+    """The residual (N,) of a channel in a trial, and its derivative (N,) by the zero or gain."""
+
+    residual: FloatArray
+    derivative: FloatArray
+
+
+def _channel_derivatives(
+    problem: Problem, no_effect: CandidateFit, name: str, nuisance: _Nuisance
+) -> list[_ChannelDerivative]:
+    """Return residual and derivative by a channel's zero or gain, for each trial that has it."""
+    derivatives = []
     for number, data in enumerate(problem.trials):
         if name not in data.trial.channels:
             continue
         column = data.trial.channels.index(name)
-        response = problem.answer(number, none.point, none.candidate)
-        by_unknown = np.ones_like(response) if freedom is _ZERO else response
-        residuals.append(none.residuals[number][:, column])
-        directions.append(data.standardised(by_unknown)[:, column])
-    return residuals, directions
+        response = problem.response_with(number, no_effect.point, no_effect.candidate)
+        by_nuisance = np.ones_like(response) if nuisance is _ZERO else response
+        derivatives.append(
+            _ChannelDerivative(
+                residual=no_effect.residuals[number][:, column],
+                derivative=data.standardised(by_nuisance)[:, column],
+            )
+        )
+    return derivatives
 
 
-def _closed_share(problem: Problem, none: CandidateFit, names: Sequence[str], freedom: _Freedom) -> float:
-    """Return the share of the misfit of the model that closes when zeros or gains are free."""
+def _closed_share(
+    problem: Problem, no_effect: CandidateFit, names: Sequence[str], nuisance: _Nuisance
+) -> float:
+    """Return the share of the misfit that closes when the zeros or gains of channels are free."""
     channels = dict(problem.campaign.channels)
     for name in names:
-        if freedom is _ZERO:
-            channels[name] = replace(channels[name], offset_deviation=freedom.wide)
+        if nuisance is _ZERO:
+            channels[name] = replace(channels[name], offset_deviation=nuisance.wide_deviation)
         else:
-            channels[name] = replace(channels[name], gain_deviation=freedom.wide)
+            channels[name] = replace(channels[name], gain_deviation=nuisance.wide_deviation)
     campaign = replace(problem.campaign, channels=channels)
-    free = Problem(campaign, problem.model, replace(problem.setting, campaign=campaign))
-    start = fit(free, Candidate(), free.start(Candidate()))
-    free_fit = refitted_from_beginnings(free, start)
+    setting = replace(problem.setting, campaign=campaign)
+    free_problem = Problem(campaign, problem.model, setting)
+    free_fit = fit(free_problem, Candidate(), free_problem.start(Candidate()))
+    free_fit = refit_from_first_readings(free_problem, free_fit)
     count = float(problem.counts.sum())
-    misfit = none.chi_square - count
-    return 1.0 - max(free_fit.chi_square - count, 0.0) / misfit if misfit > 0.0 else 0.0
+    misfit = no_effect.chi_square - count
+    if misfit <= 0.0:
+        return 0.0
+    return 1.0 - max(free_fit.chi_square - count, 0.0) / misfit

@@ -1,327 +1,566 @@
-"""Verdicts where no simulation leaves noise alone: named in part, a group, unexplained.
+"""Verdicts where no simulation leaves noise alone: named in part, a group, or unexplained.
 
-A set of effects is named in part that is probable and is most of what is missing, in the trials that were
-fitted and in those that were not, with what was calibrated within twice its prior deviations. Hypotheses are
-compared along the missing force where one can be seen, else by whole simulations under what they leave.
+A set of effects is named in part if it is probable and explains most of the gap, in the trials that
+were fitted and in those held out, with calibrated values within twice their prior deviations.
+Hypotheses are compared by the missing force where it can be seen, else by simulations under the
+noise that they leave.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.special import logsumexp
 
-from discrepancy.errors import said
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
-from discrepancy.search.honest_evidence import weigh_with_remainders
 from discrepancy.search.strategy import Search
+from discrepancy.search.wide_noise import compare_under_wide_noise
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import RemainderEstimate, Verdict, VerdictKind
+from discrepancy.verdict import Gate, NamedEffect, RemainderEstimate, Verdict, VerdictKind
 from reporting.words import capital, listing
 
 from .closed_share import share_text, trials_text
+from .comparison import (
+    Comparison,
+    ForceComparison,
+    H,
+    SimulationComparison,
+    effects_at_places,
+    families_at_places,
+)
 from .conclusion import (
     UNSTATED_GAIN,
     Conclusion,
-    Hypothetic,
-    Outcome,
-    below_limit,
+    VerdictOutcome,
+    WeightedHypothesis,
+    below_limit_sentence,
     effects_text,
-    is_one_driven_channel,
+    has_one_driven_channel,
     is_small,
     named_effects,
     plain_names,
     probability_text,
 )
-from .consistency_gate import consistency_gate
-from .court import ByForce, Court, families, names
-from .proof import held_out_gate
+from .consistency_gate import check_consistency
+from .proof import check_held_out
 
-LEAST_SHOWN = 0.1
-"""Share of what is missing from which a hypothesis is shown as the best one where none is named."""
+LEAST_MENTIONED = 0.1
+"""Share of the gap from which on a hypothesis is mentioned as the best one where none is named."""
 
 
-def judged_in_part(found: Search, first: Verdict) -> Outcome:
-    """Return the verdict where what the best simulation leaves is not the recorded noise.
+def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
+    """Return the verdict where the best simulation leaves more than the recorded noise.
 
     Parameters
     ----------
-    found : Search
-        All candidates as fitted to recorded noise, and hypotheses along the missing force if it is seen.
+    search : Search
+        All candidates as fitted to the recorded noise, and hypotheses along the missing force if it
+        is seen.
     first : Verdict
-        What the simulations led to.
+        The verdict that the simulations led to.
 
     Returns
     -------
-    Outcome
-        As `naming.name` returns it; the fit is that of the best hypothesis for an unexplained gap too.
+    VerdictOutcome
+        The verdict; its fit is that of the best hypothesis for an unexplained gap, too.
     """
-    if found.force is not None and found.forces:
-        return _verdict_of(ByForce(found, found.force), first)
-    weigh_with_remainders(found)
-    court = Court(found)
-    coloured = _beside_coloured_noise(court)
-    if coloured is not None:
-        return coloured
-    court.add_families()
-    return _verdict_of(court, first)
+    if search.force_search is not None and search.force_hypotheses:
+        return _verdict_by_comparison(ForceComparison(search, search.force_search), first)
+    compare_under_wide_noise(search)
+    comparison = SimulationComparison(search)
+    outcome = _outcome_under_coloured_noise(comparison)
+    if outcome is not None:
+        return outcome
+    comparison.add_families()
+    return _verdict_by_comparison(comparison, first)
 
 
-def nearly_all_by_laws(found: Search, first: Verdict) -> Outcome | None:
-    """Return the verdict that names laws in part that are nearly all of the missing force; None: none are.
+def verdict_by_laws_alone(search: Search, first: Verdict) -> VerdictOutcome | None:
+    """Return the verdict that names laws in part which explain nearly all of the missing force.
 
     Parameters
     ----------
-    found, first
-        As of `judged_in_part`; hypotheses along the missing force are there.
+    search : Search
+        The search, with hypotheses along the missing force.
+    first : Verdict
+        The verdict that the simulations led to.
+
+    Returns
+    -------
+    VerdictOutcome or None
+        None if there are no such laws.
     """
-    assert found.force is not None
-    court = ByForce(found, found.force)
-    outcome = _verdict_of(court, first)
-    if outcome.verdict.kind is not VerdictKind.NAMED_IN_PART or court.standing is None:
+    assert search.force_search is not None
+    comparison = ForceComparison(search, search.force_search)
+    outcome = _verdict_by_comparison(comparison, first)
+    if outcome.verdict.kind is not VerdictKind.NAMED_IN_PART or comparison.standing is None:
         return None
-    return outcome if court.told(court.standing).value > SEARCH.nearly_all else None
+    share = comparison.decisive_share(comparison.standing)
+    return outcome if share.value > SEARCH.nearly_all else None
 
 
-def without_sliver(found: Search, first: Verdict, fit: CandidateFit) -> Outcome:
-    """Return the verdict on a set that was named, one of whose effects may explain next to nothing.
+def without_negligible_effect(search: Search, first: Verdict, fit: CandidateFit) -> VerdictOutcome:
+    """Return the verdict on a named set of effects, one of which may explain next to nothing.
 
-    Where what is left is nearly noise, such an effect stands for what is left as well as wider noise does. It
-    stays if the evidence of the whole set is above that of the set without it by far.
+    Where a fit leaves nearly noise, a wider noise explains that as well as such an effect does. The
+    effect stays if the evidence of the whole set is far above that of the set without it.
 
     Parameters
     ----------
-    found, first
-        As of `judged_in_part`.
+    search : Search
+        All candidates as fitted to the recorded noise.
+    first : Verdict
+        The verdict that names the set.
     fit : CandidateFit
-        Of the set that was named.
+        The fit of the set.
     """
-    court, problem = Court(found), found.problem
-    one_channel = is_one_driven_channel(problem)
-    patches = fit.candidate.patches(problem.setting, fit.effect)
-    kept = {
-        (term.label, term.place) for term, patch in zip(fit.candidate.terms, patches, strict=True)
-        if not is_small(problem, patch, unstated=UNSTATED_GAIN) and (court.acts(term) or not one_channel)
-    }  # fmt: skip
-    whole_key, share = set(fit.candidate.key), court.told(fit).value
-    less = [item for key, item in found.exact.items() if key and set(key) < whole_key]
-    if kept == whole_key and not any(court.told(item).value > share - SEARCH.sliver for item in less):
-        return Outcome(first, found, fit)
-    weigh_with_remainders(found)
-    whole = found.judged.get(fit.candidate.key, fit)
-    for item in sorted(found.judged.values(), key=lambda one: len(one.candidate.terms)):
-        own = set(item.candidate.key)
-        if not own or not own < whole_key or court.told(item).value < share - SEARCH.sliver:
+    comparison = SimulationComparison(search)
+    whole_key = set(fit.candidate.key)
+    notable_key = _key_of_notable_terms(comparison, fit)
+    least_share = comparison.decisive_share(fit).value - SEARCH.sliver
+    is_each_notable = notable_key == whole_key
+    if is_each_notable and not _has_equal_subset(comparison, whole_key, least_share):
+        return VerdictOutcome(first, search, fit)
+    compare_under_wide_noise(search)
+    whole = search.wide_fits.get(fit.candidate.key, fit)
+    for subset in sorted(search.wide_fits.values(), key=lambda fit: len(fit.candidate.terms)):
+        key = set(subset.candidate.key)
+        if not key or not key < whole_key:
             continue
-        if own == kept or found.score(item) > found.score(whole) - SEARCH.sliver_gain:
-            probability = court.probability(item)
-            if court.against(item) or probability < SEARCH.sure:
-                return _unexplained(court, first, item)
-            return _in_part(court, item, probability)
-    found.judged = {}
-    return Outcome(first, found, fit)
+        if comparison.decisive_share(subset).value < least_share:
+            continue
+        least_score = search.score(whole) - SEARCH.sliver_gain
+        if key == notable_key or search.score(subset) > least_score:
+            probability = comparison.probability(subset)
+            if comparison.objection(subset) or probability < SEARCH.sure:
+                return _unexplained(comparison, first, subset)
+            return _named_in_part(comparison, subset, probability)
+    search.wide_fits = {}
+    return VerdictOutcome(first, search, fit)
 
 
-def _beside_coloured_noise(court: Court) -> Outcome | None:
-    """Return the verdict where all that is left is the colour of the noise, as its records have it."""
-    problem, found = court.problem, court.found
-    nothing, best = found.nothing, found.best()
-    probabilities = found.set_probabilities()
-    told = Conclusion.of(found, best, probabilities)
-    gate, p_none = absolute_gate(problem, nothing), probabilities.get((), 0.0)
-    if p_none > 1.0 - SEARCH.sure and gate.passed is not False and _is_coloured(nothing):
-        more: dict[str, Any] = {"gates": (gate,), "remainders": remainder_estimates(problem, nothing)}
-        if p_none >= SEARCH.unsure:
-            sentence = said("verdict.coloured_noise")
-            return told.outcome(VerdictKind.NOTHING_MISSING, sentence, p_none, nothing, **more)
-        hints = sorted(name for name, p in told.inclusion.items() if p > 1.0 - SEARCH.sure)
-        total = min(p_none + sum(told.inclusion[name] for name in hints), 1.0)
-        sentence, more["group"] = below_limit(hints, " that is coloured"), tuple(hints)
-        return told.outcome(VerdictKind.BELOW_LIMIT, sentence, total, nothing, **more)
-    if not best.candidate.terms or best.candidate.is_family or not _is_coloured(best):
+def _has_equal_subset(
+    comparison: SimulationComparison, whole_key: set[tuple[str, str]], least_share: float
+) -> bool:
+    """Return whether a subset of a set of effects explains at least some share of the gap."""
+    for key, subset in comparison.search.exact_fits.items():
+        is_subset = bool(key) and set(key) < whole_key
+        if is_subset and comparison.decisive_share(subset).value > least_share:
+            return True
+    return False
+
+
+def _key_of_notable_terms(
+    comparison: SimulationComparison, fit: CandidateFit
+) -> set[tuple[str, str]]:
+    """Return labels and places of the effects of a fit that may be a name beside the others.
+
+    Errors of instruments that are too small may not, and with one driven channel no error of
+    readings.
+    """
+    problem = comparison.problem
+    one_channel = has_one_driven_channel(problem)
+    patches = fit.candidate.patches(problem.setting, fit.effect)
+    notable = set()
+    for term, patch in zip(fit.candidate.terms, patches, strict=True):
+        if is_small(problem, patch, unstated=UNSTATED_GAIN):
+            continue
+        if comparison.acts_on_structure(term) or not one_channel:
+            notable.add((term.label, term.place))
+    return notable
+
+
+# ---------------------------------------------------------------- noise that is coloured
+
+
+def _outcome_under_coloured_noise(comparison: SimulationComparison) -> VerdictOutcome | None:
+    """Return the verdict where a fit leaves noise of the colour of its records, and nothing else.
+
+    None where no hypothesis does.
+    """
+    problem = comparison.problem
+    search = comparison.search
+    best = search.best()
+    no_effect = search.compared_no_effect
+    probabilities = search.set_probabilities()
+    conclusion = Conclusion.from_probabilities(search, best, probabilities)
+    no_effect_gate = check_absolute_fit(problem, no_effect)
+    probability_of_none = probabilities.get((), 0.0)
+    is_possible = probability_of_none > 1.0 - SEARCH.sure
+    if is_possible and no_effect_gate.passed is not False and _leaves_recorded_colour(no_effect):
+        return _nothing_under_coloured_noise(
+            conclusion, no_effect, no_effect_gate, probability_of_none
+        )
+    if not best.candidate.terms or best.candidate.is_family or not _leaves_recorded_colour(best):
         return None
-    probability = court.probability(best)
-    held_out = held_out_gate(court.residuals(replace(best, remainder=None)))
-    gates = (absolute_gate(problem, best), consistency_gate(problem, best), held_out)
+    probability = comparison.probability(best)
+    held_out_residuals = comparison.residuals(replace(best, residual_process=None))
+    gates = (
+        check_absolute_fit(problem, best),
+        check_consistency(problem, best),
+        check_held_out(held_out_residuals),
+    )
     if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
         return None
-    return told.named(best, probability, gates, remainders=remainder_estimates(problem, best))
+    return conclusion.named(best, probability, gates, remainder_estimates(problem, best))
 
 
-def _is_coloured(item: CandidateFit) -> bool:
-    return item.remainder is not None and item.remainder.is_noise
-
-
-def _verdict_of(court: Court, first: Verdict) -> Outcome:
-    """Return the verdict of a court."""
-    if not court.contenders:
-        return _unexplained(court, first)
-    best = court.slimmed(court.contenders[0])
-    members = [best, *court.rivals(best)]
-    if len(members) > SEARCH.largest_group:
-        return _unexplained(court, first, best, said("against.rivals", rivals=len(members) - 1))
-    if court.grew(best):
-        return _unexplained(court, first, best)
-    probability = court.probability(*members)
-    if probability < SEARCH.sure:
-        return _unexplained(court, first, best)
-    log_bayes_factor = best.log_evidence - court.nothing.log_evidence
-    if log_bayes_factor < SEARCH.bayes_factor:
-        return _unexplained(court, first, best, _too_little_evidence(log_bayes_factor))
-    if len(members) > 1:
-        if all(map(court.passes_absolute_fit, members)):
-            return _group(court, members, probability)
-        others = listing([effects_text(named_effects(court.problem, item)) for item in members[1:]], "or")
-        why = f"it leaves more than noise, and these data do not tell it from {others}"
-        return _unexplained(court, first, best, why)
-    return _in_part(court, best, probability)
-
-
-def _too_little_evidence(log_bayes_factor: float) -> str:
-    """Return why a hypothesis is no name that explains little more than a force without any law does."""
-    return (
-        "a missing force without any law explains the readings as well "
-        f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs {SEARCH.bayes_factor:g})"
+def _nothing_under_coloured_noise(
+    conclusion: Conclusion, no_effect: CandidateFit, gate: Gate, probability_of_none: float
+) -> VerdictOutcome:
+    """Return the verdict that nothing is missing under coloured noise, or too little to tell."""
+    remainders = remainder_estimates(conclusion.search.problem, no_effect)
+    if probability_of_none >= SEARCH.unsure:
+        return conclusion.outcome(
+            VerdictKind.NOTHING_MISSING,
+            "The model explains the data within their noise, which is coloured as its records "
+            "admit.",
+            probability_of_none,
+            no_effect,
+            gates=(gate,),
+            remainders=remainders,
+        )
+    hints = []
+    for name, probability in conclusion.inclusion.items():
+        if probability > 1.0 - SEARCH.sure:
+            hints.append(name)
+    hints.sort()
+    total = min(probability_of_none + sum(conclusion.inclusion[name] for name in hints), 1.0)
+    return conclusion.outcome(
+        VerdictKind.BELOW_LIMIT,
+        below_limit_sentence(hints, " that is coloured"),
+        total,
+        no_effect,
+        group=tuple(hints),
+        gates=(gate,),
+        remainders=remainders,
     )
 
 
-def _in_part(court: Court, best: Hypothetic, probability: float) -> Outcome:
+def _leaves_recorded_colour(fit: CandidateFit) -> bool:
+    """Return whether a fit leaves noise of the colour of its records, and nothing else."""
+    process = fit.residual_process
+    return process is not None and process.is_all_recorded_colour
+
+
+# ---------------------------------------------------------------- verdicts of a comparison
+
+
+def _verdict_by_comparison(comparison: Comparison[H], first: Verdict) -> VerdictOutcome:
+    """Return the verdict that a comparison of hypotheses leads to.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The hypotheses.
+    first : Verdict
+        The verdict that the simulations led to, which says how they failed.
+    """
+    if not comparison.contenders:
+        return _unexplained(comparison, first)
+    best = comparison.simplest_equivalent(comparison.contenders[0])
+    members = [best, *comparison.competitors(best)]
+    others = len(members) - 1
+    if len(members) > SEARCH.largest_group:
+        reason = f"{others} others are as much of it: that tells nothing"
+        return _unexplained(comparison, first, best, reason)
+    if comparison.enlarges_error(best):
+        return _unexplained(comparison, first, best)
+    probability = comparison.probability(*members)
+    if probability < SEARCH.sure:
+        return _unexplained(comparison, first, best)
+    log_bayes_factor = best.log_evidence - comparison.no_effect.log_evidence
+    if log_bayes_factor < SEARCH.bayes_factor:
+        reason = (
+            "a missing force without any law explains the readings as well "
+            f"(ln Bayes factor {log_bayes_factor:.3g}; a name needs {SEARCH.bayes_factor:g})"
+        )
+        return _unexplained(comparison, first, best, reason)
+    if others == 0:
+        return _named_in_part(comparison, best, probability)
+    if all(comparison.passes_absolute_fit(member) for member in members):
+        return _group(comparison, members, probability)
+    names = [effects_text(named_effects(comparison.problem, member)) for member in members[1:]]
+    reason = f"it leaves more than noise, and these data do not tell it from {listing(names, 'or')}"
+    return _unexplained(comparison, first, best, reason)
+
+
+def _named_in_part(comparison: Comparison[H], best: H, probability: float) -> VerdictOutcome:
     """Return the verdict that names a hypothesis in part."""
-    effects, share = named_effects(court.problem, best), court.told(best)
-    family = ", ".join(sorted({t.effect.family for t in best.candidate.terms if t.free_shape}))
-    named = effects_text(effect for effect in effects if not effect.shape)
-    what = listing(filter(None, (named, said("verdict.family_in_part", family=family) if family else "")))
-    _, explains = court.closed(best)
-    sentence = f"{capital(what)} is missing (probability {probability_text(probability)}): {explains}."
-    if court.has_held_out and not share.held_out:
+    effects = named_effects(comparison.problem, best)
+    share = comparison.decisive_share(best)
+    families = {term.effect.family for term in best.candidate.terms if term.free_shape}
+    family = ", ".join(sorted(families))
+    parts = []
+    canonical = effects_text(effect for effect in effects if not effect.shape)
+    if canonical:
+        parts.append(canonical)
+    if family:
+        parts.append(f"an effect of the family {family}, with a shape of its own,")
+    _, explains = comparison.closed_share(best)
+    sentence = (
+        f"{capital(listing(parts))} is missing (probability {probability_text(probability)}): "
+        f"{explains}."
+    )
+    if comparison.has_held_out and not share.held_out:
         sentence += " In the trials held out it has hardly any force."
-    sentence += f" It leaves {court.left(best, share)}, which is unexplained."
-    sentence += _shape(court, best) + _not_proved(court, best)
-    more = {"effects": effects, "family": family, "gates": (court.gate(best),)}
-    return _outcome(court, VerdictKind.NAMED_IN_PART, sentence, probability, best, [best], **more)
+    sentence += f" It leaves {comparison.remaining_text(best, share)}, which is unexplained."
+    sentence += _shape_sentence(comparison, best)
+    sentence += _unproved_addition_sentence(comparison, best)
+    return _outcome(
+        comparison,
+        VerdictKind.NAMED_IN_PART,
+        sentence,
+        probability,
+        standing=best,
+        members=[best],
+        effects=effects,
+        family=family,
+        gates=(comparison.check_fit(best),),
+    )
 
 
-def _group(court: Court, members: Sequence[Hypothetic], probability: float) -> Outcome:
-    """Return the verdict that one of several hypotheses is what is missing, what they share first."""
-    effects = [named_effects(court.problem, item) for item in members]
-    rows = zip(members, effects, strict=True)
-    words = [f"{effects_text(own)}{_share_in_brackets(court, item)}" for item, own in rows]
-    sentence = f"Either {listing(words, 'or')} is missing; these data cannot tell which."
-    closed, reason = court.closed(members[0])
+def _group(comparison: Comparison[H], members: Sequence[H], probability: float) -> VerdictOutcome:
+    """Return the verdict that one of several hypotheses is what is missing.
+
+    What all of them share is stated first.
+    """
+    effects_by_member = [named_effects(comparison.problem, member) for member in members]
+    texts = []
+    for member, effects in zip(members, effects_by_member, strict=True):
+        closed, _ = comparison.closed_share(member)
+        in_brackets = "" if closed is None else f" ({share_text(closed)})"
+        texts.append(f"{effects_text(effects)}{in_brackets}")
+    sentence = f"Either {listing(texts, 'or')} is missing; these data cannot tell which."
+    closed, reason = comparison.closed_share(members[0])
     if closed is None:
         sentence += f" {capital(reason)}."
     else:
         sentence += (
-            f" In brackets the share of the mean square error that each explains in {trials_text(closed)}."
+            " In brackets the share of the mean square error that each explains in "
+            f"{trials_text(closed)}."
         )
-    common = frozenset.intersection(*map(names, members))
-    both = [effect for effect in effects[0] if (effect.identifier, effect.place) in common]
-    if both:
-        sentence = f"{capital(effects_text(both))} is missing. {sentence}"
-    more = {
-        "effects": tuple(effect for own in effects for effect in own),
-        "group": tuple(" + ".join(sorted(plain_names(item.candidate.identifiers))) for item in members),
-        "gates": (court.gate(members[0]),),
-    }
-    return _outcome(court, VerdictKind.GROUP, sentence, min(probability, 1.0), members[0], members, **more)
-
-
-def _share_in_brackets(court: Court, item: Hypothetic) -> str:
-    """Return the share of the mean square error that a member of a group takes away; empty: none is told."""
-    closed, _ = court.closed(item)
-    return "" if closed is None else f" ({share_text(closed)})"
-
-
-def _unexplained(court: Court, first: Verdict, close: Hypothetic | None = None, why: str = "") -> Outcome:
-    """Return the verdict that a force is missing which has no name: how large, and what orders it.
-
-    `close`: what has a probability that is too small for a name, unless something else speaks against it.
-    """
-    failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
-    gap = f"{said('verdict.no_effect_fits', reason=failed).strip()} {court.gap()}".strip()
-    effective = [item for item in court.ranked if item.candidate.terms]
-    shown = close or max(effective, key=lambda item: court.told(item).value, default=None)
-    if shown is None or court.told(shown).value < LEAST_SHOWN:
-        shown, sentence = None, f"{gap} No effect of the catalogue follows it."
-    elif court.grew(shown):
-        sentence = f"{gap} {_worse(court, shown)}"
-        shown = None
-    else:
-        why = why or court.against(shown)
-        if close is not None and not why:
-            why = said("against.probability", probability=court.probability(close), sure=SEARCH.sure)
-        why = f"; it is no name, as {why}" if why else ""
-        what, (_, explains) = effects_text(named_effects(court.problem, shown)), court.closed(shown)
-        sentence = f"{gap} The best hypothesis is {what}: {explains}{why}."
-    more = {
-        "resembles": () if shown is None else plain_names(shown.candidate.identifiers), "gates": first.gates,
-    }  # fmt: skip
-    return _outcome(court, VerdictKind.UNEXPLAINED, sentence, first.probability, shown, [], **more)
-
-
-def _worse(court: Court, item: Hypothetic) -> str:
-    """Return the sentence on a hypothesis that makes the error larger, and is no name for that reason."""
-    what = effects_text(named_effects(court.problem, item))
-    if court.simulated(item) is court.found.none:
-        return f"The nearest in the catalogue is {what}, but it cannot be simulated: nothing is named."
-    _, words = court.closed(item)
-    return (
-        f"The nearest in the catalogue is {what}, but {words}: nothing is named, and nothing to be applied."
+    common = frozenset.intersection(*(effects_at_places(member) for member in members))
+    common_effects = []
+    for effect in effects_by_member[0]:
+        if (effect.identifier, effect.place) in common:
+            common_effects.append(effect)
+    if common_effects:
+        sentence = f"{capital(effects_text(common_effects))} is missing. {sentence}"
+    all_effects: list[NamedEffect] = []
+    for effects in effects_by_member:
+        all_effects.extend(effects)
+    group = []
+    for member in members:
+        group.append(" + ".join(sorted(plain_names(member.candidate.identifiers))))
+    return _outcome(
+        comparison,
+        VerdictKind.GROUP,
+        sentence,
+        min(probability, 1.0),
+        standing=members[0],
+        members=members,
+        effects=tuple(all_effects),
+        group=tuple(group),
+        gates=(comparison.check_fit(members[0]),),
     )
 
 
+def _unexplained(
+    comparison: Comparison[H], first: Verdict, nearest: H | None = None, reason: str = ""
+) -> VerdictOutcome:
+    """Return the verdict that there is a gap without a name, and what comes nearest to one.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The hypotheses.
+    first : Verdict
+        The verdict that the simulations led to.
+    nearest : H, optional
+        The hypothesis that comes nearest to a name.
+    reason : str
+        Why it is no name; what objects to it if left out, or else its probability.
+    """
+    failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
+    gap = f"There is a gap that no effect of the catalogue fits. {failed}".strip()
+    gap = f"{gap} {comparison.gap_sentence()}".strip()
+    mentioned = nearest
+    if mentioned is None:
+        with_effects = [other for other in comparison.ranked if other.candidate.terms]
+        mentioned = max(
+            with_effects, key=lambda other: comparison.decisive_share(other).value, default=None
+        )
+    if mentioned is None or comparison.decisive_share(mentioned).value < LEAST_MENTIONED:
+        mentioned = None
+        sentence = f"{gap} No effect of the catalogue follows it."
+    elif comparison.enlarges_error(mentioned):
+        sentence = f"{gap} {_larger_error_sentence(comparison, mentioned)}"
+        mentioned = None
+    else:
+        reason = reason or comparison.objection(mentioned)
+        if nearest is not None and not reason:
+            probability = comparison.probability(nearest)
+            reason = f"its probability is {probability:.2g}: a name needs {SEARCH.sure:g}"
+        clause = f"; it is no name, as {reason}" if reason else ""
+        effects = effects_text(named_effects(comparison.problem, mentioned))
+        _, explains = comparison.closed_share(mentioned)
+        sentence = f"{gap} The best hypothesis is {effects}: {explains}{clause}."
+    resembles = () if mentioned is None else plain_names(mentioned.candidate.identifiers)
+    return _outcome(
+        comparison,
+        VerdictKind.UNEXPLAINED,
+        sentence,
+        first.probability,
+        standing=mentioned,
+        members=[],
+        resembles=resembles,
+        gates=first.gates,
+    )
+
+
+def _larger_error_sentence(comparison: Comparison[H], hypothesis: H) -> str:
+    """Return the sentence on a hypothesis that is no name because it makes the error larger."""
+    effects = effects_text(named_effects(comparison.problem, hypothesis))
+    nearest = f"The nearest in the catalogue is {effects}, but"
+    if comparison.simulation(hypothesis) is comparison.search.no_effect:
+        return f"{nearest} it cannot be simulated: nothing is named."
+    _, enlarges = comparison.closed_share(hypothesis)
+    return f"{nearest} {enlarges}: nothing is named, and nothing to be applied."
+
+
 def _outcome(
-    court: Court, kind: VerdictKind, sentence: str, probability: float, stands: Hypothetic | None,
-    first: Sequence[Hypothetic], **more: Any,
-) -> Outcome:  # fmt: skip
-    """Return a verdict with all hypotheses, some of them `first`, and the one that stands for it."""
-    ranked = [*first, *(item for item in court.ranked if not any(item is one for one in first))]
-    scores = np.array([court.score(item) for item in ranked])
-    weights = np.exp(scores - logsumexp(scores)).tolist()
-    rows = [*zip(ranked, weights, strict=True)]
-    rows = rows[: len(first)] + sorted(rows[len(first) :], key=lambda row: -row[1])
-    fit = court.found.none if stands is None else court.simulated(stands)
-    court.standing = stands
-    gain = (stands or ranked[0]).log_evidence - court.nothing.log_evidence
-    more["remainders"] = remainder_estimates(court.problem, fit)
-    return Conclusion(court.found, gain, rows).outcome(kind, sentence, probability, fit, **more)
+    comparison: Comparison[H],
+    kind: VerdictKind,
+    sentence: str,
+    probability: float,
+    *,
+    standing: H | None,
+    members: Sequence[H],
+    effects: tuple[NamedEffect, ...] = (),
+    group: tuple[str, ...] = (),
+    family: str = "",
+    gates: tuple[Gate, ...] = (),
+    resembles: tuple[str, ...] = (),
+) -> VerdictOutcome:
+    """Return a verdict that lists all hypotheses.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The hypotheses.
+    kind, sentence, probability
+        What is concluded, see `Verdict`.
+    standing : H or None
+        The hypothesis that stands for the verdict; None stands for the model without effect.
+    members : sequence of H
+        The hypotheses that are listed first, in their order.
+    effects, group, family, gates, resembles
+        Further attributes of the `Verdict`.
+    """
+    others = []
+    for other in comparison.ranked:
+        if not any(other is member for member in members):
+            others.append(other)
+    listed: list[H] = [*members, *others]
+    scores = np.array([comparison.score(hypothesis) for hypothesis in listed])
+    probabilities = np.exp(scores - logsumexp(scores)).tolist()
+    weighted: list[WeightedHypothesis] = []
+    for hypothesis, weight in zip(listed, probabilities, strict=True):
+        weighted.append(WeightedHypothesis(hypothesis, weight))
+    first_other = len(members)
+    other_weighted = sorted(weighted[first_other:], key=lambda entry: -entry.probability)
+    weighted = weighted[:first_other] + other_weighted
+    fit = comparison.search.no_effect
+    if standing is not None:
+        fit = comparison.simulation(standing)
+    comparison.standing = standing
+    best = listed[0] if standing is None else standing
+    log_bayes_factor = best.log_evidence - comparison.no_effect.log_evidence
+    return Conclusion(comparison.search, log_bayes_factor, weighted).outcome(
+        kind,
+        sentence,
+        probability,
+        fit,
+        effects=effects,
+        group=group,
+        family=family,
+        gates=gates,
+        resembles=resembles,
+        remainders=remainder_estimates(comparison.problem, fit),
+    )
 
 
-def _shape(court: Court, best: Hypothetic) -> str:
-    """Return the sentence on the free shape of one law, unless trials not fitted speak against it."""
-    (term, *others) = best.candidate.terms
-    free = None if others else court.freed(best)
-    if free is None or court.told(free).value < court.told(best).value - SEARCH.slim:
+# ---------------------------------------------------------------- what is added to a name in part
+
+
+def _shape_sentence(comparison: Comparison[H], best: H) -> str:
+    """Return the sentence on the free shape of a single law.
+
+    Empty if held-out trials speak against it.
+    """
+    if len(best.candidate.terms) != 1:
         return ""
-    spread = np.sqrt(np.diag(free.covariance))[len(free.shared) + len(term.effect.parameters) :]
-    shown = [
-        f"{item.description.split(' (')[0]} {item.value:.2g} ({item.low:.2g} to {item.high:.2g})"
-        for item, deviation in zip(named_effects(court.problem, free)[0].shape, spread, strict=True)
-        if deviation < SEARCH.told_by_data
-    ]
-    return said("verdict.with_a_shape", shape=", ".join(shown)) if shown else ""
-
-
-def _not_proved(court: Court, best: Hypothetic) -> str:
-    """Return the sentence on the next law that would stand beside a name, close but not probable enough."""
-    own, least = families(best), court.score(best) - SEARCH.contenders
-    longer = (item for item in court.ranked if families(item) > own)
-    more = (item for item in longer if all(map(court.acts, item.candidate.terms)))
-    close = next((item for item in more if court.score(item) > least), None)
-    if close is None or court.told(close).value < court.told(best).value + SEARCH.sliver:
+    (term,) = best.candidate.terms
+    free = comparison.with_free_shape(best)
+    if free is None:
         return ""
-    effects = named_effects(court.problem, close)
-    added = effects_text(effect for effect in effects if (effect.family, effect.place) not in own)
-    return said("verdict.not_proved", what=capital(added))
+    least_share = comparison.decisive_share(best).value - SEARCH.slim
+    if comparison.decisive_share(free).value < least_share:
+        return ""
+    first_shape = len(free.shared) + len(term.effect.parameters)
+    deviations = np.sqrt(np.diag(free.covariance))[first_shape:]
+    (effect,) = named_effects(comparison.problem, free)
+    texts = []
+    for parameter, deviation in zip(effect.shape, deviations, strict=True):
+        if deviation < SEARCH.told_by_data:
+            description = parameter.description.split(" (")[0]
+            interval = f"{parameter.low:.2g} to {parameter.high:.2g}"
+            texts.append(f"{description} {parameter.value:.2g} ({interval})")
+    return f" With a shape of its own: {', '.join(texts)}." if texts else ""
 
 
-def remainder_estimates(problem: Problem, found: CandidateFit) -> tuple[RemainderEstimate, ...]:
-    """Return the remainders of a fit for the verdict."""
-    left = found.remainder
-    if left is None:
+def _unproved_addition_sentence(comparison: Comparison[H], best: H) -> str:
+    """Return the sentence on a further law that gains too little evidence for a name.
+
+    Empty if there is none.
+    """
+    families = families_at_places(best)
+    least_score = comparison.score(best) - SEARCH.contenders
+    addition = None
+    for other in comparison.ranked:
+        has_more_laws = families_at_places(other) > families
+        only_laws = all(comparison.acts_on_structure(term) for term in other.candidate.terms)
+        if has_more_laws and only_laws and comparison.score(other) > least_score:
+            addition = other
+            break
+    if addition is None:
+        return ""
+    least_share = comparison.decisive_share(best).value + SEARCH.sliver
+    if comparison.decisive_share(addition).value < least_share:
+        return ""
+    added = []
+    for effect in named_effects(comparison.problem, addition):
+        if (effect.family, effect.place) not in families:
+            added.append(effect)
+    return (
+        f" {capital(effects_text(added))} may be there beside it, but is not proved: it gains less "
+        "evidence than it costs."
+    )
+
+
+def remainder_estimates(problem: Problem, fit: CandidateFit) -> tuple[RemainderEstimate, ...]:
+    """Return what a fit leaves beside the noise, for each channel with such a residual process."""
+    process = fit.residual_process
+    if process is None:
         return ()
-    rows = zip(problem.channel_names, left.size, left.time, left.frequency, strict=True)
-    return tuple(RemainderEstimate(name, *map(float, of)) for name, *of in rows if of[0] > 0.0)
+    estimates = []
+    for channel, name in enumerate(problem.channel_names):
+        amplitude = float(process.amplitude[channel])
+        if amplitude > 0.0:
+            correlation_time = float(process.correlation_time[channel])
+            frequency = float(process.frequency[channel])
+            estimates.append(RemainderEstimate(name, amplitude, correlation_time, frequency))
+    return tuple(estimates)

@@ -1,6 +1,6 @@
 """Parameters, gains and zeros that a fit moves far from what is stated of them.
 
-A wrong model can fit by leaving what was calibrated: what it has taken up so leaves no residual.
+A wrong model can fit by moving calibrated values: what it takes up in this way leaves no residual.
 """
 
 from collections.abc import Sequence
@@ -8,96 +8,131 @@ from collections.abc import Sequence
 from discrepancy.campaign.units import UNITS
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
+from discrepancy.fits.trial_data import TrialData
 from discrepancy.verdict import MovedUnknown
 from reporting.words import listing
 
 MOVED_DEVIATIONS = 2.0
-"""Stated standard deviations from which on a parameter, gain or zero is named."""
-UNKNOWNS_TOLD = 5
-"""Of these, how many a sentence names."""
+"""Stated standard deviations from which on a moved parameter, gain or zero is reported."""
+MOST_MENTIONED = 5
+"""Number of moved unknowns that a sentence mentions."""
 
 
 def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, ...]:
-    """Return what a fit moves by more than `MOVED_DEVIATIONS` of its stated deviations, the farthest first.
+    """Return the unknowns that a fit moves by more than `MOVED_DEVIATIONS`, the farthest first.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     fit : CandidateFit
-        Mostly that of the model as it is.
+        The fit, mostly that of the model without effect.
     """
-    unknowns = [*_moved_parameters(problem, fit), *_moved_gains(problem, fit), *_moved_zeros(problem, fit)]
-    far = [item for item in unknowns if abs(item.deviations) > MOVED_DEVIATIONS]
-    return tuple(sorted(far, key=lambda item: -abs(item.deviations)))
+    unknowns = [
+        *_parameters(problem, fit),
+        *_gains(problem, fit),
+        *_zeros_and_constants(problem, fit),
+    ]
+    moved = [unknown for unknown in unknowns if abs(unknown.deviations) > MOVED_DEVIATIONS]
+    return tuple(sorted(moved, key=lambda unknown: -abs(unknown.deviations)))
 
 
-def _moved_parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+def _parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+    """Return the uncertain calibrated parameters in a fit."""
     shared = problem.shared
     values = shared.parameters(fit.point.shared)
-    found = []
+    unknowns = []
     for number, parameter in enumerate(problem.model.parameters):
-        centre, scale = float(shared.centre[number]), float(shared.scale[number])
-        if scale > 0.0:
-            value = float(values[number])
-            deviations = (value - centre) / scale
-            found.append(MovedUnknown(parameter.name, centre, scale, value, deviations, parameter.unit))
-    return found
+        centre = float(shared.centre[number])
+        scale = float(shared.scale[number])
+        if scale <= 0.0:
+            continue
+        value = float(values[number])
+        unknowns.append(
+            MovedUnknown(
+                name=parameter.name,
+                stated=centre,
+                deviation=scale,
+                value=value,
+                deviations=(value - centre) / scale,
+                unit=parameter.unit,
+            )
+        )
+    return unknowns
 
 
-def _moved_gains(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
-    shared, found = problem.shared, []
+def _gains(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+    """Return the gains with a stated deviation in a fit."""
+    shared = problem.shared
+    unknowns = []
     for row, channel in enumerate(shared.gain_channels):
         number = shared.count + row
-        u, scale = float(fit.point.shared[number]), float(shared.scale[number])
         if shared.precision[number] > 0.0:
-            name = f"gain of {channel}"
-            found.append(MovedUnknown(name, 0.0, scale, scale * u, u, "1"))
-    return found
+            u = float(fit.point.shared[number])
+            scale = float(shared.scale[number])
+            unknowns.append(_moved_from_zero(f"gain of {channel}", u, scale, "1"))
+    return unknowns
 
 
-def _moved_zeros(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
-    """Return the zeros of channels, and the constants of inputs, in the trials of a fit."""
-    found = []
+def _zeros_and_constants(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+    """Return the zeros of channels and the constants of inputs with a stated deviation in a fit."""
+    unknowns = []
     for data, local in zip(problem.trials, fit.point.local, strict=True):
-        trial, unknowns = data.trial, data.unknowns
-        first_constant, last_constant = unknowns.ends[1:3]
-        names = []
-        for column in unknowns.zero_columns:
-            channel = trial.channels[column]
-            unit = UNITS[problem.campaign.channels[channel].quantity].si
-            names.append((f"zero of {channel} in {trial.name!r}", unit))
-        numbers = list(range(unknowns.zeros))
-        for row in unknowns.offset_inputs:
-            item = trial.inputs[row]
-            names.append((f"constant of {item.name} in {trial.name!r}", UNITS[item.quantity].si))
-        numbers += range(first_constant, last_constant)
-        for (name, unit), number in zip(names, numbers, strict=True):
-            u, scale = float(local[number]), float(unknowns.scale[number])
-            if unknowns.precision[number] > 0.0:
-                found.append(MovedUnknown(name, 0.0, scale, scale * u, u, unit))
-    return found
+        layout = data.unknowns
+        names_and_units = _names_of_zeros_and_constants(problem, data)
+        zeros_end, initial_end, inputs_end, _ = layout.ends
+        numbers = [*range(zeros_end), *range(initial_end, inputs_end)]
+        for (name, unit), number in zip(names_and_units, numbers, strict=True):
+            if layout.precision[number] > 0.0:
+                u = float(local[number])
+                unknowns.append(_moved_from_zero(name, u, float(layout.scale[number]), unit))
+    return unknowns
+
+
+def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tuple[str, str]]:
+    """Return the names and SI units of a trial's unknown zeros, then of its constants of inputs."""
+    trial = data.trial
+    names_and_units = []
+    for column in data.unknowns.zero_columns:
+        channel = trial.channels[column]
+        unit = UNITS[problem.campaign.channels[channel].quantity].si
+        names_and_units.append((f"zero of {channel} in {trial.name!r}", unit))
+    for row in data.unknowns.offset_inputs:
+        recorded = trial.inputs[row]
+        unit = UNITS[recorded.quantity].si
+        names_and_units.append((f"constant of {recorded.name} in {trial.name!r}", unit))
+    return names_and_units
+
+
+def _moved_from_zero(name: str, u: float, scale: float, unit: str) -> MovedUnknown:
+    """Return an unknown that is stated as zero with a standard deviation, at a scaled value u."""
+    return MovedUnknown(
+        name=name, stated=0.0, deviation=scale, value=scale * u, deviations=u, unit=unit
+    )
 
 
 def moved_sentence(moved: Sequence[MovedUnknown]) -> str:
-    """Return what the model as it is moves, in one sentence; empty: nothing."""
+    """Return a sentence on what the model without effect moves; empty if nothing."""
     if not moved:
         return ""
-    parts = [_moved_text(item) for item in moved[:UNKNOWNS_TOLD]]
-    more = len(moved) - UNKNOWNS_TOLD
-    if more > 0:
-        parts.append(f"{more} more")
+    parts = [_moved_text(unknown) for unknown in moved[:MOST_MENTIONED]]
+    remaining = len(moved) - MOST_MENTIONED
+    if remaining > 0:
+        parts.append(f"{remaining} more")
     return f"Fitted without an effect, the model moves {listing(parts)}."
 
 
-def _moved_text(item: MovedUnknown) -> str:
-    """Return an unknown with what is stated of it, its value, and the deviations between them."""
-    off = f"{abs(item.deviations):.1f} deviations"
-    unit = "" if item.unit == "1" else f" {item.unit}"
-    if item.name.startswith("gain of "):
-        stated = f"stated to {100.0 * item.deviation:.3g} %"
-        return f"the {item.name} by {100.0 * item.value:+.3g} % ({stated}; {off})"
-    if item.stated == 0.0:
-        return f"the {item.name} to {item.value:.3g}{unit} (stated to {item.deviation:.3g}{unit}; {off})"
-    stated = f"{item.stated:.4g} ± {item.deviation:.2g}"
-    return f"{item.name!r} from {stated} to {item.value:.4g}{unit} ({off})"
+def _moved_text(unknown: MovedUnknown) -> str:
+    """Return in words what is stated of an unknown, its value, and the deviations between them."""
+    name = unknown.name
+    value = unknown.value
+    deviation = unknown.deviation
+    off = f"{abs(unknown.deviations):.1f} deviations"
+    unit = "" if unknown.unit == "1" else f" {unknown.unit}"
+    if name.startswith("gain of "):
+        stated = f"stated to {100.0 * deviation:.3g} %"
+        return f"the {name} by {100.0 * value:+.3g} % ({stated}; {off})"
+    if unknown.stated == 0.0:
+        return f"the {name} to {value:.3g}{unit} (stated to {deviation:.3g}{unit}; {off})"
+    stated = f"{unknown.stated:.4g} ± {deviation:.2g}"
+    return f"{name!r} from {stated} to {value:.4g}{unit} ({off})"

@@ -3,391 +3,570 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.errors import said
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
-from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, shape_gate
+from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
+from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit, check_shape
 from discrepancy.fits.predictive import residual_set, with_draws
 from discrepancy.fits.problem import Problem
-from discrepancy.search.starts import Tell, acts_within, in_silence
+from discrepancy.search.starts import OnProgress, acts_within, no_progress
 from discrepancy.search.strategy import Search
-from discrepancy.search.whole_search import OnSearch, nobody_looks, search
+from discrepancy.search.whole_search import OnSearch, ignore_search, search
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import Gate, Verdict, VerdictKind
+from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import INTERNAL_FORCES, SENSORS, LoadGain, SensorGain
 from reporting.words import listing
 
 from .conclusion import (
     LEAST_SIZE,
     Conclusion,
-    Outcome,
-    below_limit,
-    is_one_driven_channel,
+    VerdictOutcome,
+    below_limit_sentence,
+    has_one_driven_channel,
     is_small,
     named_effects,
     plain_names,
 )
-from .consistency_gate import consistency_gate
-from .in_part import judged_in_part, nearly_all_by_laws, without_sliver
+from .consistency_gate import check_consistency
+from .in_part import verdict_by_laws_alone, verdict_in_part, without_negligible_effect
 from .moved_unknowns import moved_sentence, moved_unknowns
-from .proof import held_out_gate
+from .proof import check_held_out
 from .verdict_checks import checked_verdict
 
-Names = tuple[str, ...]
+EffectSet = tuple[str, ...]
+"""The identifiers of a set of effects."""
+
+
+class CheckedFit(NamedTuple):
+    """A fit with the outcomes of the tests of absolute fit and consistency."""
+
+    fit: CandidateFit
+    absolute: Gate
+    consistency: Gate
+
+
+class FittedMember(NamedTuple):
+    """A set of effects that may be a member of a group, its fit, and the test of absolute fit."""
+
+    names: EffectSet
+    fit: CandidateFit
+    absolute: Gate
 
 
 class Case:
-    """A search before the rules.
+    """A search to which the rules of a verdict are applied, with what they ask for.
 
     Parameters
     ----------
-    found : Search
-        All candidates.
+    search : Search
+        The search with all candidates.
     probabilities : mapping of tuple of str to float
-        Of sets of effects, most probable first.
-    top : tuple of str, optional
+        The probability of each set of effects, the most probable first.
+    leading : tuple of str, optional
         The set that may be named; the most probable one if left out.
     """
 
-    def __init__(self, found: Search, probabilities: Mapping[Names, float], top: Names | None = None) -> None:
-        self.problem, self.found, self.probabilities = found.problem, found, probabilities
-        self.top = next(iter(probabilities)) if top is None else top
-        self.best = found.exactly(found.best_of(self.top)) if self.top else found.best()
-        self.told = Conclusion.of(found, self.best, probabilities)
-        self.p_none = probabilities.get((), 0.0)
-        self.has_evidence = self.told.log_bayes_factor >= SEARCH.bayes_factor
-        self.none_gate = absolute_gate(self.problem, found.none)
+    def __init__(
+        self,
+        search: Search,
+        probabilities: Mapping[EffectSet, float],
+        leading: EffectSet | None = None,
+    ) -> None:
+        self.problem = search.problem
+        self.search = search
+        self.probabilities = probabilities
+        self.leading = next(iter(probabilities)) if leading is None else leading
+        self.best = search.best()
+        if self.leading:
+            self.best = search.fit_exactly(search.best_of(self.leading))
+        self.conclusion = Conclusion.from_probabilities(search, self.best, probabilities)
+        self.probability_of_none = probabilities.get((), 0.0)
+        self.has_evidence = self.conclusion.log_bayes_factor >= SEARCH.bayes_factor
+        self.no_effect_gate = check_absolute_fit(self.problem, search.no_effect)
 
     # ---------------------------------------------------------------- how probable
 
     @property
-    def leads(self) -> bool:
-        """Whether a set of effects is before nothing missing."""
-        return bool(self.top) and (self.has_evidence or self.none_gate.passed is False)
+    def has_leading_set(self) -> bool:
+        """Whether a set of effects is ahead of the model without effect."""
+        return bool(self.leading) and (self.has_evidence or self.no_effect_gate.passed is False)
 
     @cached_property
     def probability(self) -> float:
-        """Of the set with all that hold it (a further effect is open then), of a family with its members."""
-        own = set(plain_names(self.top))
-        total = sum(p for names, p in self.probabilities.items() if own <= set(plain_names(names)))
-        if self.best.candidate.is_family:  # reached from several members or places, it is one family
-            total = max(total, _family_probability(self.found, self.best.candidate.terms[0].effect.family))
+        """The probability of the leading set.
+
+        It includes all sets that hold it, as a further effect is open then. That of a family
+        includes its members.
+        """
+        leading = set(plain_names(self.leading))
+        total: float = 0
+        for names, probability in self.probabilities.items():
+            if leading <= set(plain_names(names)):
+                total += probability
+        if self.best.candidate.is_family:  # one family is reached from several members or places
+            family = self.best.candidate.terms[0].effect.family
+            total = max(total, _family_probability(self.search, family))
         return min(total, 1.0)
 
     @property
     def is_sure(self) -> bool:
-        """Whether the set has the probability and the evidence of a name."""
+        """Whether the set has the probability and the evidence that a name needs."""
         return self.probability >= SEARCH.sure and self.has_evidence
 
     @cached_property
-    def members(self) -> list[Names]:
+    def probable_sets(self) -> list[EffectSet]:
         """The most probable sets that together reach the probability of a name."""
-        return members_of(self.probabilities)
+        return most_probable_sets(self.probabilities)
 
-    # ---------------------------------------------------------------- gates
-
-    @cached_property
-    def gates(self) -> tuple[Gate, Gate]:
-        """Absolute fit and consistency of the set."""
-        return absolute_gate(self.problem, self.best), consistency_gate(self.problem, self.best)
+    # ---------------------------------------------------------------- tests
 
     @cached_property
-    def shape(self) -> tuple[Gate, CandidateFit | None]:
-        """The gate of shape, and the fit with the shape free that gains most, where that gains too much."""
-        numbers = range(len(self.best.candidate.terms))
-        free = (free_shape(self.problem, self.best, number) for number in numbers)
-        kept = max((item for item in free if item), key=lambda item: item.log_evidence, default=None)
-        outcome = shape_gate(self.best, kept)
-        return outcome, kept if outcome.statistic > SHAPE_GAIN else None
+    def tested(self) -> CheckedFit:
+        """The leading set with the tests of absolute fit and consistency."""
+        return CheckedFit(
+            self.best,
+            check_absolute_fit(self.problem, self.best),
+            check_consistency(self.problem, self.best),
+        )
+
+    @cached_property
+    def _best_free_shape(self) -> CandidateFit | None:
+        """The fit with the shape of one effect free that has the most evidence.
+
+        None without a shape.
+        """
+        free_fits = []
+        for number in range(len(self.best.candidate.terms)):
+            free_fit = fit_free_shape(self.problem, self.best, number)
+            if free_fit is not None:
+                free_fits.append(free_fit)
+        return max(free_fits, key=lambda fit: fit.log_evidence, default=None)
+
+    @cached_property
+    def shape_gate(self) -> Gate:
+        """The test whether a free shape explains more than the effects as they are."""
+        return check_shape(self.best, self._best_free_shape)
+
+    @property
+    def family_fit(self) -> CandidateFit | None:
+        """The fit with a free shape, if it gains so much that the name gives way to it."""
+        return self._best_free_shape if self.shape_gate.statistic > SHAPE_GAIN else None
 
     @property
     def all_gates(self) -> tuple[Gate, ...]:
-        """Absolute fit, shape and consistency; of a family no shape."""
-        absolute, consistent = self.gates
+        """The tests of absolute fit, shape and consistency; for a family no test of shape."""
         if self.best.candidate.is_family:
-            return self.gates
-        return absolute, self.shape[0], consistent
+            return self.tested.absolute, self.tested.consistency
+        return self.tested.absolute, self.shape_gate, self.tested.consistency
 
     @property
     def passes(self) -> bool:
-        """Whether no gate that could be applied fails."""
+        """Whether no test that could be applied fails."""
         return not _any_fails(self.all_gates)
 
     @cached_property
-    def freed(self) -> tuple[CandidateFit, Gate, Gate] | None:
-        """The set with one law of free shape, and its gates, where it may be stated so.
+    def tested_family(self) -> CheckedFit | None:
+        """The set with one law of free shape and its tests, where that may be stated.
 
-        A free shape counts as one more effect, and beside a second law it would imitate nearly anything.
+        A free shape counts as one more effect, and beside a second law it would imitate nearly
+        anything.
         """
         candidate = self.best.candidate
-        family = None if candidate.is_family else self.shape[1]
+        family_fit = None if candidate.is_family else self.family_fit
         patches = candidate.patches(self.problem.setting, self.best.effect)
-        laws = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
-        if family is None or laws > 1 or len(patches) == SEARCH.largest_set:
+        law_count = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
+        if family_fit is None or law_count > 1 or len(patches) == SEARCH.largest_set:
             return None
-        return family, absolute_gate(self.problem, family), consistency_gate(self.problem, family)
+        return CheckedFit(
+            family_fit,
+            check_absolute_fit(self.problem, family_fit),
+            check_consistency(self.problem, family_fit),
+        )
 
-    # ---------------------------------------------------------------- what is said
+    # ---------------------------------------------------------------- verdicts
 
-    def gap(self) -> Outcome:
-        """Return that there is a gap that no effect of the catalogue explains."""
-        sentence, gates = said("verdict.no_effect_explains", gate=self.none_gate), (self.none_gate,)
-        return self._unexplained(sentence, self.probabilities[self.top], gates)
+    def gap(self) -> VerdictOutcome:
+        """Return the verdict that there is a gap which no effect of the catalogue explains."""
+        sentence = (
+            f"There is a gap that no effect of the catalogue explains. {self.no_effect_gate.reason}"
+        )
+        probability = self.probabilities[self.leading]
+        return self._unexplained(sentence, probability, (self.no_effect_gate,))
 
-    def nothing(self) -> Outcome:
-        """Return that nothing is missing."""
-        key = "nothing_missing" if self.none_gate.passed else "nothing_better"
-        sentence = said(f"verdict.{key}", gate=self.none_gate)
-        return self.told.outcome(VerdictKind.NOTHING_MISSING, sentence, self.p_none, gates=(self.none_gate,))
+    def nothing_missing(self) -> VerdictOutcome:
+        """Return the verdict that nothing is missing."""
+        if self.no_effect_gate.passed:
+            sentence = "The model explains the data within their noise."
+        else:
+            sentence = (
+                "No effect of the catalogue explains the data better than the model does. "
+                f"{self.no_effect_gate.reason}"
+            )
+        return self.conclusion.outcome(
+            VerdictKind.NOTHING_MISSING,
+            sentence,
+            self.probability_of_none,
+            gates=(self.no_effect_gate,),
+        )
 
-    def shared(self) -> Outcome | None:
-        """Return the name of what all probable sets hold, if that fits alone: else a group is open.
+    def common_effects(self) -> VerdictOutcome | None:
+        """Return the name of the effects that all probable sets hold, if these fit alone.
 
-        Which further effect it has beside it stays open, and a name does not depend on that.
+        Else None.
+
+        Which further effect there is beside them stays open, and a name does not depend on that.
         """
-        common = set.intersection(*(set(plain_names(names)) for names in self.members))
-        alone = next((names for names in self.members if set(names) == common), None)
-        case = Case(self.found, self.probabilities, alone) if alone else None
-        if case is None or not case.is_sure:
+        common = set.intersection(*(set(plain_names(names)) for names in self.probable_sets))
+        alone = next((names for names in self.probable_sets if set(names) == common), None)
+        if not alone:
             return None
-        outcome = decided(case)
+        case = Case(self.search, self.probabilities, alone)
+        if not case.is_sure:
+            return None
+        outcome = decide(case)
         return outcome if outcome.verdict.kind is VerdictKind.NAMED else None
 
-    def open(self) -> Outcome:
+    def open(self) -> VerdictOutcome:
         """Return the verdict where no set reaches the probability that a name needs."""
-        if () in self.members:
-            hints = sorted({name for names in self.members for name in plain_names(names)})
-            total = sum(self.probabilities[names] for names in self.members)
-            more: dict[str, Any] = {"group": tuple(hints), "gates": (absolute_gate(self.problem, self.best),)}
-            return self.told.outcome(VerdictKind.BELOW_LIMIT, below_limit(hints), total, self.best, **more)
-        fits = [self.found.exactly(self.found.best_of(names)) for names in self.members]
-        gates = [absolute_gate(self.problem, item) for item in fits]
-        # those that do not fit take their probability with them; a law and its family are one
-        fitting = [row for row in zip(self.members, fits, gates, strict=True) if row[2].passed is not False]
-        together = sum(self.probabilities[names] for names, _, _ in fitting)
-        single: dict[Names, tuple[Names, CandidateFit, Gate]] = {}
-        for row in fitting:
-            single.setdefault(plain_names(row[0]), row)
-        rows = list(single.values())
-        if not rows or len(rows) > SEARCH.largest_group:
-            sentence = said("verdict.no_effect_fits", reason=gates[0].reason)
-            if rows:
-                sentence = said("verdict.alike", count=len(rows))
-            total = sum(self.probabilities[names] for names in self.members)
-            more = {"gates": (gates[0],), "resembles": plain_names(self.members[0])}
-            return self.told.outcome(VerdictKind.UNEXPLAINED, sentence, total, **more)
-        drawn = [with_draws(self.problem, item) for _, item, _ in rows]
-        labels = listing((" + ".join(names) for names, _, _ in rows), "or")
-        more = {
-            "effects": tuple(effect for item in drawn for effect in named_effects(self.problem, item)),
-            "group": tuple(" + ".join(plain_names(names)) for names, _, _ in rows), "gates": (rows[0][2],),
-        }  # fmt: skip
-        sentence = said("verdict.either" if len(rows) > 1 else "verdict.not_probable", members=labels)
-        return self.told.outcome(VerdictKind.GROUP, sentence, together, drawn[0], **more)
+        if () in self.probable_sets:
+            return self._below_limit()
+        members = []
+        for names in self.probable_sets:
+            fit = self.search.fit_exactly(self.search.best_of(names))
+            members.append(FittedMember(names, fit, check_absolute_fit(self.problem, fit)))
+        # those that do not fit take their probability with them
+        fitting = [member for member in members if member.absolute.passed is not False]
+        probability = sum(self.probabilities[member.names] for member in fitting)
+        # a law and its family are one member
+        distinct: dict[EffectSet, FittedMember] = {}
+        for member in fitting:
+            distinct.setdefault(plain_names(member.names), member)
+        group = list(distinct.values())
+        if not group or len(group) > SEARCH.largest_group:
+            return self._no_group(members[0], len(group))
+        return self._group(group, probability)
 
-    def named(self) -> Outcome:
-        """Return the name."""
-        return self.told.named(with_draws(self.problem, self.best), self.probability, self.all_gates)
+    def _below_limit(self) -> VerdictOutcome:
+        """Return the verdict that something may be missing, but too small to tell."""
+        hints = sorted({name for names in self.probable_sets for name in plain_names(names)})
+        return self.conclusion.outcome(
+            VerdictKind.BELOW_LIMIT,
+            below_limit_sentence(hints),
+            sum(self.probabilities[names] for names in self.probable_sets),
+            self.best,
+            group=tuple(hints),
+            gates=(check_absolute_fit(self.problem, self.best),),
+        )
 
-    def family(self) -> Outcome:
-        """Return the family of the set, or of the set with its shape free."""
-        fit, absolute, consistent = self.freed or (self.best, *self.gates)
-        gates = (absolute, consistent) if self.freed is None else (absolute, self.shape[0], consistent)
-        return self.told.family(fit, self.probability, gates)
+    def _no_group(self, first: FittedMember, count: int) -> VerdictOutcome:
+        """Return the verdict where none, or too many, of the probable sets fit."""
+        sentence = f"There is a gap that no effect of the catalogue fits. {first.absolute.reason}"
+        if count:
+            sentence = f"There is a gap, and {count} explanations fit it alike."
+        return self.conclusion.outcome(
+            VerdictKind.UNEXPLAINED,
+            sentence,
+            sum(self.probabilities[names] for names in self.probable_sets),
+            gates=(first.absolute,),
+            resembles=plain_names(first.names),
+        )
 
-    def unfit(self) -> Outcome:
-        """Return that the set, or its family, fails a gate."""
-        _, absolute, consistent = self.freed or (self.best, *self.gates)
-        fails = absolute.passed is not False and consistent.passed is False
-        reason = (consistent if fails else absolute).reason
+    def _group(self, members: Sequence[FittedMember], probability: float) -> VerdictOutcome:
+        """Return the verdict that one of some sets is missing, which the data cannot tell apart."""
+        fits = [with_draws(self.problem, member.fit) for member in members]
+        effects: list[NamedEffect] = []
+        for fit in fits:
+            effects.extend(named_effects(self.problem, fit))
+        names = listing((" + ".join(member.names) for member in members), "or")
+        if len(members) > 1:
+            sentence = f"Either {names} is missing; these data cannot tell which."
+        else:
+            sentence = (
+                f"There is a gap that {names} fits, but not with the probability that a name needs."
+            )
+        return self.conclusion.outcome(
+            VerdictKind.GROUP,
+            sentence,
+            probability,
+            fits[0],
+            effects=tuple(effects),
+            group=tuple(" + ".join(plain_names(member.names)) for member in members),
+            gates=(members[0].absolute,),
+        )
+
+    def named(self) -> VerdictOutcome:
+        """Return the verdict that names the leading set."""
+        fit = with_draws(self.problem, self.best)
+        return self.conclusion.named(fit, self.probability, self.all_gates)
+
+    def family(self) -> VerdictOutcome:
+        """Return the verdict that names the family of the leading set, its shape being free."""
+        if self.tested_family is None:
+            tested = self.tested
+            gates: tuple[Gate, ...] = (tested.absolute, tested.consistency)
+        else:
+            tested = self.tested_family
+            gates = (tested.absolute, self.shape_gate, tested.consistency)
+        return self.conclusion.family(tested.fit, self.probability, gates)
+
+    def unfit(self) -> VerdictOutcome:
+        """Return the verdict that there is a gap, as the leading set or its family fails a test."""
+        tested = self.tested_family or self.tested
+        reason = tested.absolute.reason
+        if tested.absolute.passed is not False and tested.consistency.passed is False:
+            reason = tested.consistency.reason
         if self.best.candidate.is_family:
-            sentence = said("verdict.no_effect_fits", reason=reason)
-            return self._unexplained(sentence, self.probability, (absolute, consistent))
-        if self.shape[1] is not None and self.freed is None:
-            reason = said("verdict.needs_shape")
-        nearest, reason = " with ".join(self.best.candidate.identifiers), f"{reason[0].lower()}{reason[1:]}"
-        sentence = said("verdict.nearest", nearest=nearest, reason=reason)
-        return self._unexplained(sentence, self.probability, (absolute, self.shape[0], consistent))
+            sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
+            gates = (tested.absolute, tested.consistency)
+            return self._unexplained(sentence, self.probability, gates)
+        if self.family_fit is not None and self.tested_family is None:
+            reason = (
+                "one of them would need a shape of its own, and with so much freedom nearly "
+                "anything fits."
+            )
+        nearest = " with ".join(self.best.candidate.identifiers)
+        clause = f"{reason[0].lower()}{reason[1:]}"
+        sentence = (
+            f"There is a gap that no effect of the catalogue fits; the nearest is {nearest}, but "
+            f"{clause}"
+        )
+        gates_with_shape = (tested.absolute, self.shape_gate, tested.consistency)
+        return self._unexplained(sentence, self.probability, gates_with_shape)
 
-    def _unexplained(self, sentence: str, probability: float, gates: tuple[Gate, ...]) -> Outcome:
-        resembles = plain_names(self.best.candidate.identifiers)
-        kind = VerdictKind.UNEXPLAINED
-        return self.told.outcome(kind, sentence, probability, gates=gates, resembles=resembles)
+    def _unexplained(
+        self, sentence: str, probability: float, gates: tuple[Gate, ...]
+    ) -> VerdictOutcome:
+        """Return the verdict of an unexplained gap, which the leading set resembles."""
+        return self.conclusion.outcome(
+            VerdictKind.UNEXPLAINED,
+            sentence,
+            probability,
+            gates=gates,
+            resembles=plain_names(self.best.candidate.identifiers),
+        )
 
 
-def decided(case: Case) -> Outcome:
-    """Return the verdict of the first rule that holds; in words: `[[rule]]` of `sentences.toml`."""
-    if not case.leads:
-        if case.none_gate.passed is False:
+def decide(case: Case) -> VerdictOutcome:
+    """Return the verdict by the first rule that holds.
+
+    The rules in words are the `[[rule]]` tables of `sentences.toml`, in the same order.
+    """
+    if not case.has_leading_set:
+        if case.no_effect_gate.passed is False:
             return case.gap()
-        return case.open() if case.top and case.p_none < SEARCH.unsure else case.nothing()
+        if case.leading and case.probability_of_none < SEARCH.unsure:
+            return case.open()
+        return case.nothing_missing()
     if not case.is_sure:
-        return case.shared() or case.open()
+        return case.common_effects() or case.open()
     if case.passes:
         return case.family() if case.best.candidate.is_family else case.named()
-    free = case.freed
-    return case.unfit() if free is None or _any_fails(free[1:]) else case.family()
+    family = case.tested_family
+    if family is None or _any_fails((family.absolute, family.consistency)):
+        return case.unfit()
+    return case.family()
 
 
 def _any_fails(gates: Iterable[Gate]) -> bool:
-    """Whether a gate that could be applied fails."""
+    """Return whether a test that could be applied fails."""
     return any(gate.passed is False for gate in gates)
 
 
-def as_recorded(found: Search) -> Outcome:
-    """Return the verdict if what a right model leaves is noise as the records say, and no more."""
-    probabilities = found.set_probabilities()
-    for _ in range(SEARCH.largest_group):  # those that matter fitted exactly: few steps give rough evidence
-        exact = {item.candidate.identifiers for item in found.exact.values()}
-        rough = [names for names in members_of(probabilities) if names not in exact]
-        if not rough:
-            break
-        found.exactly(found.best_of(rough[0]))
-        probabilities = found.set_probabilities()
-    return decided(Case(found, probabilities))
-
-
-def members_of(probabilities: Mapping[Names, float]) -> list[Names]:
+def most_probable_sets(probabilities: Mapping[EffectSet, float]) -> list[EffectSet]:
     """Return the most probable sets that together reach the probability of a name."""
     sums = np.cumsum(list(probabilities.values()))
     return list(probabilities)[: int(np.searchsorted(sums, SEARCH.sure)) + 1]
 
 
-def _family_probability(found: Search, family: str) -> float:
-    """Return the probability of a family: of all single effects of it, named or of free shape."""
-    kept = [(item.candidate.terms, found.score(item)) for item in found.all().values()]
-    weights = np.exp(np.array([score for _, score in kept]) - max(score for _, score in kept))
-    members = [len(terms) == 1 and terms[0].effect.family == family for terms, _ in kept]
-    return float(weights[members].sum() / weights.sum())
+def _family_probability(search: Search, family: str) -> float:
+    """Return the probability of a family: of all single effects of it, with any shape."""
+    fits = list(search.compared_fits().values())
+    scores = np.array([search.score(fit) for fit in fits])
+    weights = np.exp(scores - scores.max())
+    is_member = []
+    for fit in fits:
+        terms = fit.candidate.terms
+        is_member.append(len(terms) == 1 and terms[0].effect.family == family)
+    return float(weights[is_member].sum() / weights.sum())
 
+
+# ---------------------------------------------------------------- the verdict on a campaign
 
 INSTRUMENTS = (LoadGain, *SENSORS)
+"""Primitives that describe errors of instruments."""
 
 
-def name(
+def reach_verdict(
     problem: Problem,
     effects: Sequence[Effect],
-    tell: Tell = in_silence,
-    on_search: OnSearch = nobody_looks,
-) -> Outcome:
-    """Name what is missing.
+    on_progress: OnProgress = no_progress,
+    on_search: OnSearch = ignore_search,
+) -> VerdictOutcome:
+    """Return the verdict on a campaign: what the model lacks, by its name if it has one.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     effects : sequence of Effect
         The catalogue.
-    tell : callable
-        Takes a few words on what is fitted, and how much is left.
+    on_progress : callable
+        Takes a line that says what is fitted, and how much is still to come.
     on_search : callable
         Takes each search as it begins.
 
     Returns
     -------
-    Outcome
-        The verdict without next experiments and data faults, which others add; all candidates; the fit that
-        stands for the verdict: of the named set, of the family, of the most probable member of a group or of
-        what is too small to tell; else the one without effect.
+    VerdictOutcome
+        The verdict without next experiments and faults of the data, which others add; all
+        candidates; the fit that stands for the verdict.
     """
-    verdict, found, fit = checked_verdict(_searched(problem, effects, tell, on_search))
-    moved = moved_unknowns(problem, found.none)
+    outcome = checked_verdict(_searched_verdict(problem, effects, on_progress, on_search))
+    verdict = outcome.verdict
+    moved = moved_unknowns(problem, outcome.search.no_effect)
     sentence = f"{verdict.sentence} {moved_sentence(moved)}".strip()
-    return Outcome(replace(verdict, sentence=sentence, moved=moved), found, fit)
+    return outcome._replace(verdict=replace(verdict, sentence=sentence, moved=moved))
 
 
-def _searched(problem: Problem, effects: Sequence[Effect], tell: Tell, on_search: OnSearch) -> Outcome:
-    """Return the verdict on a search along the missing force, or else on whole simulations."""
-    found = search(problem, effects, tell, on_search)
-    first = _named(found)
-    if not found.forces or first.verdict.kind is not VerdictKind.UNEXPLAINED:
+def _searched_verdict(
+    problem: Problem, effects: Sequence[Effect], on_progress: OnProgress, on_search: OnSearch
+) -> VerdictOutcome:
+    """Return the verdict on a search, where the missing force gives none on simulations."""
+    first_search = search(problem, effects, on_progress, on_search)
+    first = _verdict_on_search(first_search)
+    is_unexplained = first.verdict.kind is VerdictKind.UNEXPLAINED
+    if not first_search.force_hypotheses or not is_unexplained:
         return first
-    tell("nothing follows the missing force: comparing whole simulations")
-    again = attempt(problem, Candidate(), found.none.point)  # time steps may be finer by now
-    second = Search(problem, found.effects, again or found.none, tell=tell)
-    second.force = found.force
-    on_search(second)
-    second.singles()
-    second.sets()
-    other = _named(second)
-    second.forces = found.forces
-    named = other.verdict.kind is VerdictKind.NAMED_IN_PART and any(_acts(problem, other.fit))
-    # held-out trials alone give no name: most of the gap is to be closed where it was fitted
+    on_progress("nothing follows the missing force: comparing whole simulations")
+    # time steps may be finer by now
+    no_effect = attempt(problem, Candidate(), first_search.no_effect.point)
+    second_search = Search(
+        problem, first_search.effects, no_effect or first_search.no_effect, on_progress=on_progress
+    )
+    second_search.force_search = first_search.force_search
+    on_search(second_search)
+    second_search.search_single_effects()
+    second_search.search_sets()
+    second = _verdict_on_search(second_search)
+    second_search.force_hypotheses = first_search.force_hypotheses
+    is_named = second.verdict.kind is VerdictKind.NAMED_IN_PART
+    has_law = any(_acts_on_structure(problem, second.fit))
+    # held-out trials alone give no name: most of the gap must be closed where it was fitted
     count = float(problem.counts.sum())
-    gap = second.none.chi_square - count
-    closes = gap > 0.0 and other.fit.chi_square - count < (1.0 - SEARCH.least_share) * gap
-    return other if named and closes else first
+    gap = second_search.no_effect.chi_square - count
+    remaining = second.fit.chi_square - count
+    closes_gap = gap > 0.0 and remaining < (1.0 - SEARCH.least_share) * gap
+    return second if is_named and has_law and closes_gap else first
 
 
-def _acts(problem: Problem, fit: CandidateFit) -> list[bool]:
-    """Return which effects of a fit act on the structure, and are no errors of readings."""
+def _acts_on_structure(problem: Problem, fit: CandidateFit) -> list[bool]:
+    """Return for each effect of a fit whether it acts on the structure, not on readings only."""
     return [acts_within(term.effect, problem.setting) for term in fit.candidate.terms]
 
 
-def _named(found: Search) -> Outcome:
-    """Return the verdict on a search, by its simulations or else by the missing force."""
-    verdict, _, fit = as_recorded(found)
+def _verdict_on_search(search: Search) -> VerdictOutcome:
+    """Return the verdict on a search: by its simulations, or else by names in part."""
+    outcome = verdict_by_simulations(search)
+    verdict = outcome.verdict
     stands = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
     if stands or verdict.kind is VerdictKind.GROUP:
-        gate = held_out_gate(residual_set(found.problem, fit, sensitivities=False))
-        sentence = f"{verdict.sentence} {gate.reason}" if gate.passed is False else verdict.sentence
+        gate = check_held_out(residual_set(search.problem, outcome.fit, sensitivities=False))
+        sentence = verdict.sentence
+        if gate.passed is False:
+            sentence = f"{sentence} {gate.reason}"
+            stands = False
         verdict = replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
-        stands = stands and gate.passed is not False
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP):
-        overruled = _overruled(found, verdict)
+        overruled = _overruled_by_instruments(search, verdict)
         if overruled is not None:
-            return Outcome(overruled, found, found.none)
+            return VerdictOutcome(overruled, search, search.no_effect)
     if stands and len(verdict.effects) > 1:
-        alone = _without_readings(found, verdict, fit)
-        return without_sliver(found, verdict, fit) if alone is None else alone
+        laws_alone = _laws_without_reading_errors(search, verdict, outcome.fit)
+        if laws_alone is not None:
+            return laws_alone
+        return without_negligible_effect(search, verdict, outcome.fit)
     failed = {gate.name for gate in verdict.gates if gate.passed is False}
-    open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
-    open_group = verdict.kind is VerdictKind.GROUP and bool(found.forces)
     misfits = bool(failed & {"absolute fit", "held-out trials"})
-    if open_group or (not stands and (misfits or verdict.kind in open_kinds)):
-        return judged_in_part(found, verdict)
-    return Outcome(verdict, found, fit)
+    open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
+    is_open = not stands and (misfits or verdict.kind in open_kinds)
+    is_open_group = verdict.kind is VerdictKind.GROUP and bool(search.force_hypotheses)
+    if is_open_group or is_open:
+        return verdict_in_part(search, verdict)
+    return VerdictOutcome(verdict, search, outcome.fit)
 
 
-def _without_readings(found: Search, verdict: Verdict, fit: CandidateFit) -> Outcome | None:
-    """Return the verdict that names laws in part, without an error of readings that was named beside them.
+def verdict_by_simulations(search: Search) -> VerdictOutcome:
+    """Return the verdict if a right model leaves noise as the records say, and no more.
 
-    Where laws are nearly all of the missing force, such an error takes up what is left, whatever it is.
+    The sets that matter are fitted exactly first, since few steps give rough evidence.
     """
-    acts = _acts(found.problem, fit)
-    if not found.forces or all(acts) or not any(acts):
+    probabilities = search.set_probabilities()
+    for _ in range(SEARCH.largest_group):
+        exact = {fit.candidate.identifiers for fit in search.exact_fits.values()}
+        rough = [names for names in most_probable_sets(probabilities) if names not in exact]
+        if not rough:
+            break
+        search.fit_exactly(search.best_of(rough[0]))
+        probabilities = search.set_probabilities()
+    return decide(Case(search, probabilities))
+
+
+def _laws_without_reading_errors(
+    search: Search, verdict: Verdict, fit: CandidateFit
+) -> VerdictOutcome | None:
+    """Return the verdict that names laws in part, without the errors of readings beside them.
+
+    Where laws are nearly all of the missing force, such an error takes up whatever they leave. None
+    where the verdict does not name both, or laws alone cannot be named.
+    """
+    acts = _acts_on_structure(search.problem, fit)
+    names_both = any(acts) and not all(acts)
+    if not search.force_hypotheses or not names_both:
         return None
-    return nearly_all_by_laws(found, verdict)
+    return verdict_by_laws_alone(search, verdict)
 
 
-def _overruled(found: Search, verdict: Verdict) -> Verdict | None:
-    """Return the verdict where errors of instruments that are named are no cause; None where they may be.
+def _overruled_by_instruments(search: Search, verdict: Verdict) -> Verdict | None:
+    """Return the verdict that named errors of instruments are no cause; None where they may be one.
 
-    They are none below a size that any instrument has. Nor where they only keep calibrated parameters within
-    their priors: with one channel under a recorded drive a gain does what all parameters of a linear model do
-    together. Where the model as it is leaves no gap on held-out trials either, nothing but these priors
-    speaks for it.
+    They are no cause below a size that any instrument has. Nor are they where they only keep
+    calibrated parameters within their priors: with one channel under a recorded drive a gain does
+    what all parameters of a linear model do together. Where the model as it is leaves no gap on
+    held-out trials either, nothing but these priors supports the name.
     """
-    problem, no_name = found.problem, replace(verdict, effects=(), group=())
-    what = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
+    problem = search.problem
+    without_name = replace(verdict, effects=(), group=())
+    causes = " or ".join(dict.fromkeys(effect.name for effect in verdict.effects))
     if all(is_small(problem, effect.patch) for effect in verdict.effects):
-        sentence = said("verdict.nuisance", what=what, least=100.0 * LEAST_SIZE)
-        return replace(no_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
-    parts = [part for effect in verdict.effects for part in effect.patch]
-    gains = any(isinstance(part, LoadGain | SensorGain) for part in parts)
-    instruments = gains and all(isinstance(part, INSTRUMENTS) for part in parts)
-    if not instruments or not is_one_driven_channel(problem) or not problem.campaign.held_out:
+        sentence = (
+            f"The model explains the data but for {causes} below {100.0 * LEAST_SIZE:g} % of what "
+            "it acts on, which is a nuisance of the instruments and no name."
+        )
+        return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
+    if not has_one_driven_channel(problem) or not problem.campaign.held_out:
         return None
-    if held_out_gate(residual_set(problem, found.none, sensitivities=False)).passed is not True:
+    primitives = [primitive for effect in verdict.effects for primitive in effect.patch]
+    has_gain = any(isinstance(primitive, LoadGain | SensorGain) for primitive in primitives)
+    if not has_gain or not all(isinstance(primitive, INSTRUMENTS) for primitive in primitives):
         return None
-    moved = zip(problem.model.parameters, found.none.point.shared, strict=False)
-    far = [f"{item.name!r} {abs(u):.1f}" for item, u in moved if abs(u) > SEARCH.stand_in_range]
-    told = f" ({', '.join(far)} stated deviations off)" if far else ""
-    sentence = said("verdict.parameters_or_instruments", far=told, what=what)
+    residuals = residual_set(problem, search.no_effect, sensitivities=False)
+    if check_held_out(residuals).passed is not True:
+        return None
+    strained = []
+    for parameter, u in zip(problem.model.parameters, search.no_effect.point.shared, strict=False):
+        if abs(u) > SEARCH.stand_in_range:
+            strained.append(f"{parameter.name!r} {abs(u):.1f}")
+    far = f" ({', '.join(strained)} stated deviations off)" if strained else ""
+    sentence = (
+        "The model predicts held-out trials as it is, but with calibrated parameters beside their "
+        f"priors{far}. An error of the instruments ({causes}) would do as well: with one channel "
+        "these data cannot tell them apart."
+    )
     resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
-    return replace(no_name, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles)
+    return replace(
+        without_name, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles
+    )

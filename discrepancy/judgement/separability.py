@@ -1,33 +1,36 @@
-"""What a campaign can decide, before its data are looked at: detectable sizes and confusion groups.
+"""What a campaign can decide before its data are looked at: detectable sizes and confusion groups.
 
-Every effect is put on the model at its prior median; the change it makes, with all nuisances projected out,
-is compared with the noise (can it be seen?) and with what every other effect can do (can it be told apart?).
+Every effect is put on the model at its prior median. The change that it makes, without what all
+nuisances can do, is compared with the noise (can it be seen?) and with what every other effect can
+do (can it be told apart?).
 """
 
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import inf, sqrt
-from operator import attrgetter
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord, Start, Trial
 from discrepancy.catalogue.entry import Effect, Setting
-from discrepancy.errors import DiscrepancyError, said
-from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, Term
+from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen
-from discrepancy.fits.trial_data import stand_in
+from discrepancy.fits.screening import Screen, ScreenedChange
+from discrepancy.fits.trial_data import stand_in_deviation
 from discrepancy.system.interface import Model
 
 CONFUSED = 9.0
-"""Squared distance [sigma^2] below which two effects form a confusion group."""
+"""Squared distance below which two effects form a confusion group [sigma^2]."""
 DETECTED = 25.0
-"""Squared distance from the model [sigma^2] at which an effect is found: 3 nats of Bayes factor, the cost of
-its parameters and of its place in the catalogue."""
+"""Squared distance from the model at which an effect is found [sigma^2]: 3 nats of Bayes factor,
+the cost of its parameters and of its place in the catalogue."""
+LEAST_VISIBLE = 1e-6
+"""Squared distance from the model below which an effect is not compared with others [sigma^2]."""
 
 
 @dataclass(frozen=True)
@@ -37,21 +40,22 @@ class Detectability:
     Attributes
     ----------
     effect : Effect
-        Which.
+        The effect.
     reason : str
         Why it cannot be tested here; empty if it can.
     place : str
-        Where it shows best.
+        The place at which it shows best.
     distance : float
-        d^2 from the model without it at the prior median [sigma^2].
+        The squared distance from the model without it at the prior median [sigma^2].
     parameter : str
-        The parameter that scales it.
+        The name of the parameter that scales it.
     detectable : float
-        Value of that parameter from which on it is found [unit of the parameter]; infinite if never.
+        The value of that parameter from which on the effect is found [unit of the parameter];
+        infinite if never.
     unit : str
-        Of it.
+        The unit of the parameter.
     typical : float
-        Its prior median (for a signed parameter one prior deviation).
+        The prior median of the parameter (one prior deviation for a signed one).
     """
 
     effect: Effect
@@ -71,14 +75,15 @@ class Separability:
     Attributes
     ----------
     detectability : tuple of Detectability
-        In the order of the catalogue.
+        How well each effect is seen, in the order of the catalogue.
     identifiers : tuple of str
-        Of the effects that can be tested, rows and columns of `distance`.
-    distance : (E, E) ndarray
-        d^2 of the row's effect from the nearest that the column's effect can do [sigma^2]: at its median, or
-        where it is not seen there, at the size from which it is. What nobody sees is close to everything.
+        The effects that can be tested: the rows and columns of `distance`.
+    distance : (E, E) array
+        The squared distance of the row's effect from the nearest that the column's effect can do
+        [sigma^2]. It is that at the median of the row's effect, or where it is not seen there, at
+        the size from which it is. What nobody sees is close to everything.
     groups : tuple of tuple of str
-        Confusion groups of two or more.
+        The confusion groups of two or more effects.
     """
 
     detectability: tuple[Detectability, ...]
@@ -87,191 +92,322 @@ class Separability:
     groups: tuple[tuple[str, ...], ...]
 
 
-def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
-    """Return the campaign with what the model predicts in the place of the data.
+# ---------------------------------------------------------------- a campaign as predicted
 
-    Such data leave no rest from which an unknown noise could be told: channels without a noise record get one
-    of a thousandth of their range. Where the state at the begin of a trial is not known, the data say it:
-    from rest nothing would move, and nothing could be seen.
+
+def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
+    """Return a campaign whose readings are those that the model predicts.
+
+    Such data leave no residuals from which an unknown noise could be estimated: channels without a
+    noise record get one of a thousandth of their range. Where the initial state of a trial is
+    unknown it is taken from the data: from rest nothing would move, and nothing could be seen.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign as measured.
+    model : Model
+        The model as it is.
+    setting : Setting
+        The scales by which the catalogue states its priors.
     """
     problem = Problem(campaign, model, setting)
-    point = begun(problem)
-    trials: list[Trial] = []
-    predicted = {}
+    point = prior_point_with_initial_states(problem)
+    predictions = {}
     for number, data in enumerate(problem.trials):
-        response = problem.answer(number, point, Candidate())
-        predicted[data.trial.name] = problem.prediction(number, point, response)
+        response = problem.response_with(number, point, Candidate())
+        predictions[data.trial.name] = problem.prediction(number, point, response)
+    trials: list[Trial] = []
     for trial in campaign.trials:
-        values = predicted.get(trial.name)
-        trials.append(trial if values is None else replace(trial, values=values))
-    ideal = replace(campaign, trials=tuple(trials))
-    channels = {
-        name: channel
-        if channel.noise is not None
-        else replace(channel, noise=NoiseRecord(stand_in(ideal, name), inf))
-        for name, channel in campaign.channels.items()
-    }
-    return replace(ideal, channels=channels)
+        if trial.name in predictions:
+            trial = replace(trial, values=predictions[trial.name])
+        trials.append(trial)
+    predicted = replace(campaign, trials=tuple(trials))
+    channels = dict(campaign.channels)
+    for name, channel in campaign.channels.items():
+        if channel.noise is None:
+            noise = NoiseRecord(stand_in_deviation(predicted, name), inf)
+            channels[name] = replace(channel, noise=noise)
+    return replace(predicted, channels=channels)
 
 
-def began_before(trial: Trial) -> bool:
-    """Whether a motion began before its record, in a state that only the data tell."""
-    return trial.begins is Start.UNKNOWN or bool(trial.release and not trial.release.at_rest)
+def has_free_initial_state(trial: Trial) -> bool:
+    """Return whether a motion began before its record, in a state that only the data say."""
+    if trial.begins is Start.UNKNOWN:
+        return True
+    return trial.release is not None and not trial.release.at_rest
 
 
-def begun(problem: Problem) -> Point:
-    """Return the prior means, with the initial states that only the data tell, fitted with the model.
+def prior_point_with_initial_states(problem: Problem) -> Point:
+    """Return the point of the prior means, with unknown initial states fitted to the data.
 
     Raises
     ------
     FitError
-        As `fit`.
+        If the model gives numbers that are not finite.
     """
     start = problem.start(Candidate())
-    unknown = [began_before(data.trial) for data in problem.trials]
-    if not any(unknown):
+    if not any(has_free_initial_state(data.trial) for data in problem.trials):
         return start
-    # parameters follow: beside a frequency that is off, what begins would fade out of the record
-    found = fit(problem, Candidate(), start).point.local
-    chosen = zip(unknown, found, start.local, strict=True)
-    return replace(start, local=tuple(own if free else kept for free, own, kept in chosen))
+    # parameters are fitted, too: with a wrong frequency the initial motion would fade out
+    fitted = fit(problem, Candidate(), start).point
+    local = []
+    for data, fitted_unknowns, prior_unknowns in zip(
+        problem.trials, fitted.local, start.local, strict=True
+    ):
+        is_free = has_free_initial_state(data.trial)
+        local.append(fitted_unknowns if is_free else prior_unknowns)
+    return replace(start, local=tuple(local))
+
+
+# ---------------------------------------------------------------- what can be seen and told apart
 
 
 def separability(
     campaign: Campaign, model: Model, setting: Setting, effects: Sequence[Effect]
 ) -> Separability:
-    """Return what a campaign can decide.
+    """Return which effects a campaign can detect, and which it can tell apart.
 
     Parameters
     ----------
     campaign : Campaign
-        Inputs, channels and noise count; the measured values do not, but where a trial begins in a state that
-        is not known. See `as_predicted`, for unknown noise too.
+        The campaign. Its inputs, channels and noise count; the measured values do not, but where a
+        trial begins in a state that is not known. See `as_predicted`, for unknown noise too.
     model : Model
         The model as it is.
     setting : Setting
-        Scales.
+        The scales by which the catalogue states its priors.
     effects : sequence of Effect
         The catalogue.
     """
-    ideal = as_predicted(campaign, model, setting)
-    problem = Problem(ideal, model, setting)
-    none = fit(problem, Candidate(), begun(problem), iterations=1)
-    screen = Screen(problem, none)
-    rows: list[Detectability] = []
-    changes: dict[str, list[Change]] = {}
+    problem = Problem(as_predicted(campaign, model, setting), model, setting)
+    start = prior_point_with_initial_states(problem)
+    screen = Screen(problem, fit(problem, Candidate(), start, iterations=1))
+    detectability: list[Detectability] = []
+    visible: list[_VisibleEffect] = []
     for effect in effects:
         reason = effect.unavailable(setting)
         if reason is not None:
-            rows.append(Detectability(effect, reason))
+            detectability.append(Detectability(effect, reason))
             continue
-        options = [
-            change for place in effect.places(setting) for change in screen.changes(Term(effect, place))
-        ]
-        central = _references(screen, effect, effect.places(setting)) or options
-        if not central:
-            rows.append(Detectability(effect, "The structure cannot carry it at any size that was tried."))
+        options = _all_changes(screen, effect)
+        best = _reference_change(screen, effect, options)
+        if best is None:
+            reason = "The structure cannot carry it at any size that was tried."
+            detectability.append(Detectability(effect, reason))
             continue
-        best = max(central, key=attrgetter("size"))
-        if best.size < DETECTED:  # its median place may be where nothing is measured
-            best = max([best, *filter(_at_reference, options)], key=attrgetter("size"))
-        little, factor = screen.shrunk(best)
-        rows.append(_detectability(effect, best, min(best.size, little.size / factor**2)))
-        if best.size > 1e-6:
-            changes[effect.identifier] = [best, *options]
-    names = tuple(changes)
-    small = {name: [screen.shrunk(change) for change in changes[name]] for name in names}
-    distance = np.zeros((len(names), len(names)))
-    for i, one in enumerate(names):
-        target, (little, factor) = changes[one][0], small[one][0]
-        for j, other in enumerate(names):
-            if i != j:
-                first_order = _distance(screen, little, [change for change, _ in small[other]]) / factor**2
-                found = min(_distance(screen, target, changes[other]), first_order)
-                distance[i, j] = found * max(1.0, DETECTED / target.size)
-    return Separability(tuple(rows), names, distance, _groups(names, distance))
+        small = _SmallChange(*screen.shrunk(best))
+        distance = min(best.squared_size, small.change.squared_size / small.factor**2)
+        detectability.append(_detectability(effect, best, distance))
+        if best.squared_size > LEAST_VISIBLE:
+            visible.append(_VisibleEffect(effect.identifier, best, [best, *options]))
+    identifiers = tuple(effect.identifier for effect in visible)
+    distance_matrix = _distances(screen, visible)
+    groups = _confusion_groups(identifiers, distance_matrix)
+    return Separability(tuple(detectability), identifiers, distance_matrix, groups)
 
 
-def _references(screen: Screen, effect: Effect, places: Sequence[str]) -> list[Change]:
-    """Return the changes of an effect at its prior median, at the places where the structure can carry it.
+class _VisibleEffect(NamedTuple):
+    """An effect that changes readings.
 
-    Signed magnitudes are at one prior deviation.
+    Its identifier, its reference change, and all changes that it can make.
     """
-    found = []
-    for term in (Term(effect, place) for place in places):
+
+    identifier: str
+    reference: ScreenedChange
+    options: list[ScreenedChange]
+
+
+class _SmallChange(NamedTuple):
+    """A change that is linear in its magnitude, and the factor by which it was made smaller."""
+
+    change: ScreenedChange
+    factor: float
+
+
+def _all_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
+    """Return the changes by an effect over the grid of its parameters, at all its places."""
+    changes: list[ScreenedChange] = []
+    for place in effect.places(screen.problem.setting):
+        changes.extend(screen.changes(EffectTerm(effect, place)))
+    return changes
+
+
+def _reference_change(
+    screen: Screen, effect: Effect, options: Sequence[ScreenedChange]
+) -> ScreenedChange | None:
+    """Return the most visible change by an effect at its prior median.
+
+    None if the structure carries none.
+
+    Where the effect is not seen at its median place, other places are tried.
+    """
+    references = _changes_at_prior_median(screen, effect) or options
+    if not references:
+        return None
+    best = max(references, key=lambda change: change.squared_size)
+    if best.squared_size < DETECTED:  # its median place may be where nothing is measured
+        at_reference = [change for change in options if _has_reference_magnitude(change)]
+        best = max([best, *at_reference], key=lambda change: change.squared_size)
+    return best
+
+
+def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedChange]:
+    """Return the changes by an effect at its prior median, where the structure can carry it.
+
+    Signed magnitudes, whose median is zero, are at one prior deviation.
+    """
+    changes = []
+    for place in effect.places(screen.problem.setting):
+        term = EffectTerm(effect, place)
         start = term.start()
-        for number, item in enumerate(term.parameters):
-            if item.magnitude and item.prior.value(0.0) == 0.0:
+        for number, parameter in enumerate(term.parameters):
+            if parameter.magnitude and parameter.prior.value(0.0) == 0.0:
                 start[number] = 1.0
         with suppress(DiscrepancyError):
-            found.append(screen.change(term, start))
-    return found
+            changes.append(screen.change(term, start))
+    return changes
 
 
-def _at_reference(change: Change) -> bool:
-    """Whether the magnitude is that of `_references`."""
-    return all(
-        abs(u) in (0.0, 1.0)
-        for item, u in zip(change.term.parameters, change.start, strict=True)
-        if item.magnitude
-    )
+def _has_reference_magnitude(change: ScreenedChange) -> bool:
+    """Return whether the magnitudes of a change are those of `_changes_at_prior_median`."""
+    for parameter, u in zip(change.term.parameters, change.start, strict=True):
+        if parameter.magnitude and abs(u) not in (0.0, 1.0):
+            return False
+    return True
 
 
-def _detectability(effect: Effect, change: Change, distance: float) -> Detectability:
-    for number, item in enumerate(change.term.parameters):
-        if item.magnitude:
-            typical = abs(item.prior.value(float(change.start[number])))
+def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> Detectability:
+    """Return how well an effect is seen.
+
+    Parameters
+    ----------
+    effect : Effect
+        The effect.
+    change : ScreenedChange
+        Its reference change.
+    distance : float
+        The squared distance of that change from the model [sigma^2].
+    """
+    for number, parameter in enumerate(change.term.parameters):
+        if parameter.magnitude:
+            typical = abs(parameter.prior.value(float(change.start[number])))
             detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
             return Detectability(
-                effect, "", change.term.place, distance, item.name, detectable, item.unit, typical
+                effect=effect,
+                reason="",
+                place=change.term.place,
+                distance=distance,
+                parameter=parameter.name,
+                detectable=detectable,
+                unit=parameter.unit,
+                typical=typical,
             )
     return Detectability(effect, "", change.term.place, distance)
 
 
-def _distance(screen: Screen, target: Change, options: list[Change]) -> float:
-    """Return d^2 of a change from what an effect can do: its nearest grid point, moved by its parameters."""
+# ---------------------------------------------------------------- distances
+
+
+def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
+    """Return the squared distance (E, E) of each effect from the nearest that another can do.
+
+    See `Separability.distance`. Both the effects as they are and effects made small are compared,
+    as effects that are far apart at their medians may be alike to first order.
+    """
+    small_options = [
+        [_SmallChange(*screen.shrunk(change)) for change in effect.options] for effect in effects
+    ]
+    distance = np.zeros((len(effects), len(effects)))
+    for i, effect in enumerate(effects):
+        target = effect.reference
+        small_target = small_options[i][0]
+        for j, other in enumerate(effects):
+            if i == j:
+                continue
+            other_changes = [small.change for small in small_options[j]]
+            first_order = _squared_distance(screen, small_target.change, other_changes)
+            first_order /= small_target.factor**2
+            least = min(_squared_distance(screen, target, other.options), first_order)
+            distance[i, j] = least * max(1.0, DETECTED / target.squared_size)
+    return distance
+
+
+def _squared_distance(
+    screen: Screen, target: ScreenedChange, options: Sequence[ScreenedChange]
+) -> float:
+    """Return the squared distance of a change from what an effect can do [sigma^2].
+
+    What the effect can do is spanned by the option that is nearest to the target, and by its
+    derivatives with respect to the parameters of the effect there.
+
+    Parameters
+    ----------
+    screen : Screen
+        The fit whose inner product measures distances.
+    target : ScreenedChange
+        The change.
+    options : sequence of ScreenedChange
+        The changes by the effect over a grid of its parameters.
+    """
     sign = screen.sign
-    if target.size <= 0.0:
+    if target.squared_size <= 0.0:
         return 0.0
 
-    def overlap(option: Change) -> float:
-        return (
-            abs(float(target.vector * sign @ option.vector)) / sqrt(option.size) if option.size > 0.0 else 0.0
-        )
+    def cosine(option: ScreenedChange) -> float:
+        """Return the cosine between option and target, times the length of the target."""
+        if option.squared_size <= 0.0:
+            return 0.0
+        return abs(float(target.vector * sign @ option.vector)) / sqrt(option.squared_size)
 
-    nearest = max(options, key=overlap)
-    if nearest.size <= 0.0:
-        return target.size
+    nearest = max(options, key=cosine)
+    if nearest.squared_size <= 0.0:
+        return target.squared_size
+    # nearest option and its differences by the parameters
     columns = [nearest.vector]
     for number in range(len(nearest.start)):
-        moved = nearest.start.copy()
-        moved[number] += 10.0 * PARAMETER_STEP
-        with suppress(DiscrepancyError):  # the nearest point may be the last that the model can follow
-            columns.append(screen.change(nearest.term, moved).vector - nearest.vector)
+        stepped = nearest.start.copy()
+        stepped[number] += 10.0 * PARAMETER_STEP
+        with suppress(DiscrepancyError):  # the option may be the last that the structure can carry
+            change = screen.change(nearest.term, stepped)
+            columns.append(change.vector - nearest.vector)
+    # least squares by scaled and regularised normal equations
     span = np.stack(columns)
     gram = (span * sign) @ span.T
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     gram = gram / np.outer(scale, scale) + 1e-6 * np.eye(len(gram))
     right = (span * sign) @ target.vector / scale
-    return max(target.size - float(right @ np.linalg.solve(gram, right)), 0.0)
+    explained = float(right @ np.linalg.solve(gram, right))
+    return max(target.squared_size - explained, 0.0)
 
 
-def _groups(names: tuple[str, ...], distance: FloatArray) -> tuple[tuple[str, ...], ...]:
-    """Return connected sets of effects that are closer than `CONFUSED` in either direction."""
-    _, labels = connected_components(np.minimum(distance, distance.T) < CONFUSED)
-    sets = (np.flatnonzero(labels == label) for label in range(labels.max(initial=-1) + 1))
-    return tuple(tuple(names[i] for i in found) for found in sets if len(found) > 1)
+def _confusion_groups(
+    identifiers: Sequence[str], distance: FloatArray
+) -> tuple[tuple[str, ...], ...]:
+    """Return the connected sets of effects that are closer than `CONFUSED` in either direction."""
+    is_confused = np.minimum(distance, distance.T) < CONFUSED
+    _, labels = connected_components(is_confused)
+    groups = []
+    for label in range(labels.max(initial=-1) + 1):
+        numbers = np.flatnonzero(labels == label).tolist()
+        if len(numbers) > 1:
+            groups.append(tuple(identifiers[number] for number in numbers))
+    return tuple(groups)
 
 
-def usable(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
-    """Return the effects that can be tested here.
+def usable_effects(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
+    """Return the effects of a catalogue that can be tested with a campaign and model.
 
     Raises
     ------
     DiscrepancyError
-        If there is none.
+        If no effect can be tested.
     """
-    found = tuple(effect for effect in effects if effect.unavailable(setting) is None)
-    if not found:
-        raise DiscrepancyError(said("effects.none_testable"))
-    return found
+    usable = tuple(effect for effect in effects if effect.unavailable(setting) is None)
+    if not usable:
+        raise DiscrepancyError(
+            "No effect of the catalogue can be tested with this campaign and model: the campaign "
+            "needs static, ring-down, forced or flight trials whose channels are outputs of the "
+            "model."
+        )
+    return usable

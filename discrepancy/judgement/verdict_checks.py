@@ -1,7 +1,7 @@
-"""What trials say against a verdict, whatever it rests on.
+"""Checks of a verdict against the trials, whatever it rests on.
 
-A hypothesis with which the error grows is no name. Held-out trials far off veto that nothing is missing. A
-fit that leaves more than the signal is no fit, and no evidence of anything.
+A hypothesis with which the error grows is no name. Held-out trials that are far off veto that
+nothing is missing. A fit that leaves more than the signal is no fit, and no evidence of anything.
 """
 
 from collections.abc import Sequence
@@ -17,47 +17,51 @@ from discrepancy.verdict import UnfittedRecord, Verdict, VerdictKind
 from reporting.words import listing
 
 from .closed_share import NOMINAL_UNIT, closed_text, rms_by_channel
-from .conclusion import NO_GAP, Outcome, effects_text
-from .proof import told_share
+from .conclusion import NO_GAP, VerdictOutcome, effects_text
+from .proof import closed_share_or_reason
 
 VETO_NOISES = 5.0
 """rms over the noise from which on a channel of a held-out trial vetoes that nothing is missing."""
 VETO_DEVIATIONS = 3.0
 """The same over the deviation of the prediction: what the fitted trials leave open is no gap."""
-RECORDS_TOLD = 3
-"""Records that a sentence names."""
+MOST_MENTIONED = 3
+"""Number of records that a sentence mentions."""
 WHITE_SECOND_DIFFERENCES = 6.0
 """Variance of second differences of white noise over its own."""
 
 
-def checked_verdict(outcome: Outcome) -> Outcome:
-    """Return a verdict that the trials bear out: the same, or one that names nothing and says why.
+def checked_verdict(outcome: VerdictOutcome) -> VerdictOutcome:
+    """Return a verdict that the trials confirm: the same, or one that names nothing and says why.
 
     Parameters
     ----------
-    outcome : Outcome
+    outcome : VerdictOutcome
         A verdict, its search, and the fit that stands for it.
     """
     verdict, search, fit = outcome
     problem = search.problem
-    before = residual_set(problem, search.none, sensitivities=False)
-    after = before if fit is search.none else residual_set(problem, fit, sensitivities=False)
+    no_effect = search.no_effect
+    before = residual_set(problem, no_effect, sensitivities=False)
+    after = before
+    if fit is not no_effect:
+        after = residual_set(problem, fit, sensitivities=False)
     unfitted = unfitted_records(after)
     if unfitted:
-        return Outcome(_not_fitted(verdict, unfitted), search, search.none)
+        return VerdictOutcome(_unfitted_verdict(verdict, unfitted), search, no_effect)
     if fit.candidate.terms:
-        closed, _ = told_share(before, after)
+        closed, _ = closed_share_or_reason(before, after)
         if closed is not None and closed.grew:
-            sentence = _larger_error(verdict, closed_text(before, after, closed))
-            return Outcome(_nothing_named(verdict, sentence), search, search.none)
-    far_off = far_held_out_records(before) if verdict.kind in NO_GAP else []
-    if far_off:
-        return Outcome(_nothing_named(verdict, _gap_held_out(before, far_off)), search, search.none)
+            sentence = _larger_error_sentence(verdict, closed_text(before, after, closed))
+            return VerdictOutcome(_without_name(verdict, sentence), search, no_effect)
+    far_records = far_held_out_records(before) if verdict.kind in NO_GAP else []
+    if far_records:
+        sentence = _held_out_gap_sentence(before, far_records)
+        return VerdictOutcome(_without_name(verdict, sentence), search, no_effect)
     return outcome
 
 
-def _nothing_named(verdict: Verdict, sentence: str) -> Verdict:
-    """Return an unexplained gap in the place of a verdict."""
+def _without_name(verdict: Verdict, sentence: str) -> Verdict:
+    """Return the verdict of an unexplained gap in the place of another verdict."""
     return replace(
         verdict,
         kind=VerdictKind.UNEXPLAINED,
@@ -72,12 +76,20 @@ def _nothing_named(verdict: Verdict, sentence: str) -> Verdict:
 # ---------------------------------------------------------------- an error that grew
 
 
-def _larger_error(verdict: Verdict, words: str) -> str:
-    """Return the sentence on a hypothesis that would be named, but makes the error larger."""
-    what = effects_text(verdict.effects) or "the best hypothesis"
+def _larger_error_sentence(verdict: Verdict, clause: str) -> str:
+    """Return the sentence on a hypothesis that would be named, but makes the error larger.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        The verdict that names it.
+    clause : str
+        By how much the error grows, as `closed_text` returns it.
+    """
+    effects = effects_text(verdict.effects) or "the best hypothesis"
     return (
-        f"There is a gap without a name. The most probable explanation in the catalogue is {what}, but "
-        f"{words}: nothing is named, and nothing to be applied."
+        "There is a gap without a name. The most probable explanation in the catalogue is "
+        f"{effects}, but {clause}: nothing is named, and nothing to be applied."
     )
 
 
@@ -86,7 +98,15 @@ def _larger_error(verdict: Verdict, words: str) -> str:
 
 @dataclass(frozen=True)
 class FarRecord:
-    """A channel of a trial that is far off the prediction: rms residual over the noise."""
+    """A channel of a trial that is far off the prediction.
+
+    Attributes
+    ----------
+    trial, channel : str
+        Their names.
+    noises : float
+        The rms residual over the noise.
+    """
 
     trial: str
     channel: str
@@ -96,95 +116,98 @@ class FarRecord:
 def far_held_out_records(residuals: ResidualSet) -> list[FarRecord]:
     """Return the channels of held-out trials that are far off a prediction, the farthest first.
 
-    That is: rms beyond `VETO_NOISES` of the noise, and beyond `VETO_DEVIATIONS` of what noise and the
-    uncertainty of the fit make together. Where no noise is recorded it is what the fit leaves in fitted
-    trials.
+    Their rms residual is beyond `VETO_NOISES` of the noise, and beyond `VETO_DEVIATIONS` of what
+    noise and the uncertainty of the fit make together. Without a noise record the noise is what the
+    fit leaves in the fitted trials.
     """
-    found = []
-    for item in residuals.trials:
-        if not item.trial.held_out:
+    far_records = []
+    for fitted in residuals.trials:
+        if not fitted.trial.held_out:
             continue
-        for column, channel in enumerate(item.trial.channels):
-            used = item.used[:, column]
+        for column, channel in enumerate(fitted.trial.channels):
+            used = fitted.used[:, column]
             if not used.any():
                 continue
-            square = float(np.mean(item.standardised[used, column] ** 2))
-            expected = float(np.mean(item.expected_variance[used, column]))
+            square = float(np.mean(fitted.standardised[used, column] ** 2))
+            expected = float(np.mean(fitted.expected_variance[used, column]))
             if square > max(VETO_NOISES**2, VETO_DEVIATIONS**2 * expected):
-                found.append(FarRecord(item.trial.name, channel, float(np.sqrt(square))))
-    return sorted(found, key=lambda record: -record.noises)
+                far_records.append(FarRecord(fitted.trial.name, channel, float(np.sqrt(square))))
+    return sorted(far_records, key=lambda record: -record.noises)
 
 
-def _gap_held_out(residuals: ResidualSet, far_off: Sequence[FarRecord]) -> str:
+def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarRecord]) -> str:
     """Return the sentence on a gap that only held-out trials show."""
     parts = []
-    for record in far_off[:RECORDS_TOLD]:
-        own = [item for item in residuals.trials if item.trial.name == record.trial]
-        rms = rms_by_channel(replace(residuals, trials=tuple(own)))[record.channel]
+    for record in far_records[:MOST_MENTIONED]:
+        trials = [fitted for fitted in residuals.trials if fitted.trial.name == record.trial]
+        rms = rms_by_channel(replace(residuals, trials=tuple(trials)))[record.channel]
         size = _with_unit(residuals, record.channel, rms)
-        parts.append(
-            f"{record.channel} in {record.trial!r} by {size} (rms, {record.noises:.1f} times the noise)"
-        )
-    more = len(far_off) - RECORDS_TOLD
-    if more > 0:
-        parts.append(f"{more} more records")
+        noises = f"{record.noises:.1f} times the noise"
+        parts.append(f"{record.channel} in {record.trial!r} by {size} (rms, {noises})")
+    remaining = len(far_records) - MOST_MENTIONED
+    if remaining > 0:
+        parts.append(f"{remaining} more records")
     return (
         "The model explains the trials that were fitted, but not those held out: it misses "
-        f"{listing(parts)}. Something is missing that the fitted trials do not show: fit one like these too."
+        f"{listing(parts)}. Something is missing that the fitted trials do not show: fit one like "
+        "these too."
     )
 
 
 def _with_unit(residuals: ResidualSet, channel: str, value: float) -> str:
-    """Return a size of a channel in the unit in which it is drawn."""
+    """Return a value of a channel (SI) in the unit of its figures."""
     factor, unit = UNITS[residuals.channels[channel].quantity].drawn
-    return f"{factor * value:.3g}" if unit == NOMINAL_UNIT else f"{factor * value:.3g} {unit}"
+    text = f"{factor * value:.3g}"
+    return text if unit == NOMINAL_UNIT else f"{text} {unit}"
 
 
-# ---------------------------------------------------------------- a fit that is none
+# ---------------------------------------------------------------- a model that is not fitted
 
 
 def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
-    """Return the records of fitted trials in motion of which more is left than the signal's own variance.
+    """Return the records of fitted trials in motion that leave more than their own variance.
 
-    The signal's variance is that about its mean. A channel in which nothing but noise is seen is fitted:
-    what is left must be beyond `VETO_NOISES` of the noise, recorded or else of the quick part.
+    The variance is that about the mean of the readings. A channel that shows nothing but noise is
+    fitted: the residuals must be beyond `VETO_NOISES` of the noise, too.
     """
-    found = []
-    for item in residuals.trials:
-        if item.trial.held_out or not item.trial.is_dynamic:
+    unfitted = []
+    for fitted in residuals.trials:
+        if fitted.trial.held_out or not fitted.trial.is_dynamic:
             continue
-        for column, channel in enumerate(item.trial.channels):
-            used = item.used[:, column]
+        for column, channel in enumerate(fitted.trial.channels):
+            used = fitted.used[:, column]
             if not used.any():
                 continue
-            left = float(np.sqrt(np.mean(item.residual[used, column] ** 2)))
-            varies = float(np.std(item.trial.values[used, column]))
-            if left > max(varies, VETO_NOISES * _noise(residuals, item, column)):
-                found.append(UnfittedRecord(item.trial.name, channel, left, varies))
-    return tuple(found)
+            rms = float(np.sqrt(np.mean(fitted.residual[used, column] ** 2)))
+            deviation = float(np.std(fitted.trial.values[used, column]))
+            noise = _noise_deviation(residuals, fitted, column)
+            if rms > max(deviation, VETO_NOISES * noise):
+                unfitted.append(UnfittedRecord(fitted.trial.name, channel, rms, deviation))
+    return tuple(unfitted)
 
 
-def _noise(residuals: ResidualSet, item: FittedTrial, column: int) -> float:
-    """Return the deviation of the noise of a record: as recorded, or of the quick part of its readings."""
-    if residuals.degrees_of_freedom(item.trial.channels[column]) > 0.0:
-        return float(item.noise_deviation[column])
-    used: FloatArray = item.trial.values[item.used[:, column], column]
-    if len(used) < 3:
+def _noise_deviation(residuals: ResidualSet, fitted: FittedTrial, column: int) -> float:
+    """Return the noise deviation of a column of a trial.
+
+    As recorded, or of its second differences.
+    """
+    if residuals.degrees_of_freedom(fitted.trial.channels[column]) > 0.0:
+        return float(fitted.noise_deviation[column])
+    readings: FloatArray = fitted.trial.values[fitted.used[:, column], column]
+    if len(readings) < 3:
         return float("inf")
-    return float(np.sqrt(np.mean(np.diff(used, 2) ** 2) / WHITE_SECOND_DIFFERENCES))
+    return float(np.sqrt(np.mean(np.diff(readings, 2) ** 2) / WHITE_SECOND_DIFFERENCES))
 
 
-def _not_fitted(verdict: Verdict, unfitted: Sequence[UnfittedRecord]) -> Verdict:
+def _unfitted_verdict(verdict: Verdict, unfitted: Sequence[UnfittedRecord]) -> Verdict:
     """Return the verdict on a model that could not be fitted to the trials."""
-    parts = []
-    for record in unfitted[:RECORDS_TOLD]:
-        parts.append(f"{record.channel} in {record.trial!r}")
-    more = len(unfitted) - RECORDS_TOLD
-    if more > 0:
-        parts.append(f"{more} more records")
+    parts = [f"{record.channel} in {record.trial!r}" for record in unfitted[:MOST_MENTIONED]]
+    remaining = len(unfitted) - MOST_MENTIONED
+    if remaining > 0:
+        parts.append(f"{remaining} more records")
     sentence = (
-        f"The model is not fitted: it leaves more of {listing(parts)} than the readings vary about their "
-        "mean. That is no evidence of a missing force. Check how the trials begin, inputs, signs and units, "
-        "and try a shorter record."
+        f"The model is not fitted: it leaves more of {listing(parts)} than the readings vary about "
+        "their mean. That is no evidence of a missing force. Check how the trials begin, inputs, "
+        "signs and units, and try a shorter record."
     )
-    return replace(_nothing_named(verdict, sentence), unfitted=tuple(unfitted))
+    return replace(_without_name(verdict, sentence), unfitted=tuple(unfitted))

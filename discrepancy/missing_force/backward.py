@@ -1,6 +1,7 @@
 """What readings tell of the state before them: the passes of a record from its end to its begin.
 
-Shapes: n states, c channels, N samples, W columns that are filtered alike, S different steps, B places.
+Shapes: n states, c channels, N samples, W columns that are filtered alike, S different steps, B
+places.
 """
 
 import numpy as np
@@ -21,17 +22,17 @@ def later(
     gains: FloatArray,
     variances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return what readings from a sample on add to the state there, and how well later ones know the next.
+    """Return the smoothing additions and informations of all samples, in a backward pass.
 
-    By de Jong (1989, J. American Statistical Association 84, 1085-1088), without an inverse, from what
-    `forward` makes of all samples of one column. In his letters: r (n,) is the addition, N (n, n) the
-    information.
+    By de Jong (1989, J. American Statistical Association 84, 1085-1088), without an inverse, from
+    what `forward` makes of all samples of one column. In his letters: r (n,) is the addition, N (n,
+    n) the information.
 
     Returns
     -------
     additions, informations : (N, n), (N, n, n) ndarray
-        The smoothed state is the prediction and its covariance C times the addition; after the sample's own
-        readings its covariance is C - C information C.
+        The smoothed state is the prediction and its covariance C times the addition; after the
+        sample's own readings its covariance is C - C information C.
     """
     count = len(step_of_sample)
     n = rows.shape[1]
@@ -51,7 +52,10 @@ def later(
                 along = information @ gain
                 size = gain @ along + 1.0 / variances[k, c]
                 information = (
-                    information - np.outer(row, along) - np.outer(along, row) + size * np.outer(row, row)
+                    information
+                    - np.outer(row, along)
+                    - np.outer(along, row)
+                    + size * np.outer(row, row)
                 )
         additions[k] = addition
         # carry both back over the step
@@ -71,10 +75,12 @@ def backward(
     columns: FloatArray,
     places: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return what the readings from samples `places` (B,) on tell of the state there (information filter).
+    """Return the information on the state from all readings after some samples.
 
-    `noise_roots` (S, n, n) are roots of the noises. Given a state z (n,), the logarithm of the density of
-    these readings is, for columns in the weights w (W,):
+    This is an information filter, run backwards from the end of the record.
+
+    `noise_roots` (S, n, n) are roots of the noises. Given a state z (n,), the logarithm of the
+    density of these readings is, for columns in the weights w (W,):
 
         w^T h^T z - z^T J z / 2 - w^T c w / 2 - half.
 
@@ -126,7 +132,7 @@ def backward(
             place -= 1
         if place < 0:
             break
-        # carry it back over the step, whose noise is integrated out; Joseph's form, of the information
+        # carry it back over the step with its noise integrated out (Joseph form of the information)
         step = step_of_sample[k]
         if not (steady and reads_like_last and step == last_step):
             root = noise_roots[step]
@@ -135,7 +141,11 @@ def backward(
             inverse = np.ascontiguousarray(np.linalg.inv(inner))
             gain = J_with_readings @ root @ inverse
             keep = np.eye(n) - gain @ root.T
-            J = transitions[step].T @ (keep @ J_with_readings @ keep.T + gain @ gain.T) @ transitions[step]
+            J = (
+                transitions[step].T
+                @ (keep @ J_with_readings @ keep.T + gain @ gain.T)
+                @ transitions[step]
+            )
             J = 0.5 * (J + J.T)
             carry_back = np.ascontiguousarray(transitions[step].T @ keep)
             steady = reads_like_last and step == last_step and is_steady(J, last_J)

@@ -1,8 +1,8 @@
 """Since when, until when: stretches of a record in which a force acts that does not act otherwise.
 
-Beside a force of small size that may be missing throughout, a second one, larger, is on or off. Which it is
-in a stretch is weighed with all unknowns of the records. Stretches are turned on or off, one after the other,
-while that gains more than the places of their ends cost.
+Beside a force of small size that may be missing throughout, a second one, larger, is on or off.
+Which it is in a stretch is weighed with all unknowns of the records. Stretches are turned on or
+off, one after the other, while that gains more than the places of their ends cost.
 """
 
 from collections.abc import Sequence
@@ -15,17 +15,26 @@ from discrepancy.campaign.records import BoolArray, FloatArray
 
 from .filtered import Process
 from .process_search import SIZE_DEVIATION, TIME_DEVIATION
-from .switched_record import EventTrials, Forces, Products, SwitchedRecord, changes, price_of_changes
+from .switched_record import (
+    EventTrials,
+    Forces,
+    Products,
+    SwitchedRecord,
+    changes,
+    price_of_changes,
+)
 from .view import View
 
 FINE = 4000
 """Places of a change in a short record: between its samples too."""
 WORK = 4000
-"""Samples of all records between which events are looked for; of more, some are left out until the last."""
+"""Samples of all records between which events are looked for; of more, some are left out until the
+last."""
 MOST_EVENTS = 6
 """Stretches of a record: more are no events, but a force that varies."""
 EVENT_SIZE, STEADY_SIZE = 3.0, 0.003
-"""Sizes of both forces with which the search begins, over the process: of the event's, of the other."""
+"""Sizes of both forces with which the search begins, over the process: of the event's, of the
+other."""
 NONE = 1e-3
 """Size of no force over one."""
 GROUND = 3.0
@@ -65,10 +74,14 @@ class EventSearch(EventTrials):
 
     def products(self, forces: Forces, paths: Sequence[BoolArray]) -> list[Products]:
         """Return what each trial tells of the shared unknowns."""
-        return [SwitchedRecord(self, number, forces).products(on) for number, on in enumerate(paths)]
+        return [
+            SwitchedRecord(self, number, forces).products(on) for number, on in enumerate(paths)
+        ]
 
-    def fitted(self, begin: Forces, paths: Sequence[BoolArray], passes: int) -> tuple[Forces, float]:
-        """Return the most probable forces beside events, from some on, and ln evidence less all prices."""
+    def fitted(
+        self, begin: Forces, paths: Sequence[BoolArray], passes: int
+    ) -> tuple[Forces, float]:
+        """Return the most probable forces given events, and ln evidence less the events' price."""
         scale = np.tile((self.process.size, self.process.time), 2)
         values = [value for force in begin for value in (force.size, force.time)]
         first = np.log(np.array(values) / scale)
@@ -148,7 +161,9 @@ class Events:
             density = np.exp(log_evidence - log_evidence.max())
             steps = 0.5 * (density[1:] + density[:-1]) * np.diff(place_times)
             distribution = np.r_[0.0, np.cumsum(steps)]
-            moments[change] = np.interp((0.5, 0.05, 0.95), distribution / distribution[-1], place_times)
+            moments[change] = np.interp(
+                (0.5, 0.05, 0.95), distribution / distribution[-1], place_times
+            )
         return moments
 
 
@@ -169,7 +184,8 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
     Returns
     -------
     Events
-        With changes where these tell more than a force that acts throughout the records that have one.
+        With changes where these tell more than a force that acts throughout the records that have
+        one.
     """
     every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
     search = EventSearch(view, port, process, every=every)
@@ -191,7 +207,7 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
 
 
 def throughout(view: View, port: int, process: Process) -> Events:
-    """Return a force that acts in all records from the first sample to the last, nothing being weighed."""
+    """Return a force that acts in all records from the first sample to the last."""
     always = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
     return Events(EventSearch(view, port, process), (process, process), always, -np.inf)
 
@@ -200,7 +216,8 @@ def _among_all_samples(coarse: Events, every: int) -> Events:
     """Return events found in a part of the readings, placed among all."""
     search = EventSearch(coarse.search.view, coarse.search.port, coarse.search.process)
     paths = [
-        np.repeat(on, every)[: len(trial.time)] for on, trial in zip(coarse.paths, search.trials, strict=True)
+        np.repeat(on, every)[: len(trial.time)]
+        for on, trial in zip(coarse.paths, search.trials, strict=True)
     ]
     events_of_all = Events(search, coarse.forces, paths, -np.inf)
     for number in range(len(paths)):
@@ -225,7 +242,7 @@ def _throughout_some(search: EventSearch, never: Sequence[BoolArray]) -> Events:
 
 
 def _round(search: EventSearch, forces: Forces, paths: Sequence[BoolArray], passes: int) -> Events:
-    """Return events with stretches switched beside some forces, and the forces fitted beside these."""
+    """Return events with new stretches beside given forces, and the forces fitted to these."""
     new_paths = search.switched(forces, paths)
     new_forces, score = search.fitted(forces, new_paths, passes)
     return Events(search, new_forces, new_paths, score)

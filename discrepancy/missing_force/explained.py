@@ -1,4 +1,4 @@
-"""A hypothesis along the missing force: its effects, what is missing beside them, and the motion that was."""
+"""A hypothesis along the missing force: effects, the force missing beside them, and the motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,37 +11,39 @@ from discrepancy.fits.candidate import Candidate
 
 from .filtered import Solution
 from .process_search import MOST_STEPS, Processes
-from .view import Motion, View
+from .view import TrialMotion, View
 
 NOTHING = Candidate()
+"""The candidate without effects."""
 NO_VALUES = np.zeros(0)
-ALONG = 0.5
-"""Share of what is left of an unknown law that may be hidden along a named one: without it intervals beside a
+"""Its parameters."""
+HIDDEN_PART = 0.5
+"""Part of the remaining force that may be hidden along a named law. Without it, intervals beside a
 weaker law hold 4 of 9 hidden values."""
 
 
 @dataclass(frozen=True, eq=False)
-class Explained:
-    """A hypothesis.
+class ForceHypothesis:
+    """A hypothesis that was fitted to the missing force: its effects act along the motion that was.
 
     Attributes
     ----------
     candidate : Candidate
-        Its effects; none: missing forces alone.
-    effect : (E,) ndarray
-        Their unknowns, standard normal before.
+        The effects; without any, there are missing forces alone.
+    effect : (E,) array
+        The scaled effect parameters.
     processes : mapping of int to Process
-        Missing forces beside them, by the numbers of their ports.
+        The missing forces beside the effects, by the numbers of their ports.
     log_evidence : float
-        [nat], with the prior of the processes.
+        The log evidence, with the prior of the processes [nat].
     view : View
-        Trials and columns.
+        The trials and the columns of the effects.
     solution : Solution
-        Shared unknowns first, those of the effects last.
-    local : sequence of (L,) ndarray
-        Unknowns of the trials.
-    motions : sequence of Motion
-        By trial.
+        The values of shared unknowns and effect parameters, in this order.
+    local : sequence of (L,) array
+        The unknowns of each trial.
+    motions : sequence of TrialMotion
+        The motion of each trial.
     """
 
     candidate: Candidate
@@ -51,52 +53,71 @@ class Explained:
     view: View
     solution: Solution
     local: Sequence[FloatArray]
-    motions: Sequence[Motion]
+    motions: Sequence[TrialMotion]
 
     @property
     def effect_covariance(self) -> FloatArray:
-        """Of the effects' unknowns (E, E), beside the missing force as it is."""
-        at = len(self.view.shared_precision)
-        return self.solution.covariance[at:, at:]
+        """The covariance (E, E) of the effect parameters, beside the missing force as it is."""
+        first_effect = len(self.view.shared_precision)
+        return self.solution.covariance[first_effect:, first_effect:]
 
     @cached_property
     def shared(self) -> FloatArray:
-        """Shared unknowns (K,) at the values of the effects, which may not have settled."""
-        at = len(self.view.shared_precision)
-        mean, covariance = self.solution.mean, self.solution.covariance
+        """The shared unknowns (K,) at the values of the effects, which may not have converged.
+
+        They are the conditional mean of the solution, given the effect parameters.
+        """
+        first_effect = len(self.view.shared_precision)
+        mean = self.solution.mean
+        covariance = self.solution.covariance
         if not len(self.effect):
-            return mean[:at]
-        step = np.linalg.solve(covariance[at:, at:], self.effect - mean[at:])
-        return np.asarray(mean[:at] + covariance[:at, at:] @ step)
+            return mean[:first_effect]
+        residual = self.effect - mean[first_effect:]
+        weights = np.linalg.solve(covariance[first_effect:, first_effect:], residual)
+        return np.asarray(mean[:first_effect] + covariance[:first_effect, first_effect:] @ weights)
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Of all unknowns, shared ones first, wide enough for what is left to lie along the laws in part.
+        """The covariance (K + E, K + E) of all unknowns, with room for a hidden force.
 
-        The process is a force in time that has nothing to do with the motion. What is left of another law
-        has: as much of it as is seen beside the columns may be hidden along them.
+        The process of a missing force has nothing to do with the motion. What remains of another
+        law has: as much of it as is seen beside the named laws may be hidden along them.
         """
-        at, covariance = len(self.view.shared_precision), self.solution.covariance
+        covariance = self.solution.covariance
         if not len(self.effect):
             return covariance
-        wider = np.zeros((len(self.effect),) * 2)
+        first_effect = len(self.view.shared_precision)
+        hidden = self._covariance_of_hidden_force()
+        effect_covariance = covariance[first_effect:, first_effect:]
+        # all unknowns follow the effect parameters by their regression on these
+        regression = np.linalg.lstsq(effect_covariance, covariance[first_effect:], rcond=None)[0].T
+        return np.asarray(covariance + regression @ hidden @ regression.T)
+
+    def _covariance_of_hidden_force(self) -> FloatArray:
+        """Return the covariance (E, E) of effect parameters that a hidden force adds."""
+        hidden = np.zeros((len(self.effect),) * 2)
         for port, process in self.processes.items():
-            rows = []
-            for number, trial in enumerate(self.view.trials):
-                nothing = np.zeros(len(trial.fine_time))
-                forces = [item[number].forces.get(port, nothing) for item in self.view.effects]
-                rows.append(np.array([np.asarray(force)[:: trial.parts] for force in forces]))
-            columns = np.concatenate(rows, axis=-1)  # the forces (E, T) at the samples of all trials
+            columns = self._effect_forces(port)
             acting = np.flatnonzero(columns.any(axis=1))
-            if len(acting):
-                size = (ALONG * process.size) ** 2
-                gram = columns[acting] @ columns[acting].T / columns.shape[1]
-                wider[np.ix_(acting, acting)] += size * np.linalg.inv(gram + size * np.eye(len(acting)))
-        follow = np.linalg.lstsq(covariance[at:, at:], covariance[at:], rcond=None)[0].T
-        return np.asarray(covariance + follow @ wider @ follow.T)
+            if not len(acting):
+                continue
+            variance = (HIDDEN_PART * process.size) ** 2
+            gram = columns[acting] @ columns[acting].T / columns.shape[1]
+            regularised = gram + variance * np.eye(len(acting))
+            hidden[np.ix_(acting, acting)] += variance * np.linalg.inv(regularised)
+        return hidden
+
+    def _effect_forces(self, port: int) -> FloatArray:
+        """Return the forces (E, T) of a unit of each effect parameter at a port, at all samples."""
+        by_trial = []
+        for number, trial in enumerate(self.view.trials):
+            no_force = np.zeros(len(trial.fine_time))
+            forces = [column[number].forces.get(port, no_force) for column in self.view.effects]
+            by_trial.append(np.array([np.asarray(force)[:: trial.parts] for force in forces]))
+        return np.concatenate(by_trial, axis=-1)
 
 
-def seen(
+def with_most_probable_forces(
     view: View,
     median: Processes,
     begin: Processes,
@@ -105,11 +126,29 @@ def seen(
     *,
     near: bool = False,
     most_steps: int = MOST_STEPS,
-) -> Explained:
-    """Return a hypothesis beside the most probable missing forces."""
+) -> ForceHypothesis:
+    """Return a hypothesis beside the most probable missing forces.
+
+    Parameters
+    ----------
+    view : View
+        The trials and the columns of the effects.
+    median : mapping of int to Process
+        The prior medians of the missing forces, by the numbers of their ports.
+    begin : mapping of int to Process
+        The missing forces from which the search for the most probable ones begins.
+    candidate : Candidate
+        The effects.
+    effect : (E,) array
+        The scaled effect parameters about which the view is linear.
+    near : bool
+        Whether the search begins at `begin` itself, not at the best of a grid around it.
+    most_steps : int
+        The largest number of steps of Newton's method.
+    """
     processes, log_evidence = view.most_probable(median, begin, near=near, most_steps=most_steps)
     solution, local, motions = view.smoothed(processes)
-    return Explained(
+    return ForceHypothesis(
         candidate=candidate,
         effect=effect,
         processes=processes,

@@ -1,8 +1,10 @@
-"""The Kalman filter with missing forces at ports: evidence of columns, and the forces and the motion seen.
+"""The Kalman filter with missing forces at ports.
 
-A force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2, two
-states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signal Processing), or 1/2.
-Unknowns that act in proportion follow from what whitened readings and columns share.
+Evidence of columns, and the forces and the motion seen.
+
+A force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2,
+two states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signal Processing),
+or 1/2. Unknowns that act in proportion follow from what whitened readings and columns share.
 """
 
 from collections.abc import Sequence
@@ -17,7 +19,7 @@ from scipy.linalg import cho_factor, cho_solve
 from discrepancy.campaign.records import FloatArray
 
 from .backward import later
-from .kalman import Steps, discretised, forward
+from .kalman import FilterSteps, discretised, forward
 from .trial import SeenTrial
 
 
@@ -53,8 +55,8 @@ class Process:
         return 2.0 / self.time if self.rough else 4.0 * np.sqrt(3.0) / self.time
 
 
-class StateSpace(NamedTuple):
-    """A trial's system with its missing forces and coloured noises as states (n,), in units of size one.
+class ForceStateSpace(NamedTuple):
+    """A trial's system with missing forces and coloured noises as states (n,), scaled to size one.
 
     Attributes
     ----------
@@ -91,7 +93,7 @@ class Smoothed(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Filtered:
+class ForceFilter:
     """A trial with missing forces at ports.
 
     Attributes
@@ -112,11 +114,14 @@ class Filtered:
         state_count = len(system.generator)
         fastest = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
         pushes = [
-            np.abs(system.actions[port]).max(initial=0.0) * process.size for port, process in self.processes
+            np.abs(system.actions[port]).max(initial=0.0) * process.size
+            for port, process in self.processes
         ]
         largest_push = max(*pushes, 1e-300)
         units = np.full(state_count, largest_push / fastest)
-        has_positions = state_count % 2 == 0  # the first half are positions, the second their speeds
+        has_positions = (
+            state_count % 2 == 0
+        )  # the first half are positions, the second their speeds
         if has_positions:
             units[: state_count // 2] /= fastest
         return units
@@ -137,7 +142,7 @@ class Filtered:
         return ratios
 
     @cached_property
-    def system(self) -> StateSpace:
+    def system(self) -> ForceStateSpace:
         """The system, its missing forces and the coloured parts of noises, in this order."""
         trial = self.trial
         motion = slice(0, len(trial.system.generator))
@@ -159,9 +164,9 @@ class Filtered:
             rows[:, place] = -trial.system.through[port] * process.size / trial.deviation
             start[force, force] = np.eye(len(process.generator))
             if trial.settled:  # the trial begins at rest under the missing force too
-                at_rest = np.linalg.lstsq(generator[motion, motion], -generator[motion, place], rcond=1e-12)[
-                    0
-                ]
+                at_rest = np.linalg.lstsq(
+                    generator[motion, motion], -generator[motion, place], rcond=1e-12
+                )[0]
                 start[motion, motion] += np.outer(at_rest, at_rest)
                 start[motion, place] = at_rest
                 start[place, motion] = at_rest
@@ -172,25 +177,27 @@ class Filtered:
             start[place, place] = 1.0
             rows[channel, place] = np.sqrt(coloured_share)
         rows *= self.white[:, None]
-        return StateSpace(generator, intensity, rows, start)
+        return ForceStateSpace(generator, intensity, rows, start)
 
     @property
     def key(self) -> tuple[bytes, ...]:
         """What trials of one system and one grid of samples share; they are filtered together."""
-        return tuple(item.tobytes() for item in (*self.system, *self.trial.steps, self.trial.used))
+        return tuple(
+            array.tobytes() for array in (*self.system, *self.trial.steps, self.trial.used)
+        )
 
-    def steps(self, columns: FloatArray) -> Steps:
+    def steps(self, columns: FloatArray) -> FilterSteps:
         """Return the record with columns (K, N, C) to be filtered."""
         lengths, _ = self.trial.steps
         transitions, noises = discretised(self.system.generator, self.system.intensity, lengths)
         whitened = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
-        return Steps(transitions, noises, self.system.output_rows, self.trial.used, whitened)
+        return FilterSteps(transitions, noises, self.system.output_rows, self.trial.used, whitened)
 
     def products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return products (K, K) of columns (K, N, C), whitened, and what they take from the evidence [nat].
+        """Return products (K, K) of whitened columns (K, N, C), and half a log determinant [nat].
 
-        Half the sum of the logarithms of the readings' variances given those before: infinite under forces
-        far larger than what is read.
+        Half the sum of the logarithms of the readings' variances given those before: infinite under
+        forces far larger than what is read.
         """
         steps = self.steps(columns)
         _, step_of_sample = self.trial.steps
@@ -256,13 +263,13 @@ class Filtered:
         return np.concatenate((np.stack(fine_states, axis=1).reshape(-1, size), means[-1:, :, 0]))
 
     def _deviations(self, covariances: FloatArray) -> FloatArray:
-        """Return deviations (2 P, N) of forces and speeds, of covariances (N, n, n) of the state."""
+        """Return deviations (2 P, N) of forces and speeds, given state covariances (N, n, n)."""
         count = len(self.processes)
-        shown = np.zeros((2 * count, covariances.shape[-1]))
+        rows = np.zeros((2 * count, covariances.shape[-1]))
         for number, (port, process) in enumerate(self.processes):
-            shown[number, self.places[number]] = process.size
-            shown[count + number, : len(self.units)] = self.trial.system.speeds[port] * self.units
-        variances = np.sum((shown @ covariances) * shown, axis=-1)
+            rows[number, self.places[number]] = process.size
+            rows[count + number, : len(self.units)] = self.trial.system.speeds[port] * self.units
+        variances = np.sum((rows @ covariances) * rows, axis=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
 
 
@@ -274,7 +281,10 @@ LEAST_PRECISION = 1e-10
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Unknowns given the readings: log evidence [nat, up to a constant], mean (K,) and covariance (K, K)."""
+    """Unknowns given the readings.
+
+    Log evidence [nat, up to a constant], mean (K,) and covariance (K, K).
+    """
 
     evidence: float
     mean: FloatArray
@@ -297,11 +307,11 @@ class Regression:
     log_determinant: float
 
     def solve(self, chosen: Sequence[int], precision: FloatArray) -> Solution:
-        """Return evidence and values of some of the columns (from 0), of given prior precisions (K,)."""
+        """Return evidence and values of some of the unknowns, given their prior precisions (K,)."""
         rows = np.array([0, *(1 + k for k in chosen)])
         products = self.products[np.ix_(rows, rows)]
         prior = np.maximum(precision, LEAST_PRECISION)
-        # columns may be of any scale and nearly equal: the normal equations are scaled to a unit diagonal
+        # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
         scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior)
         normal = (products[1:, 1:] + np.diag(prior)) * np.outer(scale, scale)
         factor = cho_factor(normal + ROUNDING * np.eye(len(scale)))
@@ -316,23 +326,25 @@ class Regression:
         return Solution(evidence, mean, covariance)
 
 
-def without(products: FloatArray, halves: FloatArray, precision: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return products (..., W, W) and half log determinants (...) without the last, unknown, columns."""
+def without(
+    products: FloatArray, halves: FloatArray, precision: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return products (..., W, W) and half log determinants (...) with unknowns eliminated."""
     if not len(precision):
         return products, halves
     prior = np.maximum(precision, LEAST_PRECISION)
-    kept = products.shape[-1] - len(prior)
+    count = products.shape[-1] - len(prior)
     # Schur complement of the last columns
-    root = np.linalg.cholesky(products[..., kept:, kept:] + np.diag(prior))
-    projected = np.asarray(np.linalg.solve(root, products[..., kept:, :kept]))
+    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
+    projected = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
     half_log_determinants = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
     remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior).sum()
-    return products[..., :kept, :kept] - projected.mT @ projected, remaining_halves
+    return products[..., :count, :count] - projected.mT @ projected, remaining_halves
 
 
-def regression(filtered: Sequence[Filtered], rows: Sequence[FloatArray]) -> Regression:
-    """Return the products of residuals and columns (1 + K + L, N, C), of a trial each, whitened alike."""
-    alike: dict[tuple[bytes, ...], list[tuple[Filtered, FloatArray]]] = {}
+def regression(filtered: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:
+    """Return the products of residuals and columns (1 + K + L, N, C) of all trials."""
+    alike: dict[tuple[bytes, ...], list[tuple[ForceFilter, FloatArray]]] = {}
     for trial, columns in zip(filtered, rows, strict=True):
         alike.setdefault(trial.key, []).append((trial, columns))
     total: FloatArray | float = 0.0
@@ -342,8 +354,8 @@ def regression(filtered: Sequence[Filtered], rows: Sequence[FloatArray]) -> Regr
         together, half = first_trial.products(np.concatenate([columns for _, columns in group]))
         ends = np.cumsum([0, *(len(columns) for _, columns in group)]).tolist()
         for (trial, _), (begin, end) in zip(group, pairwise(ends), strict=True):
-            own = together[begin:end, begin:end]
-            products, half_with_local = without(own, half, trial.trial.local_precision)
+            of_trial = together[begin:end, begin:end]
+            products, half_with_local = without(of_trial, half, trial.trial.local_precision)
             total = total + products
             log_determinant += float(half_with_local)
     return Regression(np.asarray(total), log_determinant)

@@ -1,11 +1,12 @@
 """The Kalman filter of a record, forwards, and its counterpart backwards: what both tell together.
 
-What is known before a moment and what the readings after it say (Fraser and Potter 1969, IEEE Transactions on
-Automatic Control 14, 387-390) give the evidence of all readings and the state at that moment. Readings come
-one at a time, so nothing is inverted forwards; covariance and information are updated in Joseph form. Where
-they have become steady they are kept.
+What is known before a moment and what the readings after it say (Fraser and Potter 1969, IEEE
+Transactions on Automatic Control 14, 387-390) give the evidence of all readings and the state at
+that moment. Readings come one at a time, so nothing is inverted forwards; covariance and
+information are updated in Joseph form. Where they have become steady they are kept.
 
-Shapes: n states, c channels, N samples, W columns that are filtered alike, S different steps, B places.
+Shapes: n states, c channels, N samples, W columns that are filtered alike, S different steps, B
+places.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,8 @@ from .covariances import is_steady
 SMALL_PART, ORDERS = 0.25, 12
 """Norm of what is summed as a series, and its orders: 1e-16 is left out."""
 LEAST_SIZE = 0.5
-"""Variance of a reading, over its noise, below which rounding has taken what a force too large left of it."""
+"""Variance of a reading, over its noise, below which rounding has taken what a force too large left
+of it."""
 
 
 @compiled
@@ -32,8 +34,8 @@ def discretised(
 ) -> tuple[FloatArray, FloatArray]:
     """Return transitions and noises (J, n, n) of steps of given lengths (J,) [s].
 
-    Series for a small part of a step, which is then doubled: what decays within a step would grow beyond all
-    numbers in an exponential of both signs.
+    Series for a small part of a step, which is then doubled: what decays within a step would grow
+    beyond all numbers in an exponential of both signs.
     """
     n = len(generator)
     norm = np.max(np.sum(np.abs(generator), axis=1)) if n else 0.0
@@ -66,7 +68,10 @@ def discretised(
 
 @callable_when_compiled
 def update_covariance(covariance: FloatArray, row: FloatArray, gain: FloatArray) -> float:
-    """Return the variance of a reading; take it into a covariance (n, n), and fill its gain (n,)."""
+    """Return the variance of a reading.
+
+    Take it into a covariance (n, n), and fill its gain (n,).
+    """
     along = covariance @ row
     variance = row @ along + 1.0
     gain[:] = along / variance
@@ -125,7 +130,7 @@ def forward(
     mean: FloatArray,
     places: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return what the readings of samples `first` to `places` (B,), these left out, tell of the state.
+    """Return the state given the readings of samples `first` to `places` (B,), without the last.
 
     Parameters
     ----------
@@ -134,7 +139,8 @@ def forward(
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
     rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
-        What the readings show of the state, over their noise; which readings count; what is filtered.
+        What the readings show of the state, over their noise; which readings count; what is
+        filtered.
     first : int
         The first sample that is read.
     covariance, mean : (n, n), (n, W) ndarray
@@ -142,11 +148,10 @@ def forward(
     places : (B,) ndarray
         Samples before which the state is asked for, in order.
 
-    Returns
-    -------
-    covariances, means, white, halves : (B, n, n), (B, n, W), (places[-1] - first, c, W), (B,) ndarray
-        State after the last sample read, columns as independent numbers of variance one, half the logarithm
-        of the readings' variances; infinite where one has been lost to rounding.
+    Returns ------- covariances, means, white, halves : (B, n, n), (B, n, W), (places[-1] - first,
+    c, W), (B,) ndarray
+        State after the last sample read, columns as independent numbers of variance one, half the
+        logarithm of the readings' variances; infinite where one has been lost to rounding.
     gains, variances : (B, c, n), (B, c) ndarray
         Of the readings of that sample.
     """
@@ -246,18 +251,21 @@ def driven(
             for j in range(n):
                 total += transitions[step, i, j] * states[k, j]
             for d in range(push_count):
-                total += push_at_begin[step, i, d] * pushes[k, d] + push_at_end[step, i, d] * pushes[k + 1, d]
+                total += (
+                    push_at_begin[step, i, d] * pushes[k, d]
+                    + push_at_end[step, i, d] * pushes[k + 1, d]
+                )
             states[k + 1, i] = total
     return states
 
 
-State = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Covariance or information (.., n, n), means or what lies along it (.., n, W), products of columns (.., W,
-W), and half a logarithm (..)."""
+FilterState = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+"""Covariance or information (.., n, n), means or what lies along it (.., n, W), products of columns
+(.., W, W), and half a logarithm (..)."""
 
 
 @dataclass(frozen=True, eq=False)
-class Steps:
+class FilterSteps:
     """A record as `forward` takes it, but for which of its steps leads to each sample."""
 
     moves: FloatArray
@@ -271,15 +279,15 @@ class Steps:
         """Roots of the noises."""
         return _roots(self.noises)
 
-    def begin(self, covariance: FloatArray) -> State:
+    def begin(self, covariance: FloatArray) -> FilterState:
         """Return the state at the first sample, of a covariance."""
         n, width = self.rows.shape[1], self.columns.shape[2]
         return covariance, np.zeros((n, width)), np.zeros((width, width)), np.zeros(())
 
     def before(
         self, step_of_sample: IntArray, first: int, state: Sequence[FloatArray], places: IntArray
-    ) -> State:
-        """Return the states before steps to some samples, from that before the step to the first on."""
+    ) -> FilterState:
+        """Return the states before the steps to some samples, filtered from a first one on."""
         covariance, mean, known_products, known_halves = state
         covariances, means, white, halves, *_ = forward(
             self.moves,
@@ -294,11 +302,13 @@ class Steps:
             places,
         )
         # products of the whitened columns up to each place
-        by_place = np.split(white.reshape(-1, white.shape[-1]), len(self.rows) * (places[:-1] - first))
+        by_place = np.split(
+            white.reshape(-1, white.shape[-1]), len(self.rows) * (places[:-1] - first)
+        )
         products = np.cumsum([columns.T @ columns for columns in by_place], axis=0)
         return covariances, means, products + known_products, halves + known_halves
 
-    def after(self, step_of_sample: IntArray, places: IntArray) -> State:
+    def after(self, step_of_sample: IntArray, places: IntArray) -> FilterState:
         """Return what the readings from some samples on tell of the states there."""
         return backward(
             self.moves, self.noise_roots, step_of_sample, self.rows, self.used, self.columns, places
@@ -311,10 +321,13 @@ def _roots(covariances: FloatArray) -> FloatArray:
     return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
 
 
-def joined(before: Sequence[FloatArray], after: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return products (..., W, W) and half log determinants (...) of whole records from both their parts.
+def joined(
+    before: Sequence[FloatArray], after: Sequence[FloatArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Return products (..., W, W) and half log determinants (...) of records from both parts.
 
-    The state between both parts is integrated out: Gaussian before, with the information of what came after.
+    The state between both parts is integrated out: Gaussian before, with the information of what
+    came after.
     """
     covariance, mean, products, half = before
     J, h, later_products, later_half = after
@@ -322,6 +335,8 @@ def joined(before: Sequence[FloatArray], after: Sequence[FloatArray]) -> tuple[F
     inner = np.linalg.cholesky(np.eye(covariance.shape[-1]) + root.mT @ J @ root)
     explained = np.asarray(np.linalg.solve(inner, root.mT @ (h - J @ mean)))
     cross = mean.mT @ h
-    whole = products + later_products - cross - cross.mT + mean.mT @ J @ mean - explained.mT @ explained
+    whole = (
+        products + later_products - cross - cross.mT + mean.mT @ J @ mean - explained.mT @ explained
+    )
     half_log_determinant = np.log(np.diagonal(inner, axis1=-2, axis2=-1)).sum(-1)
     return whole, half + later_half + half_log_determinant

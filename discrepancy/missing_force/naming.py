@@ -1,252 +1,390 @@
-"""The search for what the missing force is: effects beside what is left of it, by their evidence.
+"""The search for what the missing force is: effects beside what remains of it, by their evidence.
 
-A hypothesis is a set of effects with missing forces at ports beside it. Its effects act along the motion
-that was, so that they and their derivatives by their unknowns are columns; a step of all unknowns, a new
-motion, new columns: an iterated smoother whose fixed point is the most probable value, and whose evidence is
-Laplace's.
+A hypothesis is a set of effects with missing forces at ports beside it. Its effects act along the
+motion that was, so that they and their derivatives by their parameters are columns of a linear
+model. A step of all parameters gives a new motion, and that new columns: an iterated smoother,
+whose fixed point is the most probable value, with Laplace's evidence.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Key, Point, Term
+from discrepancy.fits.candidate import (
+    PARAMETER_STEP,
+    Candidate,
+    CandidateKey,
+    EffectTerm,
+    Point,
+    with_step,
+)
 from discrepancy.fits.fitting import LARGEST_EFFECT
 from discrepancy.fits.problem import Problem
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
-from .explained import NOTHING, Explained, seen
+from .explained import NOTHING, ForceHypothesis, with_most_probable_forces
 from .filtered import Process
-from .hypotheses import Columns, log_prior, scaled, variants
+from .hypotheses import ColumnBuilder, log_prior, scaled, trial_values
 from .process_search import MOST_STEPS
-from .view import Column, Motion, View, combined
+from .view import EffectColumn, TrialMotion, View, combined
 
 WIDE = 3.0
-"""Prior deviation of that size: so many times what would explain all of the gap."""
+"""Prior deviation of the magnitude of an effect: so many times what would explain all of the
+gap."""
 SIZES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
+"""Sizes of the missing forces beside which effects are screened, over the most probable ones
+without effect."""
 TIMES = (0.5, 1.5)
-"""Processes, over the most probable one without effect, beside which all effects are tried."""
+"""Correlation times of these forces, over the same."""
 LARGEST_RATIO = 1e100
-"""Of an effect to a gap that is nought."""
+"""Ratio of an effect to a gap of zero."""
 MOST_PORTS = 4
 """Ports at which forces may be missing at once."""
 BESIDE = 0.1
-"""Size of a force beside the largest one, over its size alone, to begin with."""
+"""First size of a force beside the largest one, over its size alone."""
 WIDTHS = (10, 4, 4)
 """Effects that are followed after the screen: alone, beside one other, beside two."""
 TIED = 1.0
-"""Evidence [nat] by which values of an effect may differ to be begun with, too."""
+"""Evidence by which values of an effect may be below the best ones to be followed, too [nat]."""
 BEAM = 3
 """Sets to which one more effect is added."""
 ROUNDS = 8
+"""Largest number of steps of the parameters of an effect."""
 LONGEST_STEP = 1.5
+"""Longest step of these parameters."""
 SETTLED = 0.05
-"""Steps of the unknowns of an effect: how many, the longest, and that after which no other follows."""
+"""Step after which no other follows."""
 LEAST_PART = 0.2
 """Least part of a step that is taken where steps turn back."""
 SLOPE = 0.05
 """Standard normal step of the derivatives of an effect."""
 
 
+class ScreenedEffect(NamedTuple):
+    """An effect that may stand beside a hypothesis.
+
+    Attributes
+    ----------
+    log_evidence : float
+        The largest evidence that it may have [nat].
+    term : EffectTerm
+        The effect at its place.
+    starts : list of (E,) array
+        The scaled parameters from which it is followed.
+    """
+
+    log_evidence: float
+    term: EffectTerm
+    starts: list[FloatArray]
+
+
+class _WeighedColumn(NamedTuple):
+    """The evidence of a column [nat], and the factor on it that is most probable."""
+
+    log_evidence: float
+    factor: float
+
+
 class ForceSearch:
-    """The missing forces of a problem, and effects that may be they.
+    """The search for the missing forces of a problem, and for effects that explain them.
 
     Parameters
     ----------
     problem : Problem
-        With dynamic trials, of a model that has ports.
+        A problem with trials in motion, and with a model that has ports.
 
     Attributes
     ----------
-    at : dict of str to Explained
-        The missing force at each port: first along the model's own motion, for the initial states; then along
-        the motion that was, with the parameters about where they are and the laws that the model has itself.
+    at : dict of str to ForceHypothesis
+        The missing force at each port alone: first along the model's own motion, for the initial
+        states; then along the motion that was, with the parameters about where they are, and with
+        the model's own laws.
+    ports : tuple of str
+        The names of the ports.
+    laws : ModelPatch
+        The model's own laws at its ports.
+    point : Point
+        The unknowns about which the trials are linear.
+    columns : ColumnBuilder
+        Computes the columns of effects in these trials.
     """
 
     def __init__(self, problem: Problem) -> None:
-        linear, self.laws = problem.model.apart()
+        linear_model, self.laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
         self.model = problem.model
-        self.problem = problem.with_trials(trials, linear)
+        self.problem = problem.with_trials(trials, linear_model)
         self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
-        self.ports = tuple(linear.ports)
-        self.at: dict[str, Explained] = {}
+        self.ports = tuple(linear_model.ports)
+        self.at: dict[str, ForceHypothesis] = {}
         self.point = self.problem.start(NOTHING)
-        for turn in range(2):
-            bare = self._view()
-            for port, name in enumerate(self.ports):
-                view = self.columns.along(bare, bare.smoothed(self.at[name].processes)[2]) if turn else bare
-                first = self.about((port,))
-                self.at[name] = seen(view, first, self.at[name].processes if turn else first)
-            if not turn:
-                self.point = self._point(self.best())
+        view = self._linear_view()
+        for port, name in enumerate(self.ports):
+            processes = self.prior_processes((port,))
+            self.at[name] = with_most_probable_forces(view, processes, processes)
+        self.point = self._point(self.best())
+        view = self._linear_view()
+        for port, name in enumerate(self.ports):
+            last_processes = self.at[name].processes
+            _, _, motions = view.smoothed(last_processes)
+            along_motion = self.columns.along(view, motions)
+            median = self.prior_processes((port,))
+            self.at[name] = with_most_probable_forces(along_motion, median, last_processes)
 
-    # ---------------------------------------------------------------- where
+    # ---------------------------------------------------------------- where a force is missing
 
     @cached_property
-    def whole(self) -> Explained:
-        """Missing forces at all ports at once, or at those that matter most if they are many."""
+    def whole(self) -> ForceHypothesis:
+        """The missing forces at all ports at once, or of many ports at those with most evidence."""
         best = self.best()
-        ranked = sorted(self.at.values(), key=lambda item: -item.log_evidence)[:MOST_PORTS]
+        ranked = sorted(self.at.values(), key=lambda at_port: -at_port.log_evidence)[:MOST_PORTS]
         if len(ranked) == 1:
             return best
         begin = dict(best.processes)
-        for item in ranked[1:]:
-            begin |= scaled(item.processes, BESIDE, 1.0)
+        for at_port in ranked[1:]:
+            begin |= scaled(at_port.processes, BESIDE, 1.0)
         view = best.view
         for near in (False, True):
-            found = seen(view, self.about(begin), begin, near=near)
-            view = self.columns.along(view, found.motions)
-            begin = dict(found.processes)
-        return found
+            median = self.prior_processes(begin)
+            together = with_most_probable_forces(view, median, begin, near=near)
+            view = self.columns.along(view, together.motions)
+            begin = dict(together.processes)
+        return together
 
-    def best(self) -> Explained:
-        """Return the missing force of the largest evidence."""
-        return max(self.at.values(), key=lambda item: item.log_evidence)
+    def best(self) -> ForceHypothesis:
+        """Return the missing force at one port that has the largest evidence."""
+        return max(self.at.values(), key=lambda at_port: at_port.log_evidence)
 
-    def about(self, ports: Iterable[int]) -> dict[int, Process]:
-        """Return missing forces at ports as they may be before any reading."""
-        found = {}
+    def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
+        """Return the prior medians of missing forces at ports, by the number of the port."""
+        scales = self.problem.setting.scales
+        processes = {}
         for port in ports:
-            scale = self.problem.setting.scales.ports[self.ports[port]]
-            pace = scale.angular_frequency or 1.0 / self.problem.setting.scales.duration
-            found[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
-        return found
+            scale = scales.ports[self.ports[port]]
+            pace = scale.angular_frequency or 1.0 / scales.duration
+            processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
+        return processes
 
     def own_laws(self, shared: FloatArray) -> ModelPatch:
-        """Return the laws that the model has itself, at values (K,) of the shared unknowns."""
-        model = self.model
-        return model.own_laws(self.problem.shared.parameters(shared)) + model.patch.of(PortForce)
+        """Return the model's own laws at values (K,) of the shared unknowns."""
+        parameters = self.problem.shared.parameters(shared)
+        return self.model.own_laws(parameters) + self.model.patch.of(PortForce)
 
     def whole_size(self, port: int) -> float:
-        """Return the deviation of the missing force at a port beside no effect [N or N m]."""
-        beside = self.whole.processes.get(port)
-        return self.about((port,))[port].size if beside is None else beside.size
+        """Return the deviation of the missing force at a port without any effect [N or N m]."""
+        process = self.whole.processes.get(port)
+        if process is None:
+            process = self.prior_processes((port,))[port]
+        return process.size
 
-    def _view(self) -> View:
-        """Return the trials as they are seen about the point, where columns are from then on, too."""
-        self.columns = Columns(self.problem, self.numbers, self.point, self.laws)
+    def rough(self, port: str) -> ForceHypothesis:
+        """Return the missing force at a port as one that may jump.
+
+        The trials are linear about the motion that it gives.
+        """
+        hypothesis = self.at[port]
+        for _ in range(2):
+            self.point = self._point(hypothesis)
+            view = self._linear_view()
+            for _ in range(2):
+                _, _, motions = view.smoothed(hypothesis.processes)
+                view = self.columns.along(view, motions)
+            begin = {}
+            for number, process in hypothesis.processes.items():
+                begin[number] = replace(process, rough=True)
+            hypothesis = with_most_probable_forces(view, self.prior_processes(begin), begin)
+        return hypothesis
+
+    def whole_point(self, hypothesis: ForceHypothesis) -> Point:
+        """Return the point of a hypothesis, from which its fit to the readings may begin."""
+        point = self._point(hypothesis)
+        return Point(hypothesis.shared.copy(), point.local, hypothesis.effect.copy())
+
+    def _linear_view(self) -> View:
+        """Return the trials, linear about the point, and build columns there from now on."""
+        self.columns = ColumnBuilder(self.problem, self.numbers, self.point, self.laws)
         return self.columns.bare()
 
-    def rough(self, port: str) -> Explained:
-        """Return the missing force at a port as one that may jump, linear about the motion that it gives."""
-        found = self.at[port]
-        for _ in range(2):
-            self.point = self._point(found)
-            view = self._view()
-            for _ in range(2):
-                view = self.columns.along(view, view.smoothed(found.processes)[2])
-            begin = {at: replace(one, rough=True) for at, one in found.processes.items()}
-            found = seen(view, self.about(begin), begin)
-        return found
-
-    def whole_point(self, found: Explained) -> Point:
-        """Return the point of a hypothesis, from which a fit may begin."""
-        point = self._point(found)
-        return Point(found.shared.copy(), point.local, found.effect.copy())
-
-    def _point(self, found: Explained) -> Point:
+    def _point(self, hypothesis: ForceHypothesis) -> Point:
+        """Return the unknowns of a hypothesis without its effects, within their ranges."""
         local = [np.zeros(data.unknowns.size) for data in self.problem.trials]
-        for number, values in zip(self.numbers, found.local, strict=True):
+        for number, values in zip(self.numbers, hypothesis.local, strict=True):
             local[number] = values
-        low, high = self.problem.shared.ends  # nothing would follow from a step beyond them
-        low, high = np.maximum(low + PARAMETER_STEP, -2.0), np.minimum(high - PARAMETER_STEP, 2.0)
-        return Point(np.clip(found.shared, low, high), tuple(local), np.zeros(0))
+        low, high = self.problem.shared.ends
+        low = np.maximum(low + PARAMETER_STEP, -2.0)
+        high = np.minimum(high - PARAMETER_STEP, 2.0)
+        return Point(np.clip(hypothesis.shared, low, high), tuple(local), np.zeros(0))
 
-    # ---------------------------------------------------------------- what
+    # ---------------------------------------------------------------- what the force is
 
     def name(
-        self, effects: Sequence[Effect], tell: Callable[[str], None] = lambda words: None
-    ) -> list[Explained]:
-        """Return hypotheses, the most probable first: sets of effects that were found one after another.
+        self,
+        effects: Sequence[Effect],
+        on_progress: Callable[[str], None] = lambda message: None,
+    ) -> list[ForceHypothesis]:
+        """Return hypotheses on the missing force, the most probable first, by a beam search.
 
-        Each effect alone, with its own shape and with a free one; the best of these with one more effect,
-        while that makes a more probable set.
+        Each effect is tried alone, with its own shape and with a free one; then the best of these
+        with one more effect, while that makes a more probable set.
+
+        Parameters
+        ----------
+        effects : sequence of Effect
+            The effects.
+        on_progress : callable
+            Takes a line that says what is compared, and how much is still to come.
         """
-        found: dict[Key, Explained] = {(): self.whole}
+        count = len(effects)
+        hypotheses: dict[CandidateKey, ForceHypothesis] = {(): self.whole}
         beam = [self.whole]
         for width in WIDTHS:
-            best = self._ranked(found, len(effects))[0]
-            longer: dict[Key, Explained] = {}
+            best = self._ranked(hypotheses, count)[0]
+            longer: dict[CandidateKey, ForceHypothesis] = {}
             for base in beam:
-                beside = f" beside {base.candidate.words}" if base.candidate.terms else ""
-                tell(f"comparing all effects{beside} with the missing force")
-                promising = self.screened(base, effects)[:width]
-                for number, (_, term, starts) in enumerate(promising):
-                    candidate = base.candidate.plus(term)
-                    if candidate.key in longer:
-                        continue
-                    remaining = len(promising) - number - 1
-                    tell(f"following {candidate.words} along the missing force, {remaining} more")
-                    begun = (np.concatenate((base.effect, start)) for start in starts)
-                    ends = [one for at in begun if (one := self.followed(base, candidate, at)) is not None]
-                    if ends:
-                        longer[candidate.key] = max(ends, key=lambda one: one.log_evidence)
-            found |= longer
-            ranked = self._ranked(longer, len(effects))
-            if not ranked or self.score(ranked[0], len(effects)) <= self.score(best, len(effects)):
+                self._follow_beside(base, effects, width, longer, on_progress)
+            hypotheses |= longer
+            ranked = self._ranked(longer, count)
+            if not ranked or self.score(ranked[0], count) <= self.score(best, count):
                 break
             beam = ranked[:BEAM]
-        return self._ranked(found, len(effects))
+        return self._ranked(hypotheses, count)
 
-    def score(self, found: Explained, count: int) -> float:
-        """Return ln (evidence times prior) of a hypothesis [nat], `count` effects being looked for."""
-        return found.log_evidence + log_prior(found.candidate, count, self.problem.setting)
+    def _follow_beside(
+        self,
+        base: ForceHypothesis,
+        effects: Sequence[Effect],
+        width: int,
+        longer: dict[CandidateKey, ForceHypothesis],
+        on_progress: Callable[[str], None],
+    ) -> None:
+        """Follow the most promising effects beside a base, and add them to the longer hypotheses.
 
-    def _ranked(self, found: Mapping[Key, Explained], count: int) -> list[Explained]:
-        return sorted(found.values(), key=lambda item: -self.score(item, count))
-
-    def screened(
-        self, base: Explained, effects: Iterable[Effect]
-    ) -> list[tuple[float, Term, list[FloatArray]]]:
-        """Return effects with the evidence that they may have beside a hypothesis, and values to begin with.
-
-        Best first, each at each of its places, from all values that do as well within `TIED`: in proportion
-        to its size a dead zone does the same whatever its stiffness, and ends elsewhere from each.
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis that an effect is added to.
+        effects : sequence of Effect
+            The effects.
+        width : int
+            The number of effects that are followed.
+        longer : dict of CandidateKey to ForceHypothesis
+            The hypotheses with one more effect, which is extended.
+        on_progress : callable
+            Takes a line that says what is compared.
         """
-        terms: list[Term] = []
-        values_of_terms: list[FloatArray] = []
-        columns: list[Column] = []
+        beside = f" beside {base.candidate.description}" if base.candidate.terms else ""
+        on_progress(f"comparing all effects{beside} with the missing force")
+        promising = self.screened(base, effects)[:width]
+        for number, screened_effect in enumerate(promising):
+            candidate = base.candidate.with_term(screened_effect.term)
+            if candidate.key in longer:
+                continue
+            remaining = len(promising) - number - 1
+            description = candidate.description
+            on_progress(f"following {description} along the missing force, {remaining} more")
+            followed = []
+            for start in screened_effect.starts:
+                effect = np.concatenate((base.effect, start))
+                hypothesis = self.followed(base, candidate, effect)
+                if hypothesis is not None:
+                    followed.append(hypothesis)
+            if followed:
+                best = max(followed, key=lambda hypothesis: hypothesis.log_evidence)
+                longer[candidate.key] = best
+
+    def score(self, hypothesis: ForceHypothesis, count: int) -> float:
+        """Return ln (evidence times prior) of a hypothesis among `count` effects [nat]."""
+        prior = log_prior(hypothesis.candidate, count, self.problem.setting)
+        return hypothesis.log_evidence + prior
+
+    def _ranked(
+        self, hypotheses: Mapping[CandidateKey, ForceHypothesis], count: int
+    ) -> list[ForceHypothesis]:
+        """Return hypotheses among `count` effects, the most probable first."""
+        return sorted(hypotheses.values(), key=lambda hypothesis: -self.score(hypothesis, count))
+
+    # ---------------------------------------------------------------- screen of one more effect
+
+    def screened(self, base: ForceHypothesis, effects: Iterable[Effect]) -> list[ScreenedEffect]:
+        """Return effects that may stand beside a hypothesis, the most promising first.
+
+        Each effect is tried at each of its places, and followed from all values that do as well
+        within `TIED`: in proportion to its size a dead zone does the same whatever its stiffness,
+        and ends elsewhere from each.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis that an effect is added to.
+        effects : iterable of Effect
+            The effects.
+        """
+        terms: list[EffectTerm] = []
+        values_of_columns: list[FloatArray] = []
+        columns: list[EffectColumn] = []
         for term in self._terms_beside(base, effects):
-            for values in variants(term):
-                column = self.columns.of(base.view, base.motions, Candidate((term,)), values)
+            for values in trial_values(term):
+                candidate = Candidate((term,))
+                column = self.columns.of(base.view, base.motions, candidate, values)
                 if column is not None and any(np.any(part.readings) for part in column):
                     terms.append(term)
-                    values_of_terms.append(values)
+                    values_of_columns.append(values)
                     columns.append(column)
-        starts_of_terms: dict[Term, list[tuple[float, FloatArray]]] = {}
+        starts_of_terms: dict[EffectTerm, list[tuple[float, FloatArray]]] = {}
         for number, (log_evidence, factor) in self._weighed(base, columns, terms).items():
             term = terms[number]
-            start = term.sized(values_of_terms[number], factor, -LARGEST_EFFECT, LARGEST_EFFECT)
+            values = values_of_columns[number]
+            start = term.rescaled(values, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
             starts_of_terms.setdefault(term, []).append((log_evidence, start))
-        rows = []
+        screened_effects = []
         for term, starts in starts_of_terms.items():
             best = max(log_evidence for log_evidence, _ in starts)
-            as_good = [start for log_evidence, start in starts if log_evidence > best - TIED]
-            rows.append((best, term, as_good))
-        return sorted(rows, key=lambda row: -row[0])
+            tied = [start for log_evidence, start in starts if log_evidence > best - TIED]
+            screened_effects.append(ScreenedEffect(best, term, tied))
+        return sorted(screened_effects, key=lambda effect: -effect.log_evidence)
 
-    def _terms_beside(self, base: Explained, effects: Iterable[Effect]) -> Iterator[Term]:
+    def _terms_beside(
+        self, base: ForceHypothesis, effects: Iterable[Effect]
+    ) -> Iterator[EffectTerm]:
         """Yield effects at places where a hypothesis does not have them, also with a free shape."""
         in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
         for effect in effects:
             for place in effect.places(self.problem.setting):
                 if (effect.identifier, place) in in_base:
                     continue
-                yield Term(effect, place)
+                yield EffectTerm(effect, place)
                 if effect.shape:
-                    yield Term(effect, place, True)
+                    yield EffectTerm(effect, place, free_shape=True)
 
     def _weighed(
-        self, base: Explained, columns: Sequence[Column], terms: Sequence[Term]
-    ) -> dict[int, tuple[float, float]]:
-        """Return for columns (by number) evidence and factor, beside processes around the base's."""
+        self,
+        base: ForceHypothesis,
+        columns: Sequence[EffectColumn],
+        terms: Sequence[EffectTerm],
+    ) -> dict[int, _WeighedColumn]:
+        """Return the best evidence and factor of each column, beside several missing forces.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis that an effect is added to.
+        columns : sequence of EffectColumn
+            The columns, each of an effect at one value of its parameters.
+        terms : sequence of EffectTerm
+            The effect of each column.
+
+        Returns
+        -------
+        dict of int to _WeighedColumn
+            The evidence and factor by the number of the column.
+        """
         if not columns:
             return {}
         with_columns = replace(
@@ -256,78 +394,127 @@ class ForceSearch:
             precision=(*base.view.precision, *self._prior_precisions(base, columns)),
         )
         known_count = len(base.view.precisions)
-        best: dict[int, tuple[float, float]] = {}
+        best: dict[int, _WeighedColumn] = {}
         for size, time in product(SIZES, TIMES):
             products = with_columns.products(scaled(base.processes, size, time))
             for number, term in enumerate(terms):
                 chosen = [*range(known_count), known_count + number]
                 solution = products.solve(chosen, with_columns.precisions[chosen])
                 factor = float(solution.mean[-1])
-                is_better = number not in best or best[number][0] < solution.evidence
-                may_be = np.isfinite(solution.evidence) and (factor > 0.0 or term.may_turn)
-                if is_better and may_be:
-                    best[number] = (solution.evidence, factor)
+                is_better = number not in best or best[number].log_evidence < solution.evidence
+                has_possible_sign = factor > 0.0 or term.may_be_negative
+                if is_better and np.isfinite(solution.evidence) and has_possible_sign:
+                    best[number] = _WeighedColumn(solution.evidence, factor)
         return best
 
-    def _prior_precisions(self, base: Explained, columns: Sequence[Column]) -> list[float]:
-        """Return prior precisions of factors of columns: `WIDE` times what would explain all of the gap."""
-        gap_of_readings = self._gap(base, None)
-        gap_of_forces = self._gap(base, base.motions)
+    def _prior_precisions(
+        self, base: ForceHypothesis, columns: Sequence[EffectColumn]
+    ) -> list[float]:
+        """Return the prior precisions of factors of columns.
+
+        The prior deviation of a factor is `WIDE` times what would explain all of the gap.
+        """
+        gap_of_readings = _rms([trial.residual for trial in base.view.trials])
+        gap_of_forces = _rms([force for motion in base.motions for force in motion.forces.values()])
         precisions = []
         for column in columns:
-            forces = [np.ravel(force) for part in column for force in part.forces.values()]
-            acting = forces or [part.readings.ravel() for part in column]
-            gap = gap_of_forces if forces else gap_of_readings
-            size = max(float(np.sqrt(np.mean(np.concatenate(acting) ** 2))), 1e-300)
+            forces = [force for part in column for force in part.forces.values()]
+            if forces:
+                size = _rms(forces)
+                gap = gap_of_forces
+            else:
+                size = _rms([part.readings for part in column])
+                gap = gap_of_readings
             precisions.append(min(size / (WIDE * gap), LARGEST_RATIO) ** 2)
         return precisions
 
-    @staticmethod
-    def _gap(base: Explained, motions: Sequence[Motion] | None) -> float:
-        """Return the root mean square of the missing force, or of the residuals."""
-        if motions is None:
-            values = [trial.residual.ravel() for trial in base.view.trials]
-        else:
-            values = [np.ravel(force) for motion in motions for force in motion.forces.values()]
-        return max(float(np.sqrt(np.mean(np.concatenate(values) ** 2))), 1e-300)
+    # ---------------------------------------------------------------- most probable values
 
-    def followed(self, base: Explained, candidate: Candidate, effect: FloatArray) -> Explained | None:
-        """Return a hypothesis at its most probable values, begun beside another; None: it cannot be.
+    def followed(
+        self, base: ForceHypothesis, candidate: Candidate, effect: FloatArray
+    ) -> ForceHypothesis | None:
+        """Return a hypothesis at its most probable values, by steps of an iterated smoother.
 
-        Steps of an iterated smoother: each takes the laws along the motion that the one before has found.
+        Each step takes the laws along the motion that the last one has found.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis whose motion and missing forces the first step takes.
+        candidate : Candidate
+            The effects.
+        effect : (E,) array
+            The scaled effect parameters to begin with.
+
+        Returns
+        -------
+        ForceHypothesis or None
+            None if the effects cannot act along the motion.
         """
-        processes, motions = base.processes, base.motions
-        settled = False
+        processes = base.processes
+        motions = base.motions
+        is_settled = False
         damping = 1.0
         last_step = np.zeros(len(effect))
-        best: Explained | None = None
-        for turn in range(ROUNDS):
+        best: ForceHypothesis | None = None
+        for number in range(ROUNDS):
             view = self.linear(base.view, motions, candidate, effect)
             if view is None:
                 break
-            most_steps = MOST_STEPS if settled or turn == ROUNDS - 1 else 0
-            median = self.about(processes)
-            found = seen(view, median, processes, candidate, effect, near=turn > 0, most_steps=most_steps)
-            step = found.solution.mean[len(view.shared_precision) :] - effect
-            found = _less_what_is_out_of_reach(found, step)
-            if settled:
-                return replace(found, effect=effect + step)
-            # along the motion of its base, which follows the readings, a hypothesis looks better than it is
-            if best is None or turn == 1 or found.log_evidence > best.log_evidence:
-                best = found
+            is_last = is_settled or number == ROUNDS - 1
+            hypothesis = with_most_probable_forces(
+                view,
+                self.prior_processes(processes),
+                processes,
+                candidate,
+                effect,
+                near=number > 0,
+                most_steps=MOST_STEPS if is_last else 0,
+            )
+            step = hypothesis.solution.mean[len(view.shared_precision) :] - effect
+            hypothesis = _without_unreached_evidence(hypothesis, step)
+            if is_settled:
+                return replace(hypothesis, effect=effect + step)
+            # the first motion is that of the base and follows the readings: there a hypothesis
+            # looks better than it is
+            is_better = best is None or hypothesis.log_evidence > best.log_evidence
+            if is_better or number == 1:
+                best = hypothesis
             turns_back = step @ last_step < -0.5 * (last_step @ last_step)
             damping = max(0.5 * damping, LEAST_PART) if turns_back else min(1.0, 1.5 * damping)
             move = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
             effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
-            settled = turn > 0 and _is_last_step(step, last_step)
-            processes, motions = found.processes, found.motions
+            is_settled = number > 0 and _is_last_step(step, last_step)
+            processes = hypothesis.processes
+            motions = hypothesis.motions
             last_step = step
         return best
 
     def linear(
-        self, view: View, motions: Sequence[Motion], candidate: Candidate, effect: FloatArray
+        self,
+        view: View,
+        motions: Sequence[TrialMotion],
+        candidate: Candidate,
+        effect: FloatArray,
     ) -> View | None:
-        """Return the view of a hypothesis, linear about values of its unknowns and along motions."""
+        """Return the view of a hypothesis, linear about its values and along motions.
+
+        Parameters
+        ----------
+        view : View
+            The trials.
+        motions : sequence of TrialMotion
+            The motion of each trial along which the effects act.
+        candidate : Candidate
+            The effects.
+        effect : (E,) array
+            The scaled effect parameters.
+
+        Returns
+        -------
+        View or None
+            None if the effects cannot act along the motions.
+        """
         if not candidate.terms:
             return replace(self.columns.along(view, motions, None), effects=(), precision=())
         at_values = self.columns.of(view, motions, candidate, effect)
@@ -335,26 +522,35 @@ class ForceSearch:
             return None
         slopes = []
         for k in range(len(effect)):
-            step = np.zeros(len(effect))
-            step[k] = SLOPE
-            ahead = self.columns.of(view, motions, candidate, effect + step)
-            back = self.columns.of(view, motions, candidate, effect - step)
-            if ahead is None or back is None:
+            above = self.columns.of(view, motions, candidate, with_step(effect, k, SLOPE))
+            below = self.columns.of(view, motions, candidate, with_step(effect, k, -SLOPE))
+            if above is None or below is None:
                 return None
-            slopes.append(combined((ahead, back), (0.5 / SLOPE, -0.5 / SLOPE)))
-        # linear in the unknowns: what acts where they are zero, and a column for a unit of each
+            slopes.append(combined((above, below), (0.5 / SLOPE, -0.5 / SLOPE)))
+        # a column for each parameter, and one for what acts where all of them are zero
         at_zero = combined((at_values, *slopes), (1.0, *-effect))
         view = self.columns.along(view, motions, at_zero)
         return replace(view, effects=tuple(slopes), precision=(1.0,) * len(effect))
 
 
-def _less_what_is_out_of_reach(found: Explained, step: FloatArray) -> Explained:
-    """Return a hypothesis without the evidence of values that it has not reached: they are not its own."""
-    far = np.where(np.abs(step) > SETTLED, step, 0.0)
-    if not far.any():
-        return found
-    loss = 0.5 * float(far @ np.linalg.lstsq(found.effect_covariance, far, rcond=None)[0])
-    return replace(found, log_evidence=found.log_evidence - loss)
+def _rms(series: Iterable[FloatArray]) -> float:
+    """Return the root mean square of several arrays together, at least 1e-300."""
+    values = np.concatenate([np.ravel(entries) for entries in series])
+    return max(float(np.sqrt(np.mean(values**2))), 1e-300)
+
+
+def _without_unreached_evidence(hypothesis: ForceHypothesis, step: FloatArray) -> ForceHypothesis:
+    """Return a hypothesis without the evidence of values that its parameters have not reached.
+
+    The solution is that of the linear model after a step (E,); its evidence is not that of the
+    hypothesis where the step is long.
+    """
+    unreached = np.where(np.abs(step) > SETTLED, step, 0.0)
+    if not unreached.any():
+        return hypothesis
+    weighted = np.linalg.lstsq(hypothesis.effect_covariance, unreached, rcond=None)[0]
+    loss = 0.5 * float(unreached @ weighted)
+    return replace(hypothesis, log_evidence=hypothesis.log_evidence - loss)
 
 
 def _is_last_step(step: FloatArray, last_step: FloatArray) -> bool:

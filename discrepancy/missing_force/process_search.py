@@ -1,4 +1,4 @@
-"""The most probable sizes and correlation times of missing forces, by Newton's method from a grid."""
+"""The most probable sizes and correlation times of missing forces, by Newton's method."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -17,8 +17,8 @@ SIZE_DEVIATION, TIME_DEVIATION = 3.0, 1.2
 """Prior deviations of the logarithms of a process's size and correlation time."""
 PRIOR_DEVIATIONS = np.array((SIZE_DEVIATION, TIME_DEVIATION))
 START_FACTORS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
-"""Logarithms of factors of sizes and times, at the best of which Newton's method begins: what remains beside
-a law is a part of what was missing."""
+"""Logarithms of factors of sizes and times, at the best of which Newton's method begins: what
+remains beside a law is a part of what was missing."""
 FARTHEST = 5.0
 """Prior deviations from the median within which processes are looked for."""
 DIFFERENCE = 0.02
@@ -67,7 +67,7 @@ class ProcessSearch:
         begin: Processes,
         time_range: tuple[float, float],
     ) -> "ProcessSearch":
-        """Return the search within `FARTHEST` deviations of the prior, and of times within a range [s]."""
+        """Return the search within `FARTHEST` prior deviations, and times within a range [s]."""
         center = logarithms({port: median[port] for port in begin})
         low = center - FARTHEST * PRIOR_DEVIATIONS
         high = center + FARTHEST * PRIOR_DEVIATIONS
@@ -88,8 +88,10 @@ class ProcessSearch:
         """Return the logarithm of evidence times prior [nat]."""
         return self.log_evidence(self.processes(logs))
 
-    def most_probable(self, *, from_grid: bool, most_steps: int) -> tuple[dict[int, Process], float]:
-        """Return the most probable processes, and the logarithm of their evidence times prior [nat]."""
+    def most_probable(
+        self, *, from_grid: bool, most_steps: int
+    ) -> tuple[dict[int, Process], float]:
+        """Return the most probable processes, and ln (evidence times prior) there [nat]."""
         logs = np.clip(logarithms(self.begin), self.low, self.high)
         if from_grid:
             logs = self._best_of_grid(logs)
@@ -131,18 +133,22 @@ class ProcessSearch:
             logs, top = reached, value
         return logs, top
 
-    def _curvature(self, logs: FloatArray, top: float, ahead: FloatArray, back: FloatArray) -> FloatArray:
-        """Return second differences (2 P, 2 P), from the value here and a unit ahead and back of it."""
+    def _curvature(
+        self, logs: FloatArray, top: float, ahead: FloatArray, back: FloatArray
+    ) -> FloatArray:
+        """Return second differences (2 P, 2 P), given the values a unit ahead and back."""
         units = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
         curvature = np.diag(ahead + back - 2.0 * top)
         for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-            both = self.value(logs + units[i] + units[k])
-            curvature[i, k] = both - ahead[i] - ahead[k] + top
+            ahead_of_both = self.value(logs + units[i] + units[k])
+            curvature[i, k] = ahead_of_both - ahead[i] - ahead[k] + top
             curvature[k, i] = curvature[i, k]
         return curvature
 
-    def _newton_step(self, logs: FloatArray, slope: FloatArray, curvature: FloatArray) -> FloatArray:
-        """Return Newton's step (P, 2), uphill also where the function is hollow, within the bounds' faces."""
+    def _newton_step(
+        self, logs: FloatArray, slope: FloatArray, curvature: FloatArray
+    ) -> FloatArray:
+        """Return Newton's step (P, 2) within the bounds, uphill also where values are convex."""
         may_rise = np.ravel(logs < self.high)
         may_fall = np.ravel(logs > self.low)
         free = np.flatnonzero(np.where(slope > 0.0, may_rise, may_fall))
@@ -153,7 +159,7 @@ class ProcessSearch:
         return np.asarray(step.reshape(logs.shape) / too_long)
 
     def _uphill(self, logs: FloatArray, top: float, step: FloatArray) -> tuple[FloatArray, float]:
-        """Return where a step leads, halved until it leads uphill or is too short, and the value there."""
+        """Return where a step leads and the value there; it is halved until it leads uphill."""
         reached, value = logs, -np.inf
         while value < top and np.abs(step).max() > SHORTEST_STEP:
             reached = np.clip(logs + step, self.low, self.high)

@@ -1,7 +1,7 @@
 """A record in which a force is on or off: the evidence of every stretch in which it is.
 
-What the readings before a moment tell and what those after it do are joined, so that the evidence of a
-stretch with any begin and any end costs no pass of the filter of its own.
+What the readings before a moment tell and what those after it do are joined, so that the evidence
+of a stretch with any begin and any end costs no pass of the filter of its own.
 """
 
 from collections.abc import Sequence
@@ -12,8 +12,8 @@ import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 
-from .filtered import Filtered, Process, StateSpace, without
-from .kalman import Steps, discretised, joined
+from .filtered import ForceFilter, ForceStateSpace, Process, without
+from .kalman import FilterSteps, discretised, joined
 from .view import View
 
 CHANGE_PRICE = 4.0
@@ -70,7 +70,8 @@ class EventTrials:
         self.view = view
         self.port = port
         self.trials = [
-            replace(trial, time=trial.time[::every], used=trial.used[::every]) for trial in view.trials
+            replace(trial, time=trial.time[::every], used=trial.used[::every])
+            for trial in view.trials
         ]
         self.columns = [rows[:, ::every] for rows in view.rows]
 
@@ -78,7 +79,9 @@ class EventTrials:
         """Return ln evidence (...) of what trials tell together."""
         products = sum(trial.products for trial in by_trial)
         halves = sum(trial.half_log_determinants for trial in by_trial)
-        products, halves = without(np.asarray(products), np.asarray(halves), self.view.shared_precision)
+        products, halves = without(
+            np.asarray(products), np.asarray(halves), self.view.shared_precision
+        )
         return np.asarray(-0.5 * products[..., 0, 0] - halves)
 
 
@@ -111,7 +114,7 @@ class SwitchedRecord:
         self.others = others
         trial = trials.trials[number]
         self.local_precision = trial.local_precision
-        filtered = Filtered(trial, [(trials.port, force) for force in forces])
+        filtered = ForceFilter(trial, [(trials.port, force) for force in forces])
         event = len(trial.system.generator)  # index of the event's force in the state
         lengths, step_of_sample = trial.steps
         used = np.zeros(((len(trial.time) - 1) * parts + 1, trial.used.shape[1]), dtype=bool)
@@ -119,15 +122,17 @@ class SwitchedRecord:
         columns = np.zeros((*used.shape, len(trials.columns[number])))
         columns[::parts] = np.moveaxis(trials.columns[number] * filtered.white, 0, -1)
         # the kind of each step is its length and one of four ways of the force
-        self.length_of_sample = np.concatenate((step_of_sample[:1], np.repeat(step_of_sample[1:], parts)))
+        self.length_of_sample = np.concatenate(
+            (step_of_sample[:1], np.repeat(step_of_sample[1:], parts))
+        )
         self.length_count = len(lengths)
         transitions, noises = switched_steps(filtered.system, event, lengths / parts)
-        self.steps = Steps(transitions, noises, filtered.system.output_rows, used, columns)
+        self.steps = FilterSteps(transitions, noises, filtered.system.output_rows, used, columns)
         off, on = begin_covariances(filtered.system, event)
         self.begun = [self.steps.begin(off), self.steps.begin(on)]
 
     def step_kinds(self, on: BoolArray) -> IntArray:
-        """Return the step (N,) that leads to each sample, of a path that says where the force is on."""
+        """Return the kind of step (N,) that leads to each sample of a path."""
         was_on = np.r_[False, on[:-1]]
         return np.asarray((2 * was_on + on) * self.length_count + self.length_of_sample)
 
@@ -139,7 +144,7 @@ class SwitchedRecord:
         return Products(*without(products[0], halves[0], self.local_precision))
 
     def evidence_by_ends(self, on: BoolArray, starts: IntArray, ends: IntArray) -> FloatArray:
-        """Return ln evidence (A, B) with the force the other way from each start to each end after it."""
+        """Return ln evidence (A, B) with the force switched from each start to each end."""
         width = 1 + len(self.trials.view.shared_precision)
         products = np.zeros((len(starts), len(ends), width, width))
         halves = np.full((len(starts), len(ends)), np.inf)
@@ -168,11 +173,16 @@ class SwitchedRecord:
         return self.trials.evidence([Products(products, halves), *self.others])
 
     def _steps_back(self, on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (B, n, n) of the steps at which a stretch ends; none at the last."""
+        """Return transitions and noises (B, n, n) of the steps at which a stretch ends.
+
+        None at the last.
+        """
         is_last = ends == len(on)
         sample = np.where(is_last, 0, ends)
         was_switched_on = ~on[ends - 1]
-        kind = (2 * was_switched_on + on[sample]) * self.length_count + self.length_of_sample[sample]
+        kind = (2 * was_switched_on + on[sample]) * self.length_count + self.length_of_sample[
+            sample
+        ]
         nothing_moves = np.eye(len(self.steps.rows[0]))
         transitions = np.where(is_last[:, None, None], nothing_moves, self.steps.moves[kind])
         noises = np.where(is_last[:, None, None], 0.0, self.steps.noises[kind])
@@ -182,11 +192,15 @@ class SwitchedRecord:
         """Return a path with the stretch turned on or off that gains most; None where none pays."""
         count = len(on)
         size = min(max(MOST_STEPS // count, 12), STARTS, count)
-        grid = np.unique(np.r_[np.linspace(0, count, size + 1).round(), changes(on)]).astype(np.int64)
-        # an end where the path changes already takes that change away; one at an end of the record is free
+        grid = np.unique(np.r_[np.linspace(0, count, size + 1).round(), changes(on)]).astype(
+            np.int64
+        )
+        # an end where the path changes already takes that change away; ends of the record are free
         prices = change_price(count) * np.where(np.isin(grid, changes(on)), -1.0, 1.0)
         prices[[0, -1]] = 0.0
-        gains = self.evidence_by_ends(on, grid[:-1], grid[1:]) - prices[:-1, None] - prices[None, 1:]
+        gains = (
+            self.evidence_by_ends(on, grid[:-1], grid[1:]) - prices[:-1, None] - prices[None, 1:]
+        )
         start, end = np.unravel_index(np.argmax(gains), gains.shape)
         if gains[start, end] <= self.trials.evidence([self.products(on), *self.others]):
             return None
@@ -231,10 +245,13 @@ class SwitchedRecord:
             last = places[min(probable[-1] + 1, len(places) - 1)]
 
 
-def switched_steps(system: StateSpace, event: int, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return transitions and noises (4 J, n, n) of steps of J lengths [s] by what the event's force does.
+def switched_steps(
+    system: ForceStateSpace, event: int, lengths: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return transitions and noises (4 J, n, n) of steps in which a force is switched.
 
-    First all lengths with the force off, then beginning at the end of the step, then ending there, then on.
+    First all lengths with the force off, then beginning at the end of the step, then ending there,
+    then on.
     """
     on_transition, on_noise = discretised(system.generator, system.intensity, lengths)
     off_transition, off_noise = discretised(
@@ -251,8 +268,8 @@ def switched_steps(system: StateSpace, event: int, lengths: FloatArray) -> tuple
     return transitions.reshape(shape), noises.reshape(shape)
 
 
-def begin_covariances(system: StateSpace, event: int) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance (n, n) of the state at the first sample with the event's force off, and on."""
+def begin_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray, FloatArray]:
+    """Return the start covariances (n, n) of the state with the event's force off, and on."""
     on = system.start_covariance
     off = on.copy()
     off[:event, :event] -= np.outer(on[:event, event], on[:event, event])
@@ -273,7 +290,10 @@ def changes(on: BoolArray) -> IntArray:
 
 
 def change_price(count: int) -> float:
-    """Return what a change costs in a record of `count` samples [nat]: its place, and that it is there."""
+    """Return what a change costs in a record of `count` samples [nat].
+
+    Its place, and that it is there.
+    """
     return float(np.log(count)) + CHANGE_PRICE
 
 

@@ -1,9 +1,11 @@
-"""A trial in which a missing force is looked for: what is left of its readings, and what unknowns do to them.
+"""A trial in which a missing force is looked for.
+
+What is left of its readings, and what unknowns do to them.
 
 Readings and columns are over the deviations of their noise. The unknowns are those of
-`fits.trial_data`, taken at their prior means; a calibrated parameter acts on the motion that the model has (a
-column) and on what the missing force adds to it (`slopes`), so that both together are exact along the motion
-that was.
+`fits.trial_data`, taken at their prior means; a calibrated parameter acts on the motion that the
+model has (a column) and on what the missing force adds to it (`slopes`), so that both together are
+exact along the motion that was.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,7 +19,7 @@ from scipy.signal import lfilter
 
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
-from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, moved
+from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
 from discrepancy.system.response import PortedSystem
 from discrepancy.system.sensing import in_own_clock
@@ -31,7 +33,8 @@ FINEST, COARSEST = 16, 4
 FINE_PHASE = 0.15
 """Radians of the fastest mode that such a step may span."""
 LONGEST_MEMORY, LEAST_WHITE = 2000, 1e-3
-"""Samples that a coloured noise remembers at most; the least share of its variance that is taken as white."""
+"""Samples that a coloured noise remembers at most; the least share of its variance that is taken as
+white."""
 SMALL = 1e-3
 """Step of the derivative of a system by a parameter, in prior deviations."""
 
@@ -39,7 +42,7 @@ NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class TrialColumn:
     """What an effect does in a trial, for a unit of its unknown.
 
     Attributes
@@ -56,7 +59,7 @@ class Part:
     added: FloatArray | None = None
     forces: Mapping[int, FloatArray] = field(default_factory=dict)
 
-    def plus(self, other: "Part", factor: float) -> "Part":
+    def plus(self, other: "TrialColumn", factor: float) -> "TrialColumn":
         """Return the sum with another part that is taken `factor` times."""
         forces = dict(self.forces)
         for port, force in other.forces.items():
@@ -67,7 +70,7 @@ class Part:
             added = factor * other.added
         else:
             added = self.added + factor * other.added
-        return Part(self.readings + factor * other.readings, added, forces)
+        return TrialColumn(self.readings + factor * other.readings, added, forces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +90,8 @@ class SeenTrial:
     deviation : (C,) ndarray
         Of the noise.
     coloured : sequence of (int, float, float)
-        Channels whose noise has a part that decays in time: its share of the variance, and its rate [1/s].
+        Channels whose noise has a part that decays in time: its share of the variance, and its rate
+        [1/s].
     shared, local : (K, N, C), (L, N, C) ndarray
         What a unit of each scaled unknown does to readings.
     local_precision : (L,) ndarray
@@ -131,20 +135,20 @@ class SeenTrial:
 
     @cached_property
     def steps(self) -> tuple[FloatArray, IntArray]:
-        """Different lengths (J,) of the intervals [s], and which of them leads to each sample (N,)."""
+        """The lengths (J,) of the intervals [s], and the index of that before each sample (N,)."""
         lengths = np.diff(self.time)
         mean = float(lengths.mean())
         if np.all(np.abs(lengths - mean) < 1e-3 * mean):
             return np.array([mean]), np.zeros(len(self.time), dtype=np.int64)
-        found, which = np.unique(np.round(lengths / mean, 9), return_inverse=True)
-        return found * mean, np.concatenate(([0], which)).astype(np.int64)
+        relative_lengths, index = np.unique(np.round(lengths / mean, 9), return_inverse=True)
+        return relative_lengths * mean, np.concatenate(([0], index)).astype(np.int64)
 
     @cached_property
     def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Transition (J, n, n) of a fine step, and what a push at its begin and end does (J, n, n).
 
-        By one exponential of the system with its push and the push's rate as states (Van Loan 1978, IEEE
-        Transactions on Automatic Control 23, 395-404).
+        By one exponential of the system with its push and the push's rate as states (Van Loan 1978,
+        IEEE Transactions on Automatic Control 23, 395-404).
         """
         n = len(self.system.generator)
         lengths = self.steps[0][:, None, None] / self.parts
@@ -167,8 +171,8 @@ class SeenTrial:
     def port_motion(self, unknowns: FloatArray, added: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (F, P) of the ports.
 
-        They are the model's at values (K + L,) of shared unknowns and the trial's own, and of an added state
-        (F, n).
+        They are the model's at values (K + L,) of shared unknowns and the trial's own, and of an
+        added state (F, n).
         """
         motion = np.stack((self.positions, self.speeds))
         for k, moves in self.by_unknowns.items():
@@ -183,8 +187,10 @@ class SeenTrial:
             start = np.linalg.lstsq(self.system.generator, -push * force[0], rcond=1e-12)[0]
         return self._moved(start, push[:, None], force[:, None])
 
-    def turned(self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]) -> Part:
-        """Return what a change of the system makes of an added state (F, n) and `forces` that added it."""
+    def turned(
+        self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]
+    ) -> TrialColumn:
+        """Return the effect of a change of the system on an added state (F, n) and its forces."""
         pushes = added @ slope.generator.T
         for port, force in forces.items():
             pushes -= np.outer(force, slope.actions[port])
@@ -193,61 +199,105 @@ class SeenTrial:
             start = -np.linalg.lstsq(self.system.generator, pushes[0], rcond=1e-12)[0]
         rows = np.flatnonzero(np.any(pushes, axis=0))
         state = self._moved(start, np.eye(len(start))[:, rows], pushes[:, rows])
-        return Part(self.readings(state) + self.over_noise(self.shown(slope, added, forces)), state)
+        return TrialColumn(
+            self.readings(state) + self.over_noise(self.shown(slope, added, forces)), state
+        )
 
     def _moved(
-        self, start: FloatArray, directions: FloatArray, pushes: FloatArray, which: IntArray | None = None
+        self,
+        start: FloatArray,
+        directions: FloatArray,
+        pushes: FloatArray,
+        step_of_sample: IntArray | None = None,
     ) -> FloatArray:
-        moves, begins, ends = self.fine
-        begins, ends = np.ascontiguousarray(begins @ directions), np.ascontiguousarray(ends @ directions)
-        pushes = np.ascontiguousarray(pushes)
-        which = self.steps[1] if which is None else which
-        return np.asarray(driven(self.parts, moves, begins, ends, which, start, pushes))
+        """Return the state (F, n) of the system under pushes, linear between the fine stamps.
 
-    def readings(self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES) -> FloatArray:
-        """Return what readings (N, C) show of an added state (F, n), and at once of forces (F,) at ports."""
+        Parameters
+        ----------
+        start : (n,) array
+            The state at the first stamp.
+        directions : (n, D) array
+            The directions of the pushes in the state.
+        pushes : (F, D) array
+            The pushes at the fine stamps.
+        step_of_sample : (N,) array of int, optional
+            The index of the interval before each sample; those of the trial if left out.
+        """
+        transitions, by_push_at_begin, by_push_at_end = self.fine
+        if step_of_sample is None:
+            _, step_of_sample = self.steps
+        states = driven(
+            self.parts,
+            transitions,
+            np.ascontiguousarray(by_push_at_begin @ directions),
+            np.ascontiguousarray(by_push_at_end @ directions),
+            step_of_sample,
+            start,
+            np.ascontiguousarray(pushes),
+        )
+        return np.asarray(states)
+
+    def readings(
+        self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES
+    ) -> FloatArray:
+        """Return the readings (N, C), over their noise, of an added state (F, n) and forces."""
         return self.over_noise(self.shown(self.system, states, forces))
 
-    def shown(self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]) -> FloatArray:
+    def shown(
+        self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
+    ) -> FloatArray:
         """Return what readings (N, C) show of an added state (F, n) and of forces (F,) at ports."""
-        shown = states[:: self.parts] @ system.outputs.T
+        readings = states[:: self.parts] @ system.outputs.T
         for port, force in forces.items():
-            shown -= np.outer(force[:: self.parts], system.through[port])
-        return np.asarray(shown)
+            readings -= np.outer(force[:: self.parts], system.through[port])
+        return np.asarray(readings)
 
     def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
-        """Return what forces at ports (F,) do to the readings from one sample until another, from nothing."""
+        """Return what forces (F,) at ports do to the readings of some samples, from rest."""
         fine = slice(begin * self.parts, (end - 1) * self.parts + 1)
         acting = {port: force[fine] for port, force in forces.items()}
         directions = -np.array([self.system.actions[port] for port in acting]).T
-        which = np.ascontiguousarray(self.steps[1][begin:end])
+        _, all_steps = self.steps
+        step_of_sample = np.ascontiguousarray(all_steps[begin:end])
         pushes = np.array([*acting.values()]).T
-        states = self._moved(np.zeros(len(directions)), directions, pushes, which)
-        shown = self.shown(self.system, states, acting)
-        return np.asarray(shown / self.deviation * self.used[begin:end])
+        states = self._moved(np.zeros(len(directions)), directions, pushes, step_of_sample)
+        readings = self.shown(self.system, states, acting)
+        return np.asarray(readings / self.deviation * self.used[begin:end])
 
     def over_noise(self, columns: FloatArray) -> FloatArray:
-        """Return columns (..., N, C) over the noise's deviations, zero where a reading does not count."""
+        """Return columns (..., N, C) over the noise; 0 where a reading does not count."""
         return np.asarray(columns / self.deviation * self.used)
 
 
 def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, float] | None:
-    """Return the share of a noise's variance that decays in time, and its rate [1/s]; None: it is white.
+    """Return the share of a noise's variance that decays in time, and its rate [1/s].
+
+    None: it is white.
 
     From the correlation at one and two samples: exact for an autoregression of first order.
     """
     if interval is None or not noise.applies(interval):
         return None
-    answer = lfilter([1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)])
-    at = [float(answer[: len(answer) - lag] @ answer[lag:]) for lag in range(3)]
-    if not 0.0 < at[2] < at[1]:
+    impulse_response = lfilter(
+        [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)]
+    )
+    covariances = [
+        float(impulse_response[: len(impulse_response) - lag] @ impulse_response[lag:])
+        for lag in range(3)
+    ]
+    if not 0.0 < covariances[2] < covariances[1]:
         return None
-    decay = at[2] / at[1]
-    return min(at[1] / decay / at[0], 1.0 - LEAST_WHITE), -float(np.log(decay)) / interval
+    decay = covariances[2] / covariances[1]
+    return min(covariances[1] / decay / covariances[0], 1.0 - LEAST_WHITE), -float(
+        np.log(decay)
+    ) / interval
 
 
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
-    """Return a dynamic trial of a problem, linear about a point; its model must tell how ports move."""
+    """Return a dynamic trial of a problem, linear about a point.
+
+    Its model must tell how ports move.
+    """
     data = problem.trials[number]
     trial = data.trial
     gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
@@ -282,23 +332,27 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
 def _linear_readings(
     problem: Problem, number: int, point: Point
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return readings (N, C) less the linear model with all unknowns zero, and what units of these do.
+    """Return the residuals (N, C) of the linear model at zero unknowns, and its derivatives.
 
     The latter are (K, N, C) of the shared unknowns and (L, N, C) of the trial's own.
     """
     data = problem.trials[number]
     linear = problem.linearise(number, point, Candidate())
-    columns, shared_of_column = problem.columns(number, point, linear, Candidate())
+    columns, shared_of_column = problem.prediction_derivatives(number, point, linear, Candidate())
     by_local = columns[: data.unknowns.size]
     by_shared = np.zeros((problem.shared.size, *linear.response.shape))
     by_shared[shared_of_column] = columns[data.unknowns.size :]
     residual = data.trial.values - problem.prediction(number, point, linear.response)
-    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(point.local[number], by_local, 1)
+    residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(
+        point.local[number], by_local, 1
+    )
     return residual, by_shared, by_local
 
 
-def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[tuple[int, int, float]]:
-    """Return the shared unknowns that are gains of the trial's channels, as `SeenTrial.gains` has them."""
+def _gain_unknowns(
+    problem: Problem, trial: Trial, gains: FloatArray
+) -> list[tuple[int, int, float]]:
+    """Return the shared unknowns that are gains of the trial's channels (`SeenTrial.gains`)."""
     shared = problem.shared
     unknowns = []
     for row, name in enumerate(shared.gain_channels):
@@ -309,8 +363,10 @@ def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[tu
     return unknowns
 
 
-def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> list[tuple[int, float, float]]:
-    """Return the channels whose noise has a decaying part, with its share of the variance and its rate."""
+def _coloured_noises(
+    noises: Sequence[NoiseModel], interval: float | None
+) -> list[tuple[int, float, float]]:
+    """Return the channels whose noise has a decaying part, with share and rate of that part."""
     coloured = []
     for channel, noise in enumerate(noises):
         part = decaying_part(noise, interval)
@@ -329,22 +385,25 @@ def _fine_steps(system: PortedSystem, time: FloatArray) -> int:
 def _port_motion(
     problem: Problem, number: int, point: Point, parts: int
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
-    """Return positions and speeds (2, F, P) of the ports by the model, and their derivatives by unknowns."""
-    data, shared = problem.trials[number], problem.shared
+    """Return positions and speeds (2, F, P) of the ports, and their derivatives by unknowns."""
+    data = problem.trials[number]
+    shared = problem.shared
     trial_in_own_clock, _ = in_own_clock(data.trial, ModelPatch())
 
-    def motion(of_all: FloatArray, own: FloatArray) -> FloatArray:
-        conditions = data.unknowns.conditions(data.trial, shared.parameters(of_all), own)
+    def motion(shared_values: FloatArray, local_values: FloatArray) -> FloatArray:
+        parameters = shared.parameters(shared_values)
+        conditions = data.unknowns.conditions(data.trial, parameters, local_values)
         return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, parts))
 
     local = point.local[number]
-    here = motion(point.shared, local)
+    at_point = motion(point.shared, local)
     by_unknowns = {}
     for k in range(shared.count):
-        by_unknowns[k] = (motion(moved(point.shared, k), local) - here) / PARAMETER_STEP
+        by_unknowns[k] = (motion(with_step(point.shared, k), local) - at_point) / PARAMETER_STEP
     for k in range(data.unknowns.zeros, data.unknowns.size):
-        by_unknowns[shared.size + k] = (motion(point.shared, moved(local, k)) - here) / PARAMETER_STEP
-    return here, by_unknowns
+        stepped = motion(point.shared, with_step(local, k))
+        by_unknowns[shared.size + k] = (stepped - at_point) / PARAMETER_STEP
+    return at_point, by_unknowns
 
 
 def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
@@ -355,19 +414,42 @@ def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
 def _ported(
     problem: Problem, trial: Trial, shared: FloatArray
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
-    """Return how the ports of a trial move, and the derivatives of that by the shared unknowns."""
-    model, unknowns, outputs = problem.model, problem.shared, problem.campaign.outputs(trial)
+    """Return how the ports of a trial move, and the derivatives of that by the shared unknowns.
+
+    A derivative is None where it is zero; gains do not change how ports move.
+    """
+    unknowns = problem.shared
+    outputs = problem.campaign.outputs(trial)
 
     def system(u: FloatArray) -> PortedSystem:
-        return model.ported(trial, outputs, unknowns.parameters(u))
+        return problem.model.ported(trial, outputs, unknowns.parameters(u))
 
-    def slope(k: int) -> PortedSystem | None:
-        above, below = (system(moved(shared, k, sign * SMALL)) for sign in (1.0, -1.0))
-        found = {
-            name: (getattr(above, name) - getattr(below, name)) / (2.0 * SMALL)
-            for name in ("generator", "actions", "outputs", "through")
-        }
-        return replace(above, **found) if any(np.any(item) for item in found.values()) else None
+    slopes: list[PortedSystem | None] = []
+    for k in range(unknowns.count):
+        above = system(with_step(shared, k, SMALL))
+        below = system(with_step(shared, k, -SMALL))
+        slopes.append(_slope_of_system(above, below))
+    slopes += [None] * (unknowns.size - len(slopes))
+    return system(shared), slopes
 
-    of_parameters = [slope(k) for k in range(unknowns.count)]
-    return system(shared), of_parameters + [None] * (unknowns.size - len(of_parameters))
+
+def _slope_of_system(above: PortedSystem, below: PortedSystem) -> PortedSystem | None:
+    """Return the derivative of a system between values of a parameter `SMALL` above and below."""
+
+    def slope(upper: FloatArray, lower: FloatArray) -> FloatArray:
+        return np.asarray((upper - lower) / (2.0 * SMALL))
+
+    derivative = replace(
+        above,
+        generator=slope(above.generator, below.generator),
+        actions=slope(above.actions, below.actions),
+        outputs=slope(above.outputs, below.outputs),
+        through=slope(above.through, below.through),
+    )
+    changes = (
+        derivative.generator,
+        derivative.actions,
+        derivative.outputs,
+        derivative.through,
+    )
+    return derivative if any(np.any(change) for change in changes) else None

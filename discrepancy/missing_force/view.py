@@ -10,7 +10,7 @@ from discrepancy.campaign.records import FloatArray
 
 from .filtered import (
     LEAST_PRECISION,
-    Filtered,
+    ForceFilter,
     Process,
     Regression,
     Smoothed,
@@ -18,14 +18,14 @@ from .filtered import (
     regression,
 )
 from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_density
-from .trial import Part, SeenTrial
+from .trial import SeenTrial, TrialColumn
 
 LATER = 200
 """Samples after which more of them tell nothing of a moment."""
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class TrialMotion:
     """What was in a trial, at the fine stamps.
 
     Attributes
@@ -58,17 +58,19 @@ class Motion:
         return {port: force - self.left.get(port, 0.0) for port, force in self.forces.items()}
 
 
-Column = Sequence[Part]
+EffectColumn = Sequence[TrialColumn]
 """An effect, by trial."""
 
 
-def combined(columns: Sequence[Column], factors: Sequence[float]) -> Column:
+def combined(columns: Sequence[EffectColumn], factors: Sequence[float]) -> EffectColumn:
     """Return the sum of columns, each taken a number of times."""
-    first, *others = columns
-    found = [Part(np.zeros_like(part.readings)).plus(part, factors[0]) for part in first]
-    for column, factor in zip(others, factors[1:], strict=True):
-        found = [part.plus(other, factor) for part, other in zip(found, column, strict=True)]
-    return found
+    first_column, *other_columns = columns
+    total = [
+        TrialColumn(np.zeros_like(part.readings)).plus(part, factors[0]) for part in first_column
+    ]
+    for column, factor in zip(other_columns, factors[1:], strict=True):
+        total = [part.plus(added, factor) for part, added in zip(total, column, strict=True)]
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,25 +83,25 @@ class View:
         All that are looked at.
     shared_precision : (K,) ndarray
         Prior precision of the shared unknowns.
-    motions : sequence of Motion
+    motions : sequence of TrialMotion
         By trial, along which laws and parameters act; empty: that of the model.
-    effects : sequence of Column
+    effects : sequence of EffectColumn
         What acts in proportion to one more unknown each.
     precision : sequence of float
         Prior precision of these unknowns.
-    known : Column or None
+    known : EffectColumn or None
         What the hypothesis has beside them.
-    own : Column or None
+    own : EffectColumn or None
         What the model has beside its linear system.
     """
 
     trials: Sequence[SeenTrial]
     shared_precision: FloatArray
-    motions: Sequence[Motion] = ()
-    effects: Sequence[Column] = ()
+    motions: Sequence[TrialMotion] = ()
+    effects: Sequence[EffectColumn] = ()
     precision: Sequence[float] = ()
-    known: Column | None = None
-    own: Column | None = None
+    known: EffectColumn | None = None
+    own: EffectColumn | None = None
 
     @cached_property
     def precisions(self) -> FloatArray:
@@ -107,9 +109,12 @@ class View:
         return np.concatenate((self.shared_precision, self.precision))
 
     @cached_property
-    def parts(self) -> list[dict[int, tuple[Part, float]]]:
-        """What a unit of unknowns, by number, does along the motion, and which values are in it; by trial."""
-        by_trial: list[dict[int, tuple[Part, float]]] = [{} for _ in self.trials]
+    def parts(self) -> list[dict[int, tuple[TrialColumn, float]]]:
+        """What a unit of unknowns, by number, does along the motion, and which values are in it.
+
+        By trial.
+        """
+        by_trial: list[dict[int, tuple[TrialColumn, float]]] = [{} for _ in self.trials]
         for trial, motion, parts in zip(self.trials, self.motions, by_trial, strict=False):
             # calibrated parameters change the system along the motion
             for unknown, slope in enumerate(trial.slopes):
@@ -117,9 +122,9 @@ class View:
                     part = trial.turned(slope, motion.added, motion.forces)
                     parts[unknown] = (part, float(trial.about[unknown]))
             # gains change the readings of their channel
-            shown = trial.readings(motion.added, motion.forces)
+            readings = trial.readings(motion.added, motion.forces)
             for unknown, channel, scale in trial.gains:
-                part = Part(shown * scale * np.eye(shown.shape[1])[channel])
+                part = TrialColumn(readings * scale * np.eye(readings.shape[1])[channel])
                 parts[unknown] = (part, float(trial.about[unknown]))
         for unknown, effect in enumerate(self.effects, start=len(self.shared_precision)):
             for part, parts in zip(effect, by_trial, strict=True):
@@ -128,13 +133,15 @@ class View:
 
     @cached_property
     def rows(self) -> list[FloatArray]:
-        """Residuals beside what is known, and what all unknowns do to them (1 + K + L, N, C), by trial."""
+        """The residuals and their derivatives by all unknowns (1 + K + L, N, C), by trial."""
         by_trial = []
         first_local = 1 + len(self.precisions)
         for number, trial in enumerate(self.trials):
             row_count = first_local + len(trial.local)
             rows = np.moveaxis(np.zeros((*trial.residual.shape, row_count)), -1, 0)
-            acting = [column[number].readings for column in (self.known, self.own) if column is not None]
+            acting = [
+                column[number].readings for column in (self.known, self.own) if column is not None
+            ]
             rows[0] = trial.residual - sum(acting)
             rows[1 : 1 + len(trial.shared)] = trial.shared
             rows[first_local:] = trial.local
@@ -144,9 +151,9 @@ class View:
             by_trial.append(rows)
         return by_trial
 
-    def filtered(self, processes: Processes) -> list[Filtered]:
+    def filtered(self, processes: Processes) -> list[ForceFilter]:
         """Return the filters of missing forces."""
-        return [Filtered(trial, tuple(processes.items())) for trial in self.trials]
+        return [ForceFilter(trial, tuple(processes.items())) for trial in self.trials]
 
     def products(self, processes: Processes) -> Regression:
         """Return the products of all columns beside missing forces."""
@@ -158,7 +165,12 @@ class View:
 
     @np.errstate(invalid="ignore")
     def most_probable(
-        self, median: Processes, begin: Processes, *, near: bool = False, most_steps: int = MOST_STEPS
+        self,
+        median: Processes,
+        begin: Processes,
+        *,
+        near: bool = False,
+        most_steps: int = MOST_STEPS,
     ) -> tuple[dict[int, Process], float]:
         """Return the processes of the largest evidence times their prior, and its logarithm [nat].
 
@@ -184,7 +196,9 @@ class View:
     def times(self) -> tuple[float, float]:
         """Shortest and longest correlation time [s]: that of a sample, and that of a record."""
         stamps = [trial.time for trial in self.trials]
-        return min(float(np.median(np.diff(t))) for t in stamps), max(float(t[-1] - t[0]) for t in stamps)
+        return min(float(np.median(np.diff(t))) for t in stamps), max(
+            float(t[-1] - t[0]) for t in stamps
+        )
 
     def evidence(self, median: Processes, processes: Processes) -> float:
         """Return the logarithm of the evidence of processes times their prior [nat]."""
@@ -192,8 +206,11 @@ class View:
 
     def smoothed(
         self, processes: Processes, given: Solution | None = None
-    ) -> tuple[Solution, list[FloatArray], list[Motion]]:
-        """Return the unknowns, those of the trials alone, and motion and missing forces of each trial."""
+    ) -> tuple[Solution, list[FloatArray], list[TrialMotion]]:
+        """Return unknowns, motions and missing forces given all readings.
+
+        The unknowns of the trials are returned apart from the shared ones.
+        """
         solution = given or self.solve(processes)
         local_values, motions = [], []
         for number, filtered in enumerate(self.filtered(processes)):
@@ -201,18 +218,25 @@ class View:
             unexplained = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
             local = _local_unknowns(filtered, unexplained)
             unexplained = unexplained - np.tensordot(local, filtered.trial.local, 1)
-            motions.append(self._motion(number, processes, filtered.smoothed(unexplained), solution, local))
+            motions.append(
+                self._motion(number, processes, filtered.smoothed(unexplained), solution, local)
+            )
             local_values.append(local)
         return solution, local_values, motions
 
     def _motion(
-        self, number: int, processes: Processes, smoothed: Smoothed, solution: Solution, local: FloatArray
-    ) -> Motion:
+        self,
+        number: int,
+        processes: Processes,
+        smoothed: Smoothed,
+        solution: Solution,
+        local: FloatArray,
+    ) -> TrialMotion:
         """Return the motion of a trial, with what unknowns, hypothesis and model add to it."""
         trial = self.trials[number]
         missing = dict(zip(processes, smoothed.forces, strict=True))
         unused_readings = np.zeros_like(trial.residual)
-        acting = Part(unused_readings, smoothed.state, missing)
+        acting = TrialColumn(unused_readings, smoothed.state, missing)
         for unknown, (part, value) in self.parts[number].items():
             acting = acting.plus(part, float(solution.mean[unknown] - value))
         if self.known is not None:
@@ -225,9 +249,11 @@ class View:
         force_deviations, speed_deviations = np.split(smoothed.deviations, 2)
         deviations = {
             port: (force, float(speed[-LATER:][0]))
-            for port, force, speed in zip(processes, force_deviations, speed_deviations, strict=True)
+            for port, force, speed in zip(
+                processes, force_deviations, speed_deviations, strict=True
+            )
         }
-        return Motion(
+        return TrialMotion(
             added=added,
             forces=acting.forces,
             left=missing,
@@ -238,7 +264,7 @@ class View:
         )
 
 
-def _local_unknowns(filtered: Filtered, unexplained: FloatArray) -> FloatArray:
+def _local_unknowns(filtered: ForceFilter, unexplained: FloatArray) -> FloatArray:
     """Return the unknowns (L,) of a trial alone that explain most of its residuals (N, C)."""
     trial = filtered.trial
     products, _ = filtered.products(np.concatenate((unexplained[None], trial.local)))

@@ -1,8 +1,8 @@
-"""When there is a gap in the records in time: events of the missing force, or of what readings show.
+"""When there is a gap in the records: events of the missing force, or of what readings show.
 
-Where a model tells how its ports move, an event is a force at the port that tells most, or on the reading of
-one channel where that tells more, beside all unknowns of the records. Elsewhere it acts on the pattern over
-the channels in which the residuals of a fit are largest.
+Where a model says how its ports move, an event is a force at the port with the most evidence, or an
+error of one channel where that has more, beside all unknowns of the records. Elsewhere it acts on
+the pattern over the channels in which the residuals of a fit are largest.
 """
 
 from collections.abc import Sequence
@@ -15,71 +15,87 @@ from discrepancy.campaign.records import BoolArray, FloatArray, TrialKind
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.location.residuals import ResidualSet
+from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
 from .events import GROUND, MOST_EVENTS, Events, events, throughout
-from .explained import Explained, seen
+from .explained import ForceHypothesis, with_most_probable_forces
 from .filtered import Process
 from .naming import ForceSearch
-from .shares import of_nothing
+from .shares import evidence_without_force
 from .switched_record import changes
 from .trial import SeenTrial
 from .view import View
 
 IN_TIME = frozenset(TrialKind) - {TrialKind.STATIC}
-
+"""Kinds of trials that have a course in time."""
 SHOWS = 0.2
 """Share of the largest channel's size from which on a channel shows a gap."""
-READING_SIZES, READING_TIMES = (3.0, 30.0, 300.0), (0.02, 0.3)
-"""Processes on a reading that are weighed against the force: over the noise, over the record's length."""
+READING_SIZES = (3.0, 30.0, 300.0)
+"""Deviations of an error of a reading, over its noise, that are compared with the missing force."""
+READING_TIMES = (0.02, 0.3)
+"""Correlation times of such an error, over the length of the record."""
 
 
 def gap_windows(
     problem: Problem, fit: CandidateFit, residuals: ResidualSet, *, seed: int = 0
 ) -> tuple[GapWindow, ...]:
-    """Return when there is a gap of the model as it was, in records held out too.
+    """Return when the model as it is has a gap, in held-out records too.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     fit : CandidateFit
-        Of the verdict: where its law at a port, acting throughout, tells more than events, there are none.
+        The fit of the verdict. Where its law at a port, acting throughout, has more evidence than
+        events, there are no windows.
     residuals : ResidualSet
-        Of the model as it was; those of trials whose force cannot be seen, and of a model with laws
-        of its own, are looked at themselves.
+        The residuals of the model as it is. They alone are examined where forces cannot be seen,
+        and for a model with laws of its own, which are exact only where they are simulated.
     seed : int
-        Of the draw that restores what the fit has absorbed.
+        The seed of the draw that restores what the fit has absorbed.
     """
-    dynamic = tuple(item.trial for item in residuals.trials if item.trial.is_dynamic)
-    own = problem.model.apart()[1]  # laws that are exact where they are simulated, not along what is seen
-    if not dynamic or not problem.model.shows_ports or len(own):
+    dynamic_trials = tuple(fitted.trial for fitted in residuals.trials if fitted.trial.is_dynamic)
+    _, own_laws = problem.model.apart()
+    if not dynamic_trials or not problem.model.shows_ports or len(own_laws):
         return residual_windows(residuals, seed=seed)
     try:
-        found = _of_force(problem.with_trials(dynamic), fit)
+        windows = _force_windows(problem.with_trials(dynamic_trials), fit)
     except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # no verdict rests on it
         return residual_windows(residuals, seed=seed)
-    return found + residual_windows(residuals, seed=seed, kinds=frozenset({TrialKind.FLIGHT}))
+    flight = frozenset({TrialKind.FLIGHT})
+    return windows + residual_windows(residuals, seed=seed, kinds=flight)
 
 
-def _of_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
-    """Return when a force is missing at the port, or the reading, that tells most."""
+def _force_windows(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
+    """Return when a force is missing at the port, or at the channel, with the most evidence."""
     search = ForceSearch(problem)
     port = max(search.at, key=lambda name: search.at[name].log_evidence)
-    laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
-    law = search.followed(search.at[port], *fit.candidate.some(laws, fit.effect)) if laws else None
+    evidence_of_law = _evidence_of_law(search, port, fit)
     channels = [data.trial.channels for data in problem.trials]
-    number, found = _most_telling(search.ports.index(port), search.rough(port), channels)
-    if found.log_evidence < of_nothing(found) + GROUND:
+    number, hypothesis = _most_probable_place(
+        search.ports.index(port), search.rough(port), channels
+    )
+    if hypothesis.log_evidence < evidence_without_force(hypothesis) + GROUND:
         return ()
-    best = events(found.view, number, found.processes[number], -np.inf if law is None else law.log_evidence)
+    process = hypothesis.processes[number]
+    best = events(hypothesis.view, number, process, evidence_of_law)
     shown = []
-    for trial, motion in zip(found.view.trials, found.motions, strict=True):
+    for trial, motion in zip(hypothesis.view.trials, hypothesis.motions, strict=True):
         force = motion.forces[number]
         shown.append(trial.readings(trial.pushed(number, force), {number: force}))
-    return _windows(best, channels, shown, with_effect=False)
+    return _windows_of_events(best, channels, shown, with_effect=False)
+
+
+def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float:
+    """Return the evidence of the laws of a fit at a port [nat]; -inf if it has none there."""
+    laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
+    if not laws:
+        return -np.inf
+    candidate, effect = fit.candidate.subset(laws, fit.effect)
+    law = search.followed(search.at[port], candidate, effect)
+    return -np.inf if law is None else law.log_evidence
 
 
 def residual_windows(
@@ -89,25 +105,39 @@ def residual_windows(
     with_effect: bool = False,
     kinds: frozenset[TrialKind] = IN_TIME,
 ) -> tuple[GapWindow, ...]:
-    """Return when the residuals of a hypothesis are more than noise, in trials of some kinds.
+    """Return when the residuals of a hypothesis are more than noise.
 
-    `with_effect`: whether it is the best one, not the model as it was. A flight whose turns came without
-    times has none.
+    A flight whose turns came without times has no windows.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The residuals.
+    seed : int
+        The seed of the draw that restores what the fit has absorbed.
+    with_effect : bool
+        Whether the hypothesis is the best one, not the model as it is.
+    kinds : frozenset of TrialKind
+        The kinds of trials that are examined.
     """
-    found: tuple[GapWindow, ...] = ()
+    windows: tuple[GapWindow, ...] = ()
     white = residuals.white(np.random.default_rng((seed, 1)))
-    for item, series in zip(residuals.trials, white, strict=True):
-        if item.trial.kind in kinds and item.used.any() and np.ptp(item.trial.time) > 0.0:
-            one, pattern = of_series(item.trial.name, item.trial.time, series, item.used)
-            if one.log_evidence < of_nothing(one) + GROUND:
-                continue
-            shown = one.motions[0].forces[0][:, None] * pattern
-            try:
-                best = events(one.view, 0, one.processes[0])
-            except np.linalg.LinAlgError:  # a hypothesis that leaves millions of noises is off throughout
-                best = throughout(one.view, 0, one.processes[0])
-            found += _windows(best, [item.trial.channels], [shown], with_effect=with_effect)
-    return found
+    for fitted, series in zip(residuals.trials, white, strict=True):
+        trial = fitted.trial
+        has_course = fitted.used.any() and np.ptp(trial.time) > 0.0
+        if trial.kind not in kinds or not has_course:
+            continue
+        hypothesis, pattern = pattern_of_residuals(trial.name, trial.time, series, fitted.used)
+        if hypothesis.log_evidence < evidence_without_force(hypothesis) + GROUND:
+            continue
+        process = hypothesis.processes[0]
+        try:
+            best = events(hypothesis.view, 0, process)
+        except np.linalg.LinAlgError:  # residuals of millions of noises are there throughout
+            best = throughout(hypothesis.view, 0, process)
+        shown = hypothesis.motions[0].forces[0][:, None] * pattern
+        windows += _windows_of_events(best, [trial.channels], [shown], with_effect=with_effect)
+    return windows
 
 
 def sized_windows(
@@ -118,99 +148,214 @@ def sized_windows(
     Parameters
     ----------
     windows : sequence of GapWindow
-        Of the model as it was, and of what the hypothesis of the verdict leaves.
+        The windows of the model as it is, and of what the hypothesis of the verdict leaves.
     before, after : ResidualSet
-        Residuals without and with the hypothesis. Both are over the noise of the first, so that a size with
-        the effect can be compared with one without it.
+        The residuals without and with the hypothesis. Both are divided by the noise of the first,
+        so that a size with the effect can be compared with one without it.
     """
-    noise = {item.trial.name: item.noise_deviation for item in before.trials}
-    found = []
+    noise = {fitted.trial.name: fitted.noise_deviation for fitted in before.trials}
+    sized = []
     for window in windows:
         residuals = after if window.with_effect else before
-        (item,) = [item for item in residuals.trials if item.trial.name == window.trial]
-        begin = window.first if window.begin is None else window.begin.value
-        end = window.last if window.end is None else window.end.value
-        time = item.trial.time
-        inside = item.used & ((time >= begin) & (time <= end))[:, None]
-        squares = np.where(inside, (item.residual / noise[window.trial]) ** 2, 0.0).sum(axis=0)
-        sizes = np.sqrt(squares / np.maximum(inside.sum(axis=0), 1))
+        (fitted,) = (fitted for fitted in residuals.trials if fitted.trial.name == window.trial)
+        sizes = _rms_in_window(window, fitted, noise[window.trial])
         largest = float(sizes.max())
-        shows = zip(item.trial.channels, (sizes > 0.0) & (sizes >= SHOWS * largest), strict=True)
-        channels = tuple(channel for channel, does in shows if does)
-        found.append(replace(window, size=largest, channels=channels))
-    return tuple(found)
+        shows = (sizes > 0.0) & (sizes >= SHOWS * largest)
+        channels = _selected(fitted.trial.channels, shows)
+        sized.append(replace(window, size=largest, channels=channels))
+    return tuple(sized)
 
 
-def _most_telling(port: int, at: Explained, channels: Sequence[tuple[str, ...]]) -> tuple[int, Explained]:
-    """Return the missing force, or what one channel shows where that tells more, and its port first.
+def _rms_in_window(window: GapWindow, fitted: FittedTrial, noise: FloatArray) -> FloatArray:
+    """Return the rms residual (C,) of each channel within a window, over its noise (C,)."""
+    begin = window.first if window.begin is None else window.begin.value
+    end = window.last if window.end is None else window.end.value
+    time = fitted.trial.time
+    inside = fitted.used & ((time >= begin) & (time <= end))[:, None]
+    squares = np.where(inside, (fitted.residual / noise) ** 2, 0.0).sum(axis=0)
+    return np.asarray(np.sqrt(squares / np.maximum(inside.sum(axis=0), 1)))
 
-    `channels` are those of each trial.
+
+def _selected(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...]:
+    """Return the channels that are selected by a mask (C,)."""
+    pairs = zip(channels, is_selected, strict=True)
+    return tuple(channel for channel, selected in pairs if selected)
+
+
+# ---------------------------------------------------------------- errors of readings
+
+
+def _most_probable_place(
+    port: int, at_port: ForceHypothesis, channels: Sequence[tuple[str, ...]]
+) -> tuple[int, ForceHypothesis]:
+    """Return the missing force at a port, or the error of a channel if that is more probable.
+
+    Parameters
+    ----------
+    port : int
+        The number of the port.
+    at_port : ForceHypothesis
+        The missing force there.
+    channels : sequence of tuple of str
+        The channels of each trial.
+
+    Returns
+    -------
+    port : int
+        The number of the port; 0 for a channel, which is the only port of its view.
+    hypothesis : ForceHypothesis
+        The more probable hypothesis.
     """
-    view, best = at.view, (port, at)
+    view = at_port.view
     trials = view.trials
+    length = max(float(np.ptp(trial.time)) for trial in trials)
+    best_port = port
+    best = at_port
     for channel in dict.fromkeys(chain(*channels)):
         motions = [replace(motion, forces={}, left={}) for motion in view.motions]
-        shown = [_reading(*pair, channel) for pair in zip(trials, channels, strict=True)]
-        on_reading = replace(view, trials=shown, motions=motions)
-        length = max(float(np.ptp(trial.time)) for trial in trials)
-        processes = [
-            {0: Process(size, time * length, rough=True)}
-            for size, time in product(READING_SIZES, READING_TIMES)
+        on_reading = [
+            _with_reading_as_port(trial, names, channel)
+            for trial, names in zip(trials, channels, strict=True)
         ]
-        about = max(processes, key=lambda item: on_reading.solve(item).evidence)
-        if on_reading.solve(about).evidence > best[1].log_evidence:
-            best = 0, seen(on_reading, about, about)
-    return best
+        channel_view = replace(view, trials=on_reading, motions=motions)
+        options = []
+        for size, relative_time in product(READING_SIZES, READING_TIMES):
+            options.append({0: Process(size, relative_time * length, rough=True)})
+        evidences = [channel_view.solve(processes).evidence for processes in options]
+        number = max(range(len(options)), key=lambda k: evidences[k])
+        if evidences[number] > best.log_evidence:
+            best_port = 0
+            best = with_most_probable_forces(channel_view, options[number], options[number])
+    return best_port, best
 
 
-def _reading(trial: SeenTrial, channels: Sequence[str], channel: str) -> SeenTrial:
-    """Return a trial whose only port is a reading; a unit of its force is the deviation of the noise."""
-    shown = -trial.deviation[None] * (np.array(channels) == channel)
-    still = np.zeros((len(trial.positions), 1))
-    none = np.zeros((1, len(trial.system.generator)))
+def _with_reading_as_port(trial: SeenTrial, channels: Sequence[str], channel: str) -> SeenTrial:
+    """Return a trial whose only port is a reading; the unit of its force is the noise deviation."""
+    through = -trial.deviation[None] * (np.array(channels) == channel)
+    no_motion = np.zeros((len(trial.positions), 1))
+    no_action = np.zeros((1, len(trial.system.generator)))
     system = replace(
-        trial.system, ports=("reading",), actions=none, positions=none, speeds=none, through=shown
+        trial.system,
+        ports=("reading",),
+        actions=no_action,
+        positions=no_action,
+        speeds=no_action,
+        through=through,
     )
-    return replace(trial, system=system, positions=still, speeds=still, by_unknowns={})
+    return replace(trial, system=system, positions=no_motion, speeds=no_motion, by_unknowns={})
 
 
-def of_series(
+def pattern_of_residuals(
     name: str, time: FloatArray, series: FloatArray, used: BoolArray
-) -> tuple[Explained, FloatArray]:
-    """Return residuals in noises (N, C) as a record of one reading: their largest pattern (C,), which too."""
+) -> tuple[ForceHypothesis, FloatArray]:
+    """Return residuals as a record of one reading: their largest pattern over the channels.
+
+    Parameters
+    ----------
+    name : str
+        The name of the trial.
+    time : (N,) array
+        The stamps [s].
+    series : (N, C) array
+        The residuals, over their noise and white if they are noise.
+    used : (N, C) array of bool
+        Whether a residual counts.
+
+    Returns
+    -------
+    hypothesis : ForceHypothesis
+        The pattern over time, as a missing force at the reading.
+    pattern : (C,) array
+        The pattern over the channels.
+    """
     series = np.where(used, series, 0.0)
-    pattern = np.linalg.svd(series, full_matrices=False)[2][:1]
-    deviation = 1.0 + np.sqrt((series.shape[1] - 1) / len(time))  # of the largest pattern of noise alone
-    none, columns = np.zeros((1, 0)), np.zeros((0, len(time), 1))
-    still = np.zeros((len(time), 1))
-    system = PortedSystem(np.zeros((0, 0)), ("readings",), none, none, none, none, -np.ones((1, 1)))
+    _, _, patterns = np.linalg.svd(series, full_matrices=False)
+    pattern = patterns[:1]
+    # the largest pattern of noise alone is larger than the noise
+    deviation = 1.0 + np.sqrt((series.shape[1] - 1) / len(time))
+    no_state = np.zeros((1, 0))
+    system = PortedSystem(
+        generator=np.zeros((0, 0)),
+        ports=("readings",),
+        actions=no_state,
+        positions=no_state,
+        speeds=no_state,
+        outputs=no_state,
+        through=-np.ones((1, 1)),
+    )
+    no_unknowns = np.zeros((0, len(time), 1))
+    no_motion = np.zeros((len(time), 1))
     trial = SeenTrial(
-        name, time, series @ pattern.T / deviation, np.any(used, axis=1).reshape(-1, 1),
-        np.array([deviation]), (),
-        columns, columns, np.zeros(0), system, (), 1, still, still, False,
-    )  # fmt: skip
+        name=name,
+        time=time,
+        residual=series @ pattern.T / deviation,
+        used=np.any(used, axis=1).reshape(-1, 1),
+        deviation=np.array([deviation]),
+        coloured=(),
+        shared=no_unknowns,
+        local=no_unknowns,
+        local_precision=np.zeros(0),
+        system=system,
+        slopes=(),
+        parts=1,
+        positions=no_motion,
+        speeds=no_motion,
+        settled=False,
+    )
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
-    about = {0: Process(size, 0.1 * float(np.ptp(time)), rough=True)}
-    found = seen(View([trial], np.zeros(0)), about, about)
-    return found, pattern[0]
+    processes = {0: Process(size, 0.1 * float(np.ptp(time)), rough=True)}
+    hypothesis = with_most_probable_forces(View([trial], np.zeros(0)), processes, processes)
+    return hypothesis, pattern[0]
 
 
-def _windows(
-    best: Events, channels: Sequence[tuple[str, ...]], shown: Sequence[FloatArray], *, with_effect: bool
+# ---------------------------------------------------------------- windows
+
+
+def _windows_of_events(
+    best: Events,
+    channels: Sequence[tuple[str, ...]],
+    shown: Sequence[FloatArray],
+    *,
+    with_effect: bool,
 ) -> tuple[GapWindow, ...]:
-    """Return the windows of events, given by trial the channels and what these show of the force (N, C)."""
+    """Return the windows of events, with the channels that show them and their size there.
+
+    Parameters
+    ----------
+    best : Events
+        The events.
+    channels : sequence of tuple of str
+        The channels of each trial.
+    shown : sequence of (N, C) array
+        What the readings of each trial show of the force, over their noise.
+    with_effect : bool
+        Whether the gap is that of the best hypothesis, not of the model as it is.
+    """
     windows = []
-    for number, (trial, on) in enumerate(zip(best.search.trials, best.paths, strict=True)):
-        ends = (float(trial.time[0]), float(trial.time[-1]))
-        at = changes(on)
-        if len(at) > 2 * MOST_EVENTS:
-            on, at = np.ones_like(on), at[:0]
-        moments = [Moment(*map(float, item)) for item in best.moments(number)] if len(at) else []
-        edges, known = [0, *at, len(on)], [None, *moments, None]
-        for k in np.flatnonzero(on[edges[:-1]]):
-            size = np.sqrt(np.mean(shown[number][edges[k] : edges[k + 1]] ** 2, axis=0))
-            rows = zip(channels[number], size > SHOWS * size.max(), strict=True)
-            names = tuple(name for name, shows in rows if shows)
-            largest = float(size.max())
-            windows.append(GapWindow(trial.name, names, known[k], known[k + 1], *ends, largest, with_effect))
+    for number, (trial, path) in enumerate(zip(best.search.trials, best.paths, strict=True)):
+        is_on = path
+        switches = changes(path)
+        if len(switches) > 2 * MOST_EVENTS:  # a force that comes and goes acts throughout
+            is_on = np.ones_like(path)
+            switches = switches[:0]
+        moments: list[Moment | None] = []
+        if len(switches):
+            moments = [Moment(*map(float, moment)) for moment in best.moments(number)]
+        edges = [0, *switches.tolist(), len(is_on)]
+        bounds = [None, *moments, None]
+        for k in np.flatnonzero(is_on[edges[:-1]]).tolist():
+            stretch = slice(edges[k], edges[k + 1])
+            sizes = np.sqrt(np.mean(shown[number][stretch] ** 2, axis=0))
+            windows.append(
+                GapWindow(
+                    trial=trial.name,
+                    channels=_selected(channels[number], sizes > SHOWS * sizes.max()),
+                    begin=bounds[k],
+                    end=bounds[k + 1],
+                    first=float(trial.time[0]),
+                    last=float(trial.time[-1]),
+                    size=float(sizes.max()),
+                    with_effect=with_effect,
+                )
+            )
     return tuple(windows)

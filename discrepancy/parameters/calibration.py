@@ -14,11 +14,11 @@ from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import LEFT
 from discrepancy.errors import CampaignDataError, ModelError, said
-from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
-from discrepancy.search.honest_evidence import left_by
+from discrepancy.search.wide_noise import residual_process_of
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
 from reporting.progress import Progress, reporter
@@ -78,7 +78,7 @@ def calibrate_parameters(
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
     best = posterior.optima[0]  # what noise is coloured like, beyond what its record tells, is no gap
-    gate = absolute_gate(problem, replace(best, remainder=left_by(problem, best)))
+    gate = check_absolute_fit(problem, replace(best, residual_process=residual_process_of(problem, best)))
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
     return Calibration(
         asset=campaign.name if asset is None else asset,

@@ -20,7 +20,7 @@ from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, fit, normal_equations, solved, upper_factor
+from discrepancy.fits.fitting import CandidateFit, cholesky_factor, fit, normal_equations, solve_factored
 from discrepancy.fits.problem import Problem
 
 NOTHING = Candidate()
@@ -157,7 +157,7 @@ class Marginal:
         """Return the Gaussian that a fit tells of those (P,) that were fitted, be it at an end or not."""
         problem, which = self._problem, self.free[fitted]
         equations = normal_equations(problem, found, NOTHING, problem.precisions(found.sums))
-        step = solved(upper_factor(equations.matrix), equations.gradient)
+        step = solve_factored(cholesky_factor(equations.matrix), equations.gradient)
         return CutGaussian(
             found.point.shared[which] + step[which],
             found.covariance[np.ix_(which, which)],

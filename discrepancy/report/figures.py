@@ -111,7 +111,7 @@ MOST_TURNS = 400
 def missing_force_figure(missing: MissingForce) -> Figure:
     """Draw a missing force and what is told of it, with its law and what is left where there is one."""
     parts = [("missing force", "force"), ("what is left", "left")][: 2 if missing.law else 1]
-    what, place, rate = motion_of(missing.told)
+    what, place, rate = motion_of(missing.at_port)
     integral, state = ("displacement", "speed") if place else ("integral of the state", "state")
     along = (("position", ", ".join(filter(None, (integral, place)))), ("speed", f"{state}, {rate}"))
     every = slice(None, None, -(-sum(len(item.time) for item in missing.courses) // MOST_DOTS))
@@ -132,7 +132,7 @@ def missing_force_figure(missing: MissingForce) -> Figure:
         if law and strongest.law is not None:
             row[2].plot(time, strongest.law[stretch], "--", color=style.PREDICTION, lw=0.9)
         row[2].set_xlabel(f"time in {strongest.trial}, s")
-        row[0].set_ylabel(f"{what}, {missing.told.unit}")
+        row[0].set_ylabel(f"{what}, {missing.at_port.unit}")
         for column, axes in enumerate(row):
             axes.axhline(0.0, color=style.REFERENCE, lw=0.6, zorder=0)
             axes.locator_params(axis="x", nbins=4)  # the integral of a state may have six digits
@@ -228,7 +228,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
     verdict, proof, missing = investigation.verdict, investigation.proof, investigation.missing
     before, after = investigation.before, investigation.after if added_label(investigation) else None
     if missing is not None:
-        add("missing_force", missing_force_figure(missing), sentence=force_sentence(missing.told))
+        add("missing_force", missing_force_figure(missing), sentence=force_sentence(missing.at_port))
     if before is not None:
         names = [item.trial.name for item in before.trials if item.trial.held_out]
         scale = {

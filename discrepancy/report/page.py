@@ -61,7 +61,7 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
     if problem is None or search is None or fit is None:
         return []
     layout = problem.shared
-    fits = [search.none] + ([fit] if fit.candidate.terms else [])
+    fits = [search.no_effect] + ([fit] if fit.candidate.terms else [])
     rows = []
     stated = [*zip(layout.centre.tolist(), layout.scale.tolist(), strict=True)][: layout.count]
     for prior, *found in zip(stated, *(calibrated_parameters(problem, one) for one in fits), strict=True):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity, TrialKind
 from discrepancy.campaign.units import UNITS
-from discrepancy.judgement.closed_share import over_noise_of
+from discrepancy.judgement.closed_share import with_noise_of
 from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
 from discrepancy.verdict import GapWindow
 from fe.runtime.wing_rows import strain_gauge
@@ -42,7 +42,7 @@ def models(before: ResidualSet, after: ResidualSet | None) -> list[Shown]:
     """Return the model as it was and, where there is one, with the effect."""
     if after is None:
         return [Shown(before, style.PREDICTION, "--", "o", "model", "model as it is")]
-    after = over_noise_of(after, before)
+    after = with_noise_of(after, before)
     return [
         Shown(before, style.PREDICTION, "--", "o", "model as it was", "a  model as it was"),
         Shown(after, style.PAST, "-", "D", AFTER, f"b  {AFTER}"),

@@ -1,10 +1,13 @@
-"""Where fits begin: the most promising changes of each effect and of pairs, from a screen or a grid."""
+"""Starts of fits.
+
+The most promising changes by each effect and by pairs, from a screen or a grid.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import combinations, product
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from scipy.special import ndtri
@@ -12,112 +15,209 @@ from scipy.special import ndtri
 from discrepancy.campaign.records import FloatArray
 from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.errors import DiscrepancyError
-from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import CandidateFit, objective
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Change, Screen
+from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.search_settings import SEARCH
 from fe.runtime.patch import SENSORS
 
 T = TypeVar("T")
-Tell = Callable[[str], None]
-Start = tuple[Candidate, Point]
-Starts = list[Start]
+OnProgress = Callable[[str], None]
+"""Takes a line that says what the search is doing."""
+LARGEST_CONDITION = 1e8
+"""Condition number beyond which the changes by two effects are the same one."""
 
 
-def in_silence(what: str) -> None:
-    """Tell nobody."""
+class FitStart(NamedTuple):
+    """A candidate and the point from which its fit begins."""
+
+    candidate: Candidate
+    point: Point
 
 
-def each(tell: Tell, items: Sequence[T], words: Callable[[T], str]) -> Iterator[T]:
-    """Yield items, and tell of each what is done with it and how many are left."""
+def no_progress(message: str) -> None:
+    """Ignore a line of progress."""
+
+
+def with_progress(
+    on_progress: OnProgress, items: Sequence[T], describe: Callable[[T], str]
+) -> Iterator[T]:
+    """Yield items, and report for each what is done with it and how many are still to come.
+
+    Parameters
+    ----------
+    on_progress : callable
+        Takes a line of progress.
+    items : sequence
+        The items.
+    describe : callable
+        Returns what is done with an item, such as "fitting gain".
+    """
     for number, item in enumerate(items):
-        tell(f"{words(item)}, {len(items) - number - 1} more")
+        remaining = len(items) - number - 1
+        on_progress(f"{describe(item)}, {remaining} more")
         yield item
 
 
-def starts(screen: Screen, effect: Effect) -> list[Change]:
-    """Return the most promising changes of an effect; more of them where a box is to be placed."""
-    count = SEARCH.starts * (3 if sum(not item.magnitude for item in effect.parameters) > 1 else 1)
-    found: list[Change] = []
-    places = effect.places(screen.problem.setting)
-    for place in places:
-        best: list[Change] = []
-        few = len(places) <= SEARCH.few_places
-        for change in screen.changes(Term(effect, place), fine=few):
-            tried = [change]
-            if few and change.size > SEARCH.first_order and acts_within(effect, screen.problem.setting):
-                with suppress(DiscrepancyError):
-                    tried.append(screen.shrunk(change)[0])
-            best = sorted([*best, *(item for item in tried if item.size > 0.0)], key=_worth)[:count]
-        found.extend(best)
-    return sorted(found, key=_worth)[:count]
+# ---------------------------------------------------------------- effects
 
 
 def acts_within(effect: Effect, setting: Setting) -> bool:
-    """Whether an effect acts within the structure or on its loads, not on readings only."""
-    term = Term(effect, effect.places(setting)[0])
+    """Return whether an effect acts on the structure or its loads, and not only on readings."""
+    term = EffectTerm(effect, effect.places(setting)[0])
     try:
         patch = term.patch(setting, term.start() + 1.0)
-    except DiscrepancyError:  # a law that cannot be so large
+    except DiscrepancyError:  # only a law within the structure can be too large
         return True
-    return not all(isinstance(item, SENSORS) for item in patch)
+    return not all(isinstance(primitive, SENSORS) for primitive in patch)
 
 
-def are_related(one: Effect, other: Effect) -> bool:
-    """Whether one of two different effects is easily taken for the other."""
-    if one.identifier == other.identifier:
+def are_related(first: Effect, second: Effect) -> bool:
+    """Return whether one of two different effects is easily mistaken for the other."""
+    if first.identifier == second.identifier:
         return False
-    named = one.identifier in other.confusable or other.identifier in one.confusable
-    return named or one.family == other.family
+    is_confusable = first.identifier in second.confusable or second.identifier in first.confusable
+    return is_confusable or first.family == second.family
 
 
-def _worth(change: Change) -> float:
-    """Order of changes: misfit gained, less what the scale costs in the prior."""
+# ---------------------------------------------------------------- starts from a screen
+
+
+def starting_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
+    """Return the most promising changes by an effect, from which its fits may begin.
+
+    An effect with several parameters that are no magnitudes, such as the place and width of a box,
+    gets more starts than others.
+
+    Parameters
+    ----------
+    screen : Screen
+        The fit that the effect is added to.
+    effect : Effect
+        The effect; all its places are tried.
+    """
+    setting = screen.problem.setting
+    places = effect.places(setting)
+    has_few_places = len(places) <= SEARCH.few_places
+    others = sum(not parameter.magnitude for parameter in effect.parameters)
+    count = SEARCH.starts * 3 if others > 1 else SEARCH.starts
+    best_changes: list[ScreenedChange] = []
+    for place in places:
+        best_of_place: list[ScreenedChange] = []
+        for change in screen.changes(EffectTerm(effect, place), fine=has_few_places):
+            changes = [change]
+            is_nonlinear = change.squared_size > SEARCH.first_order and acts_within(effect, setting)
+            if has_few_places and is_nonlinear:
+                with suppress(DiscrepancyError):
+                    small_change, _ = screen.shrunk(change)
+                    changes.append(small_change)
+            visible = [change for change in changes if change.squared_size > 0.0]
+            best_of_place = sorted([*best_of_place, *visible], key=_cost)[:count]
+        best_changes.extend(best_of_place)
+    return sorted(best_changes, key=_cost)[:count]
+
+
+def _cost(change: ScreenedChange) -> float:
+    """Return the change of the objective at the best scale.
+
+    Its prior less the gained misfit [nat].
+    """
     scaled = change.best
     return -change.gain + 0.5 * float(scaled @ scaled)
 
 
-def pairs(changes: Sequence[Change], sign: FloatArray) -> list[tuple[float, Change, Change]]:
-    """Return misfit and changes, scaled together, of all pairs of effects, the best first."""
-    best: dict[tuple[str, str], tuple[float, Change, Change]] = {}
-    for one, other in combinations(changes, 2):
-        key = (one.term.effect.identifier, other.term.effect.identifier)
-        overlap = float(one.vector * sign @ other.vector)
-        gram, fits = np.array([[one.size, overlap], [overlap, other.size]]), np.array([one.fits, other.fits])
-        if key[0] == key[1] or np.linalg.cond(gram) > 1e8:
+class ScreenedPair(NamedTuple):
+    """Two changes that explain most together at their scales, and the misfit they add [nat]."""
+
+    misfit: float
+    first: ScreenedChange
+    second: ScreenedChange
+
+
+def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[ScreenedPair]:
+    """Return the best pair of changes for each pair of different effects, the best first.
+
+    Parameters
+    ----------
+    changes : sequence of ScreenedChange
+        The changes by all effects.
+    sign : (D,) array
+        The signs of the inner product, `Screen.sign`.
+    """
+    best: dict[tuple[str, str], ScreenedPair] = {}
+    for first, second in combinations(changes, 2):
+        key = (first.term.effect.identifier, second.term.effect.identifier)
+        cross = float(first.vector * sign @ second.vector)
+        gram = np.array([[first.squared_size, cross], [cross, second.squared_size]])
+        overlap = np.array([first.overlap, second.overlap])
+        if key[0] == key[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
             continue
-        scale = np.linalg.solve(gram, fits)
-        # a size that cannot be negative: the other one alone
-        able = [size >= 0.0 or item.term.may_turn for size, item in zip(scale, (one, other), strict=True)]
-        misfit = -0.5 * float(fits @ scale)
-        if all(able) and (key not in best or misfit < best[key][0]):
-            best[key] = (misfit, _scaled(one, scale[0]), _scaled(other, scale[1]))
-    return sorted(best.values(), key=lambda row: row[0])
+        scale = np.linalg.solve(gram, overlap)
+        can_have_sign = [
+            factor >= 0.0 or change.term.may_be_negative
+            for factor, change in zip(scale, (first, second), strict=True)
+        ]
+        misfit = -0.5 * float(overlap @ scale)
+        is_better = key not in best or misfit < best[key].misfit
+        if all(can_have_sign) and is_better:
+            best[key] = ScreenedPair(
+                misfit, _with_scale(first, scale[0]), _with_scale(second, scale[1])
+            )
+    return sorted(best.values(), key=lambda pair: pair.misfit)
 
 
-def _scaled(change: Change, scale: float) -> Change:
-    """Return the change whose best scale alone is the given one."""
-    return Change(change.term, change.start, change.vector, scale * change.size, change.size)
+def _with_scale(change: ScreenedChange, scale: float) -> ScreenedChange:
+    """Return the change as one whose best scale is a given one, so that a fit begins there."""
+    return replace(change, overlap=scale * change.squared_size)
 
 
-def beside(base: CandidateFit, term: Term, values: FloatArray) -> Start:
-    """Return a base with one more effect, and where a fit of it begins."""
+def start_beside(base: CandidateFit, term: EffectTerm, values: FloatArray) -> FitStart:
+    """Return the start of a fit with one more effect.
+
+    Parameters
+    ----------
+    base : CandidateFit
+        The fit that the effect is added to.
+    term : EffectTerm
+        The effect at its place.
+    values : (E,) array
+        Its scaled parameters.
+    """
     effect = np.concatenate((base.effect, values))
-    return base.candidate.plus(term), replace(base.point, effect=effect)
+    return FitStart(base.candidate.with_term(term), replace(base.point, effect=effect))
 
 
-def tried(problem: Problem, base: CandidateFit, effect: Effect) -> Starts:
-    """Return the most promising points of a grid of an effect's parameters, beside a base."""
-    found = []
+# ---------------------------------------------------------------- starts from a grid
+
+
+def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[FitStart]:
+    """Return the points of a grid of an effect's parameters at which the objective is least.
+
+    Far from the truth a screen, which is linear, says little; a grid needs a simulation for each
+    point.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    base : CandidateFit
+        The fit that the effect is added to.
+    effect : Effect
+        The effect; all its places are tried.
+    """
+    valued_starts = []
     for place in effect.places(problem.setting):
-        term = Term(effect, place)
-        known, size = SEARCH.far_levels, len(term.parameters)
-        count = known[min(size, len(known) - 1)]
+        term = EffectTerm(effect, place)
+        parameter_count = len(term.parameters)
+        level_counts = SEARCH.far_levels
+        count = level_counts[min(parameter_count, len(level_counts) - 1)]
+        # quantiles of the prior
         levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
-        for values in product(levels, repeat=size):
-            candidate, start = beside(base, term, np.array(values))
+        for values in product(levels, repeat=parameter_count):
+            start = start_beside(base, term, np.array(values))
             with suppress(DiscrepancyError):  # more than the structure can carry
-                found.append((objective(problem, candidate, start), candidate, start))
-    found.sort(key=lambda row: row[0])
-    return [row[1:] for row in found[: SEARCH.far_starts]]
+                value = objective(problem, start.candidate, start.point)
+                valued_starts.append((value, start))
+    valued_starts.sort(key=lambda valued_start: valued_start[0])
+    return [start for _, start in valued_starts[: SEARCH.far_starts]]

@@ -1,4 +1,4 @@
-"""The search for the set of effects that explains a campaign: screen, fit, add."""
+"""The search for the set of effects that explains a campaign: screen, fit, add, drop."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,392 +11,541 @@ from scipy.special import logsumexp
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
 from discrepancy.estimation.refinement import refined
-from discrepancy.fits.candidate import Candidate, Key
-from discrepancy.fits.fitting import CandidateFit, attempt, free_shape
-from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, solver_share
+from discrepancy.fits.candidate import Candidate, CandidateKey
+from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
+from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit, time_step_error
 from discrepancy.fits.problem import Problem
-from discrepancy.fits.screening import Screen
-from discrepancy.missing_force.explained import Explained
+from discrepancy.fits.screening import Screen, ScreenedChange
+from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.hypotheses import log_prior, sees_forces
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
-from .other_optima import canonical_relatives, restarts, sets_at_other_places
-from .starts import Starts, Tell, acts_within, beside, each, in_silence, pairs, starts, tried
+from .other_optima import canonical_relatives, points_at_other_sizes, sets_at_other_places
+from .starts import (
+    FitStart,
+    OnProgress,
+    acts_within,
+    best_pairs,
+    grid_starts,
+    no_progress,
+    start_beside,
+    starting_changes,
+    with_progress,
+)
 
 
 @dataclass
 class Search:
-    """All candidates fitted so far, and the way to more of them.
+    """A search for the effects that explain a campaign.
+
+    All candidates fitted so far, and what fits more.
 
     Attributes
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     effects : tuple of Effect
-        Those that can act here.
-    none : CandidateFit
-        Without effect.
-    exact : dict of Key to CandidateFit
-        Fitted to convergence.
-    rough : dict of Key to CandidateFit
-        Fitted by few steps only; their evidence is approximate.
-    judged : dict of Key to CandidateFit
-        Fitted with their remainders; where there are any, they alone are compared.
-    promised : dict of str to float
-        The most that a screen at the fit without effect promised of each effect [nat].
-    tell : callable
-        Takes a few words on what is fitted, and how much is left.
-    wide : Problem or None
-        That under what the best hypothesis leaves, by which the judged ones were fitted.
-    forces : list of Explained
-        Sets of effects along the missing force, if they were compared so, the most probable first.
+        The effects that can act here.
+    no_effect : CandidateFit
+        The fit of the model without effect.
+    exact_fits : dict of CandidateKey to CandidateFit
+        The candidates that were fitted to convergence.
+    rough_fits : dict of CandidateKey to CandidateFit
+        The candidates that were fitted by few steps only; their evidence is approximate.
+    wide_fits : dict of CandidateKey to CandidateFit
+        The candidates that were fitted under a wider noise; where there are any, they alone are
+        compared.
+    screened_gains : dict of str to float
+        The largest gain of each effect that a screen at the fit without effect found [nat].
+    on_progress : callable
+        Takes a line that says what is fitted, and how much is still to come.
+    wide_problem : Problem or None
+        The problem under the noise by which `wide_fits` were fitted: as wide as what the best
+        hypothesis leaves.
+    force_hypotheses : list of ForceHypothesis
+        The sets of effects that were fitted to the missing force, the most probable first.
     """
 
     problem: Problem
     effects: tuple[Effect, ...]
-    none: CandidateFit
-    exact: dict[Key, CandidateFit] = field(default_factory=dict)
-    rough: dict[Key, CandidateFit] = field(default_factory=dict)
-    judged: dict[Key, CandidateFit] = field(default_factory=dict)
-    promised: dict[str, float] = field(default_factory=dict)
-    tell: Tell = in_silence
-    wide: Problem | None = None
-    forces: list[Explained] = field(init=False, default_factory=list)
+    no_effect: CandidateFit
+    exact_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
+    rough_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
+    wide_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
+    screened_gains: dict[str, float] = field(default_factory=dict)
+    on_progress: OnProgress = no_progress
+    wide_problem: Problem | None = None
+    force_hypotheses: list[ForceHypothesis] = field(init=False, default_factory=list)
 
     def __post_init__(self) -> None:
-        self.exact[()] = self.none
+        self.exact_fits[()] = self.no_effect
+
+    # ---------------------------------------------------------------- candidates that were fitted
 
     def log_prior(self, candidate: Candidate) -> float:
-        """Return ln of the prior probability of a candidate at its places."""
+        """Return the log prior probability of a candidate at its places."""
         return log_prior(candidate, len(self.effects), self.problem.setting)
 
-    def score(self, found: CandidateFit | Explained) -> float:
-        """Return ln (evidence times prior), up to a constant."""
-        return found.log_evidence + self.log_prior(found.candidate)
+    def score(self, fit: CandidateFit | ForceHypothesis) -> float:
+        """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""
+        return fit.log_evidence + self.log_prior(fit.candidate)
 
-    def all(self) -> dict[Key, CandidateFit]:
-        """Return every candidate that is compared, the exact fit where there is one."""
-        return self.judged or {**self.rough, **self.exact}
+    def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
+        """Return the fit of every candidate that is compared, the exact one where there is one."""
+        return self.wide_fits or {**self.rough_fits, **self.exact_fits}
 
     def best(self) -> CandidateFit:
         """Return the most probable candidate."""
-        return max((self.judged or self.exact).values(), key=self.score)
+        return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
     def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
-        """Return the most probable fit of a set of effects."""
-        options = [item for item in self.all().values() if item.candidate.identifiers == identifiers]
-        return max(options, key=self.score)
+        """Return the most probable fit of a set of effects, over their places."""
+        fits = self.compared_fits().values()
+        return max(
+            (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
+        )
 
-    def fitted(self) -> frozenset[str]:
+    def fitted_effects(self) -> frozenset[str]:
         """Return the identifiers of all effects that were fitted, alone or with others."""
-        kept = (*self.rough.values(), *self.exact.values(), *self.judged.values())
-        return frozenset(term.effect.identifier for item in kept for term in item.candidate.terms)
+        identifiers: set[str] = set()
+        for fits in (self.rough_fits, self.exact_fits, self.wide_fits):
+            for fit in fits.values():
+                identifiers.update(term.effect.identifier for term in fit.candidate.terms)
+        return frozenset(identifiers)
 
     @property
-    def nothing(self) -> CandidateFit:
-        """The fit without effect as it is compared, with its remainder where others have theirs."""
-        return self.judged.get((), self.none)
+    def compared_no_effect(self) -> CandidateFit:
+        """The fit without effect under the noise by which candidates are compared."""
+        return self.wide_fits.get((), self.no_effect)
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
-        """Return the probability of each set of identifiers, places summed, most probable first."""
+        """Return the probability of each set of effects at any places, the most probable first."""
         scores: dict[tuple[str, ...], list[float]] = {}
-        for found in self.all().values():
-            scores.setdefault(found.candidate.identifiers, []).append(self.score(found))
+        for fit in self.compared_fits().values():
+            scores.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
         sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
         total = float(logsumexp(list(sums.values())))
-        ordered = sorted(sums.items(), key=lambda item: -item[1])
+        ordered = sorted(sums.items(), key=lambda entry: -entry[1])
         return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
 
-    def keep(self, found: CandidateFit, *, exact: bool) -> None:
-        """Keep a fit if it is better than what is known of the same candidate."""
-        kept = self.exact if exact else self.rough
-        key = found.candidate.key
-        if key not in kept or kept[key].log_evidence < found.log_evidence:
-            kept[key] = found
+    def record(self, fit: CandidateFit, *, exact: bool) -> None:
+        """Record a fit if its evidence is above that of an earlier fit of the same candidate."""
+        fits = self.exact_fits if exact else self.rough_fits
+        key = fit.candidate.key
+        if key not in fits or fits[key].log_evidence < fit.log_evidence:
+            fits[key] = fit
+
+    def is_unexplained(self) -> bool:
+        """Return whether the best candidate cannot be shown to leave noise alone."""
+        return not check_absolute_fit(self.problem, self.best()).passed
+
+    @property
+    def is_all_in_motion(self) -> bool:
+        """Whether all trials are in motion."""
+        return all(data.trial.is_dynamic for data in self.problem.trials)
 
     @cached_property
-    def force(self) -> ForceSearch | None:
-        """The missing forces of the trials in motion, where they can be seen."""
+    def force_search(self) -> ForceSearch | None:
+        """The search for missing forces in the trials in motion.
+
+        None where no force can be seen.
+        """
         if not sees_forces(self.problem):
             return None
-        self.tell("looking for the missing force")
+        self.on_progress("looking for the missing force")
         try:
             return ForceSearch(self.problem)
         except (ModelError, np.linalg.LinAlgError) as cause:
-            self.tell(f"the missing force cannot be seen: {cause}")
+            self.on_progress(f"the missing force cannot be seen: {cause}")
             return None
 
-    def scan(self, base: CandidateFit, effects: Iterable[Effect]) -> list[CandidateFit]:
-        """Fit every effect roughly in addition to those of `base`; return the best of each, best first.
+    # ---------------------------------------------------------------- rough fits of one more effect
 
-        Fits begin where a screen at the base leads; far from the truth, where phases slip over a record and
-        nothing is linear, where the missing force does.
+    def fit_roughly_beside(
+        self, base: CandidateFit, effects: Iterable[Effect]
+    ) -> list[CandidateFit]:
+        """Fit each effect beside those of a base by few steps.
+
+        Return the best fit of each, best first.
+
+        Fits begin where a screen at the base leads. Far from the truth phases slip over a record
+        and nothing is linear; there they begin on a grid too, beside the missing force.
+
+        Parameters
+        ----------
+        base : CandidateFit
+            The fit that effects are added to.
+        effects : iterable of Effect
+            The effects to add.
         """
-        effects = near = tuple(effects)
-        if self._misfits(base):  # what acts on readings only turns no phases
-            near = tuple(effect for effect in effects if not acts_within(effect, self.problem.setting))
-        found = self._scan_near(base, near)
-        explained = any(absolute_gate(self.problem, item).passed for item in found)
-        if self._misfits(base) or (self._far(base) and not explained):
-            # nuisances of a wrong model are far off, a bad start; beside a force that is free they are
-            # where they belong; beside trials at rest, which know no force, they are as before the data
-            there = self._unbiased(base)
-            within = [one for one in effects if acts_within(one, self.problem.setting)]
-            grids = [row for one in within if (row := tried(self.problem, there, one))]
-            found += self._best_of(grids, there, 0.0)
+        effects = tuple(effects)
+        setting = self.problem.setting
+        screened = effects
+        if self._misfits(base):  # only what acts on readings leaves phases alone
+            screened = tuple(effect for effect in effects if not acts_within(effect, setting))
+        fits = self._fit_from_screen(base, screened)
+        is_explained = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
+        if self._misfits(base) or (self._is_far(base) and not is_explained):
+            unbiased_base = self._with_unbiased_nuisances(base)
+            starts_by_effect = []
+            for effect in effects:
+                if acts_within(effect, setting):
+                    starts_by_effect.append(grid_starts(self.problem, unbiased_base, effect))
+            starts_by_effect = [starts for starts in starts_by_effect if starts]
+            fits += self._fit_from_starts(starts_by_effect, unbiased_base, 0.0)
         best: dict[tuple[str, ...], CandidateFit] = {}
-        for item in sorted(found, key=self.score):
-            self.keep(item, exact=False)
-            best[item.candidate.identifiers] = item
-        return sorted(best.values(), key=lambda item: -self.score(item))
-
-    def _far(self, base: CandidateFit) -> bool:
-        """Whether a fit is far from the truth: much is left, or what is shared had to leave its prior."""
-        strain = np.abs(base.point.shared[self.problem.shared.precision > 0.0])
-        return self._misfits(base) or bool(strain.max(initial=0.0) > SEARCH.strained)
+        for fit in sorted(fits, key=self.score):
+            self.record(fit, exact=False)
+            best[fit.candidate.identifiers] = fit
+        return sorted(best.values(), key=lambda fit: -self.score(fit))
 
     def _misfits(self, base: CandidateFit) -> bool:
-        """Whether much is left by a fit."""
+        """Return whether a fit leaves much."""
         return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
 
-    def _scan_near(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
-        """Fit effects from where a screen at a base leads, the most promising first."""
-        least = SEARCH.worth_adding if base.candidate.terms else SEARCH.worth_fitting
-        screen, rows = Screen(self.problem, base), []
-        for effect in each(self.tell, effects, lambda one: f"screening {one.identifier}"):
-            changes = starts(screen, effect)
-            if not base.candidate.terms:
-                self.promised[effect.identifier] = max((change.gain for change in changes), default=0.0)
-            rows.append([change for change in changes if change.gain >= least])
-        rows.sort(key=lambda row: -max((change.gain for change in row), default=0.0))
-        begun = [[beside(base, change.term, change.best) for change in row] for row in rows if row]
-        return self._best_of(begun, base, least if base.candidate.terms else 0.0)
+    def _is_far(self, base: CandidateFit) -> bool:
+        """Return whether a fit is far from the truth.
 
-    def _unbiased(self, base: CandidateFit) -> CandidateFit:
-        """Return a base with its nuisances where they are beside a missing force."""
+        It leaves much, or shared unknowns left their priors.
+        """
+        has_prior = self.problem.shared.precision > 0.0
+        deviations = np.abs(base.point.shared[has_prior])
+        return self._misfits(base) or bool(deviations.max(initial=0.0) > SEARCH.strained)
+
+    def _fit_from_screen(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
+        """Fit effects from where a screen at a base leads, the most promising first."""
+        has_effects = bool(base.candidate.terms)
+        least_gain = SEARCH.worth_adding if has_effects else SEARCH.worth_fitting
+        screen = Screen(self.problem, base)
+        changes_by_effect = []
+        for effect in with_progress(
+            self.on_progress, effects, lambda effect: f"screening {effect.identifier}"
+        ):
+            changes = starting_changes(screen, effect)
+            if not has_effects:
+                gains = [change.gain for change in changes]
+                self.screened_gains[effect.identifier] = max(gains, default=0.0)
+            changes_by_effect.append([change for change in changes if change.gain >= least_gain])
+        changes_by_effect.sort(
+            key=lambda changes: -max((change.gain for change in changes), default=0.0)
+        )
+        starts_by_effect = []
+        for changes in changes_by_effect:
+            if changes:
+                starts = [start_beside(base, change.term, change.best) for change in changes]
+                starts_by_effect.append(starts)
+        return self._fit_from_starts(starts_by_effect, base, least_gain if has_effects else 0.0)
+
+    def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
+        """Return a base with the nuisances that it has beside a free missing force.
+
+        The nuisances of a wrong model are far off: a bad start. Beside a free force they are where
+        they belong. With trials at rest, which show no force, they are at their prior means.
+        """
         point = self.problem.start(base.candidate)
-        if self.moves and self.force is not None:
-            along = self.force.whole
+        force_search = self.force_search if self.is_all_in_motion else None
+        if force_search is not None:
+            hypothesis = force_search.whole
             if base.candidate.terms:
-                along = self.force.followed(along, base.candidate, base.effect) or along
-            point = self.force.whole_point(along)
+                followed = force_search.followed(hypothesis, base.candidate, base.effect)
+                hypothesis = followed or hypothesis
+            point = force_search.whole_point(hypothesis)
         return replace(base, point=replace(point, effect=base.effect), linearisations=())
 
-    def _best_of(self, starts: Sequence[Starts], base: CandidateFit, worth: float) -> list[CandidateFit]:
-        """Fit each effect by few steps from its starts beside a base; return the best of each."""
-        found, prospect = [], base.objective - worth
-        for row in each(self.tell, starts, lambda row: f"fitting {row[0][0].words}"):
+    def _fit_from_starts(
+        self, starts_by_effect: Sequence[Sequence[FitStart]], base: CandidateFit, least_gain: float
+    ) -> list[CandidateFit]:
+        """Fit each effect by few steps from its starts; return the best fit of each.
+
+        Parameters
+        ----------
+        starts_by_effect : sequence of sequence of FitStart
+            The starts of the fits of each effect.
+        base : CandidateFit
+            The fit that effects are added to; its derivatives begin the fits.
+        least_gain : float
+            The gain on the objective of the base below which a fit is given up [nat].
+        """
+        best_fits = []
+        give_up = base.objective - least_gain
+        for starts in with_progress(
+            self.on_progress,
+            starts_by_effect,
+            lambda starts: f"fitting {starts[0].candidate.description}",
+        ):
             fits: list[CandidateFit] = []
-            for candidate, start in row:
+            for start in starts:
                 rough = attempt(
-                    self.problem, candidate, start, known=base.linearisations or None,
-                    iterations=SEARCH.rough_steps, give_up=prospect,
-                )  # fmt: skip
+                    self.problem,
+                    start.candidate,
+                    start.point,
+                    known=base.linearisations or None,
+                    iterations=SEARCH.rough_steps,
+                    give_up=give_up,
+                )
                 if rough is not None:  # else it is more than the structure can carry
                     fits.append(rough)
-                    prospect = min(prospect, rough.objective + SEARCH.out_of_reach)
-            found += [max(fits, key=self.score)] if fits else []
-        return found
+                    give_up = min(give_up, rough.objective + SEARCH.out_of_reach)
+            if fits:
+                best_fits.append(max(fits, key=self.score))
+        return best_fits
 
-    def exactly(self, rough: CandidateFit) -> CandidateFit:
-        """Fit a candidate to convergence from a rough fit, and keep it."""
+    # ---------------------------------------------------------------- exact fits
+
+    def fit_exactly(self, rough: CandidateFit) -> CandidateFit:
+        """Return a candidate fitted to convergence, from a rough fit, and record it.
+
+        An exact fit that is known already is repeated only if the rough one is clearly better.
+        """
         key = rough.candidate.key
-        if key in self.judged:
-            return self.judged[key]
-        found = self.exact.get(key)
-        if found is None or found.log_evidence < rough.log_evidence - SEARCH.gained_again:
-            again = attempt(self.problem, rough.candidate, rough.point)
+        if key in self.wide_fits:
+            return self.wide_fits[key]
+        known = self.exact_fits.get(key)
+        if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
+            exact = attempt(self.problem, rough.candidate, rough.point)
             # few steps may have led to where the structure cannot follow
-            self.keep(rough if again is None else again, exact=True)
-        return self.exact[key]
+            self.record(rough if exact is None else exact, exact=True)
+        return self.exact_fits[key]
 
-    def refine(self, rough: Sequence[CandidateFit], floor: float) -> list[CandidateFit]:
-        """Fit exactly those that are close to the best of them and above a floor of the score."""
+    def fit_best_exactly(self, rough: Sequence[CandidateFit], floor: float) -> list[CandidateFit]:
+        """Fit the best of some rough fits to convergence; return these, the best first.
+
+        Parameters
+        ----------
+        rough : sequence of CandidateFit
+            The rough fits, the best first.
+        floor : float
+            The score below which none is fitted exactly.
+        """
         if not rough:
             return []
         top = self.score(rough[0])
         # far from the truth, few steps rank only roughly
         margin = max(SEARCH.close, SEARCH.close_share * (top - floor))
-        chosen = [item for item in rough[: SEARCH.exact_fits] if self.score(item) > max(top - margin, floor)]
-        found = []
-        for item in each(self.tell, chosen, lambda one: f"fitting {one.candidate.words} to the end"):
-            found.append(self.exactly(item))
-        return sorted(found, key=lambda item: -self.score(item))
+        least = max(top - margin, floor)
+        chosen = [fit for fit in rough[: SEARCH.exact_fits] if self.score(fit) > least]
+        exact = []
+        for fit in with_progress(
+            self.on_progress, chosen, lambda fit: f"fitting {fit.candidate.description} to the end"
+        ):
+            exact.append(self.fit_exactly(fit))
+        return sorted(exact, key=lambda fit: -self.score(fit))
+
+    def refine_time_steps(self) -> None:
+        """Halve the time steps while their error in the best candidate is large, and fit again.
+
+        Verdicts rest on the best candidates only, so these alone are fitted again.
+        """
+        problem = self.problem
+        while (
+            problem.refinement < SEARCH.finest
+            and time_step_error(problem, self.best()) > SEARCH.solver_share
+        ):
+            problem.refinement *= 2
+            ranked = sorted(self.exact_fits.values(), key=lambda fit: -self.score(fit))
+            for fit in ranked[: SEARCH.refitted]:
+                if not fit.candidate.terms:
+                    continue
+                finer = attempt(problem, fit.candidate, fit.point)
+                if finer is not None:  # else the coarser fit stands
+                    self.exact_fits[fit.candidate.key] = finer
 
     # ---------------------------------------------------------------- the strategy
 
-    def singles(self) -> None:
-        """Search among single effects; the best is computed finely before what rests on its evidence."""
-        self.refine(self.scan(self.none, self.effects), self.score(self.none) - SEARCH.hopeless)
-        self.settle()
+    def search_single_effects(self) -> None:
+        """Search among single effects, with time steps that are fine enough for the best."""
+        rough = self.fit_roughly_beside(self.no_effect, self.effects)
+        self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.hopeless)
+        self.refine_time_steps()
 
-    def sets(self) -> None:
-        """Search beyond one effect: a law of free shape, more effects, any two."""
-        self.families()
-        self.settle()
-        # beside a law whose shape is free further effects would be anything
+    def search_sets(self) -> None:
+        """Search beyond a single effect: a law of free shape, more effects, all pairs."""
+        self.fit_families()
+        self.refine_time_steps()
+        # beside a law whose shape is free a further effect would imitate nearly anything
         if not self.best().candidate.is_family:
-            self.longer()
-        if not self.best().candidate.is_family and self.unexplained():
+            self.add_effects()
+        if not self.best().candidate.is_family and self.is_unexplained():
             self.fit_pairs()
         self.move_effects()
-        self.shorter()
-        self.settle()
+        self.drop_effects()
+        self.refine_time_steps()
 
-    @property
-    def moves(self) -> bool:
-        """Whether all trials are in motion."""
-        return all(data.trial.is_dynamic for data in self.problem.trials)
+    def search_along_force(self, force_search: ForceSearch) -> None:
+        """Fit the sets of effects that follow the missing force best.
 
-    def by_force(self, force: ForceSearch) -> None:
-        """Compare the sets of effects that follow the missing force best, in place of what was fitted."""
-        self.exact, self.rough = {(): self.none}, {}
-        self.forces = refined(force, force.name(self.effects, self.tell), len(self.effects), self.tell)
-        able = [
-            one for one in self.forces  # beside another law a shape of its own would imitate nearly anything
-            if one.candidate.terms and not (one.candidate.is_family and len(one.candidate.terms) > 1)
-        ]  # fmt: skip
-        close = [one for one in able if self.score(one) > self.score(able[0]) - SEARCH.followed]
-        close = close[: SEARCH.far_fits]
-        for item in each(self.tell, close, lambda one: f"fitting {one.candidate.words} to the end"):
-            found = attempt(self.problem, item.candidate, force.whole_point(item))
-            if found is not None:
-                self.keep(found, exact=True)
-        self.restart_leading_single(force)
-        self.move_effects()
-        self.shorter()
-        self.settle()
-
-    def restart_leading_single(self, force: ForceSearch) -> None:
-        """Fit the leading single effect from other sizes, unless one of canonical shape leaves noise alone.
-
-        Dry friction that ends a motion has an optimum for every number of half swings. The missing force
-        leads near the right one, the parameters that follow it may be left in the next. With a free shape a
-        law bends itself to a wrong optimum, so the laws of that family are tried whose shape is canonical.
+        They replace what was fitted before.
         """
-        if not self.unexplained() and not self.best().candidate.is_family:
+        self.exact_fits = {(): self.no_effect}
+        self.rough_fits = {}
+        named = force_search.name(self.effects, self.on_progress)
+        self.force_hypotheses = refined(force_search, named, len(self.effects), self.on_progress)
+        eligible = []
+        for hypothesis in self.force_hypotheses:
+            candidate = hypothesis.candidate
+            # beside another law a free shape would imitate nearly anything
+            is_family_in_set = candidate.is_family and len(candidate.terms) > 1
+            if candidate.terms and not is_family_in_set:
+                eligible.append(hypothesis)
+        close = []
+        for hypothesis in eligible:
+            if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.followed:
+                close.append(hypothesis)
+        for hypothesis in with_progress(
+            self.on_progress,
+            close[: SEARCH.far_fits],
+            lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
+        ):
+            start = force_search.whole_point(hypothesis)
+            fit = attempt(self.problem, hypothesis.candidate, start)
+            if fit is not None:
+                self.record(fit, exact=True)
+        self.restart_leading_single(force_search)
+        self.move_effects()
+        self.drop_effects()
+        self.refine_time_steps()
+
+    def restart_leading_single(self, force_search: ForceSearch) -> None:
+        """Fit the leading single effect from other sizes, unless it explains the data.
+
+        Dry friction that ends a motion has an optimum for every number of half swings. The missing
+        force leads near the right one, but the parameters that follow it may be left in the next.
+        With a free shape a law bends itself to a wrong optimum, so the laws of that family with
+        canonical shape are tried.
+        """
+        if not self.is_unexplained() and not self.best().candidate.is_family:
             return
-        singles = [fitted for fitted in self.exact.values() if len(fitted.candidate.terms) == 1]
+        singles = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
         if not singles:
             return
         (leading,) = max(singles, key=self.score).candidate.terms
-        for hypothesis in canonical_relatives(leading, self.forces):
-            self.tell(f"fitting {hypothesis.candidate.words} from other sizes")
-            for point in restarts(self.problem, hypothesis.candidate, force.whole_point(hypothesis)):
-                fitted = attempt(self.problem, hypothesis.candidate, point)
-                if fitted is None:
+        for hypothesis in canonical_relatives(leading, self.force_hypotheses):
+            candidate = hypothesis.candidate
+            self.on_progress(f"fitting {candidate.description} from other sizes")
+            start = force_search.whole_point(hypothesis)
+            for point in points_at_other_sizes(self.problem, candidate, start):
+                fit = attempt(self.problem, candidate, point)
+                if fit is None:
                     continue
-                self.keep(fitted, exact=True)
-                if absolute_gate(self.problem, fitted).passed:
+                self.record(fit, exact=True)
+                if check_absolute_fit(self.problem, fit).passed:
                     return
 
-    def unexplained(self) -> bool:
-        """Whether the best candidate cannot be shown to explain the data."""
-        return not absolute_gate(self.problem, self.best()).passed
-
-    def settle(self) -> None:
-        """Compute the best candidate finely: halve the time steps while they cost it too much."""
-        while (
-            self.problem.refinement < SEARCH.finest
-            and solver_share(self.problem, self.best()) > SEARCH.solver_share
-        ):
-            self.problem.refinement *= 2
-            ranked = sorted(self.exact.values(), key=lambda item: -self.score(item))
-            for item in ranked[: SEARCH.refitted]:
-                again = attempt(self.problem, item.candidate, item.point) if item.candidate.terms else None
-                if again is not None:  # else the rough one stands
-                    self.exact[item.candidate.key] = again
-
-    def longer(self) -> None:
+    def add_effects(self) -> None:
         """Add one effect at a time to the best set while that makes a better one."""
         current = self.best()
         while 0 < len(current.candidate.terms) < SEARCH.largest_set:
-            if len(current.candidate.terms) > 1 and self._far(current):
-                break  # a third effect is looked for only where two nearly do
-            before, there = self.score(current), {term.effect.identifier for term in current.candidate.terms}
-            others = [effect for effect in self.effects if effect.identifier not in there]
-            fitted = self.refine(self.scan(current, others), before - SEARCH.hopeless_longer)
-            if not fitted or self.score(fitted[0]) <= before:
+            if len(current.candidate.terms) > 1 and self._is_far(current):
+                break  # a third effect is looked for only where two nearly explain the data
+            current_score = self.score(current)
+            present = {term.effect.identifier for term in current.candidate.terms}
+            others = [effect for effect in self.effects if effect.identifier not in present]
+            rough = self.fit_roughly_beside(current, others)
+            exact = self.fit_best_exactly(rough, current_score - SEARCH.hopeless_longer)
+            if not exact or self.score(exact[0]) <= current_score:
                 break
-            current = fitted[0]
+            current = exact[0]
 
     def move_effects(self) -> None:
-        """Fit the best set with one effect at another of its places, while the set leaves more than noise.
+        """Fit the best set with one effect at another place, while the set leaves more than noise.
 
         Rough fits keep one place of each set, and few steps may rank places wrongly.
         """
         best = self.best()
-        while len(best.candidate.terms) > 1 and self.unexplained():
+        while len(best.candidate.terms) > 1 and self.is_unexplained():
+            give_up = best.objective + SEARCH.out_of_reach
             for candidate in sets_at_other_places(best.candidate, self.problem.setting):
-                if candidate.key in self.exact:
+                if candidate.key in self.exact_fits:
                     continue
-                fitted = attempt(
-                    self.problem, candidate, best.point, give_up=best.objective + SEARCH.out_of_reach
-                )
-                if fitted is not None:
-                    self.keep(fitted, exact=True)
+                fit = attempt(self.problem, candidate, best.point, give_up=give_up)
+                if fit is not None:
+                    self.record(fit, exact=True)
             if self.best() is best:
                 break
             best = self.best()
 
-    def shorter(self) -> None:
-        """Leave one effect at a time out of the best set, while that makes a better one.
+    def drop_effects(self) -> None:
+        """Drop one effect at a time from the best set, while that makes a better one.
 
-        An effect may have come first because the right one stood at another place, or was not followed to
-        its place: beside the right one it may say nothing.
+        An effect may have come first because the right one stood at another place, or was not
+        followed to its place: beside the right one it may say nothing.
         """
-        while (count := len((best := self.best()).candidate.terms)) > 1:
-            for out in range(count):
-                kept = (number for number in range(count) if number != out)
-                candidate, effect = best.candidate.some(kept, best.effect)
-                begin, worst = replace(best.point, effect=effect), best.objective + SEARCH.out_of_reach
-                found = attempt(self.problem, candidate, begin, give_up=worst)
-                if found is not None:
-                    self.keep(found, exact=True)
+        best = self.best()
+        while len(best.candidate.terms) > 1:
+            give_up = best.objective + SEARCH.out_of_reach
+            numbers = range(len(best.candidate.terms))
+            for dropped in numbers:
+                remaining = [number for number in numbers if number != dropped]
+                candidate, effect = best.candidate.subset(remaining, best.effect)
+                start = replace(best.point, effect=effect)
+                fit = attempt(self.problem, candidate, start, give_up=give_up)
+                if fit is not None:
+                    self.record(fit, exact=True)
             if self.best() is best:
                 break
+            best = self.best()
 
-    def families(self) -> None:
-        """Fit the free-shape families of single effects that come close, and keep those that fit.
+    def fit_families(self) -> None:
+        """Fit the families (free shape) of single effects that come close; record those that fit.
 
-        A law with a shape of its own is a simpler cause than two laws, so it is tried before pairs are. Where
-        the best effect fits, families compete only if others fit as well: its own is for the shape gate.
+        A law with a free shape is a simpler cause than two laws, so it is tried before pairs are.
+        Where the best effect fits, families compete only if others fit as well: its own is for the
+        shape test.
         """
-        singles = [item for item in self.exact.values() if len(item.candidate.terms) == 1]
-        singles = [item for item in singles if not item.candidate.is_family]
-        singles = sorted(singles, key=self.score, reverse=True)[: SEARCH.exact_fits]
-        fitting = [item for item in singles if absolute_gate(self.problem, item).passed is not False]
-        if fitting and fitting[0] is singles[0]:
-            close = self.score(singles[0]) - SEARCH.rivals
-            singles = [item for item in fitting if self.score(item) > close]
-            if len(singles) == 1 or absolute_gate(self.problem, self.none).passed is not False:
-                return
-        kept: dict[tuple[str, str], CandidateFit] = {}
-        for named in singles:
-            family = free_shape(self.problem, named, 0)
-            if family is None or family.log_evidence - named.log_evidence <= SHAPE_GAIN:
+        singles = self._singles_with_open_shape()
+        best_families: dict[tuple[str, str], CandidateFit] = {}
+        for single in singles:
+            family = fit_free_shape(self.problem, single, 0)
+            if family is None or family.log_evidence - single.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
-            key = (term.effect.family, term.place)  # one verdict; the member from which it is reached best
-            better = key not in kept or self.score(kept[key]) < self.score(family)
-            if better and absolute_gate(self.problem, family).passed is not False:
-                kept[key] = family
-        for family in kept.values():
-            self.keep(family, exact=True)
+            # a family is one verdict: keep the fit from the member that reaches it best
+            key = (term.effect.family, term.place)
+            is_best = key not in best_families or self.score(best_families[key]) < self.score(
+                family
+            )
+            if is_best and check_absolute_fit(self.problem, family).passed is not False:
+                best_families[key] = family
+        for family in best_families.values():
+            self.record(family, exact=True)
+
+    def _singles_with_open_shape(self) -> list[CandidateFit]:
+        """Return the single effects, the best first, beside which their families may compete."""
+        singles = []
+        for fit in self.exact_fits.values():
+            if len(fit.candidate.terms) == 1 and not fit.candidate.is_family:
+                singles.append(fit)
+        singles = sorted(singles, key=self.score, reverse=True)[: SEARCH.exact_fits]
+        fitting = []
+        for fit in singles:
+            if check_absolute_fit(self.problem, fit).passed is not False:
+                fitting.append(fit)
+        if not fitting or fitting[0] is not singles[0]:
+            return singles
+        least = self.score(singles[0]) - SEARCH.rivals
+        competing = [fit for fit in fitting if self.score(fit) > least]
+        model_fits = check_absolute_fit(self.problem, self.no_effect).passed is not False
+        if len(competing) == 1 or model_fits:
+            return []
+        return competing
 
     def fit_pairs(self) -> None:
-        """Fit the most promising of all pairs of effects, by their changes at the fit without effect."""
-        screen = Screen(self.problem, self.none)
-        changes = [change for effect in self.effects for change in starts(screen, effect)]
-        begun = []
-        for _, first, second in pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
-            candidate = Candidate((first.term, second.term))
-            if candidate.key not in self.exact:
-                start = replace(self.none.point, effect=np.concatenate((first.best, second.best)))
-                begun.append([(candidate, start)])
-        rough = self._best_of(begun, self.none, 0.0)
-        for item in rough:
-            self.keep(item, exact=False)
-        rough.sort(key=lambda item: -self.score(item))
-        self.refine(rough, self.score(self.best()) - SEARCH.close)
+        """Fit the most promising of all pairs of effects, by a screen at the fit without effect."""
+        screen = Screen(self.problem, self.no_effect)
+        changes: list[ScreenedChange] = []
+        for effect in self.effects:
+            changes.extend(starting_changes(screen, effect))
+        starts_by_pair = []
+        for pair in best_pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
+            candidate = Candidate((pair.first.term, pair.second.term))
+            if candidate.key in self.exact_fits:
+                continue
+            values = np.concatenate((pair.first.best, pair.second.best))
+            start = FitStart(candidate, replace(self.no_effect.point, effect=values))
+            starts_by_pair.append([start])
+        rough = self._fit_from_starts(starts_by_pair, self.no_effect, 0.0)
+        for fit in rough:
+            self.record(fit, exact=False)
+        rough.sort(key=lambda fit: -self.score(fit))
+        self.fit_best_exactly(rough, self.score(self.best()) - SEARCH.close)

@@ -1,68 +1,76 @@
-"""A whole search: the fit without effect, then single effects, then sets of them."""
+"""A whole search: the fit without effect, then single effects, then sets of effects."""
 
 from collections.abc import Callable, Sequence
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
-from discrepancy.fits.beginnings import refitted_from_beginnings
+from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import attempt, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 
-from .starts import Tell, in_silence
+from .starts import OnProgress, no_progress
 from .strategy import Search
 
 OnSearch = Callable[[Search], None]
-"""Takes a search that begins, to look at while it goes on."""
+"""Takes a search at its begin, to look at it while it goes on."""
 
 
-def nobody_looks(search: Search) -> None:
-    """Take a search that begins, and leave it alone."""
+def ignore_search(search: Search) -> None:
+    """Ignore a search that begins."""
 
 
 def search(
     problem: Problem,
     effects: Sequence[Effect],
-    tell: Tell = in_silence,
-    on_search: OnSearch = nobody_looks,
+    on_progress: OnProgress = no_progress,
+    on_search: OnSearch = ignore_search,
 ) -> Search:
-    """Fit the model without effect, then search the catalogue.
+    """Fit the model without effect, then search the catalogue for what explains the campaign.
 
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     effects : sequence of Effect
-        The catalogue; what is unavailable here is left out, and what an event of the campaign may have begun
-        or ended is tried so too.
-    tell : callable
-        Takes a few words on what is fitted, and how much is left.
+        The catalogue. Effects that cannot act here are left out; those that an event of the
+        campaign may have begun or ended are tried in that form too.
+    on_progress : callable
+        Takes a line that says what is fitted, and how much is still to come.
     on_search : callable
         Takes the search once it has the fit without effect.
 
     Returns
     -------
     Search
-        All candidates with their evidence.
+        All candidates that were fitted, with their evidence.
     """
-    tell("fitting the model as it is")
-    none = fit(problem, Candidate(), problem.start(Candidate()), iterations=SEARCH.none_steps)
-    none = refitted_from_beginnings(problem, none, iterations=SEARCH.none_steps)
-    usable = tuple(effect for effect in effects if effect.unavailable(problem.setting) is None)
-    usable = (*usable, *in_events(usable, problem.setting))
-    found = Search(problem, usable, none, tell=tell)
-    if len(problem.model.apart()[1]) and found.force is not None and found.unexplained():
-        # a law of its own, as dry friction that ends a motion, has many optima
-        again = attempt(problem, Candidate(), found.force.whole_point(found.force.whole))
-        if again is not None and again.objective < none.objective - SEARCH.worth_fitting:
-            found = Search(problem, usable, again, tell=tell)
-    on_search(found)
-    force = found.force if found.moves else None
-    if force is None or len(force.ports) > 1:  # forces at several ports take up nearly any law at one
-        found.singles()
-        if force is None or not found.unexplained():
-            found.sets()
-            return found
-    found.by_force(force)
-    return found
+    on_progress("fitting the model as it is")
+    start = problem.start(Candidate())
+    no_effect = fit(problem, Candidate(), start, iterations=SEARCH.none_steps)
+    no_effect = refit_from_first_readings(problem, no_effect, iterations=SEARCH.none_steps)
+    usable = [effect for effect in effects if effect.unavailable(problem.setting) is None]
+    usable_effects = (*usable, *in_events(tuple(usable), problem.setting))
+    result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
+    _, own_laws = problem.model.apart()
+    if len(own_laws) and result.force_search is not None and result.is_unexplained():
+        # a law of the model itself, such as dry friction that ends a motion, has many optima: begin
+        # again where the unknowns are beside a missing force
+        start = result.force_search.whole_point(result.force_search.whole)
+        second_fit = attempt(problem, Candidate(), start)
+        least_gain = SEARCH.worth_fitting
+        if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
+            result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
+    on_search(result)
+    force_search = result.force_search if result.is_all_in_motion else None
+    # free forces at several ports take up nearly any law at one of them
+    if force_search is not None and len(force_search.ports) <= 1:
+        result.search_along_force(force_search)
+        return result
+    result.search_single_effects()
+    if force_search is not None and result.is_unexplained():
+        result.search_along_force(force_search)
+    else:
+        result.search_sets()
+    return result

@@ -8,8 +8,9 @@ from discrepancy.campaign.records import FloatArray, Start
 from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation, ReleasePoint
 from discrepancy.system.linear_system import LinearSystem
-from fe.runtime.arrays import FADING, LAGGED
-from fe.runtime.motion import Begin, Laws
+from fe.runtime.arrays import FADING_POSITION, LAGGED_FORCE
+from fe.runtime.motion import InitialMotion
+from fe.runtime.port_laws import PortLaws
 
 LEAST_PARTICIPATION = 0.03
 """A mode that moves the release point by less than this share of what the most moving mode does is
@@ -21,11 +22,13 @@ LEAST_SPEED = 1e-2
 class ReleasedState(NamedTuple):
     """State at a release, and the force (n,) that holds a structure at rest until then."""
 
-    begin: Begin
+    begin: InitialMotion
     holding_force: FloatArray | None
 
 
-def state_at_first_stamp(system: LinearSystem, excitation: Excitation, laws: Laws) -> Begin:
+def state_at_first_stamp(
+    system: LinearSystem, excitation: Excitation, laws: PortLaws
+) -> InitialMotion:
     """Return the state at the first stamp of a record that is no ring-down.
 
     Parameters
@@ -77,11 +80,11 @@ def state_at_first_stamp(system: LinearSystem, excitation: Excitation, laws: Law
     if motions:
         q[mode_count:] = system.root_drive_mass * drive_positions
         v[mode_count:] = system.root_drive_mass * drive_speeds
-    return Begin(q, v, memory)
+    return InitialMotion(q, v, memory)
 
 
 def released_state(
-    system: LinearSystem, excitation: Excitation, point: ReleasePoint, laws: Laws
+    system: LinearSystem, excitation: Excitation, point: ReleasePoint, laws: PortLaws
 ) -> ReleasedState:
     """Return the state at the release of a ring-down.
 
@@ -120,13 +123,13 @@ def released_state(
     frequency = system.angular_frequency
     under_load = (load @ system.shapes)[0] / frequency**2 if load.any() else 0.0
     q = displacements * unit_amplitudes + under_load
-    return ReleasedState(Begin(q, velocities * unit_amplitudes * frequency), None)
+    return ReleasedState(InitialMotion(q, velocities * unit_amplitudes * frequency), None)
 
 
 def _held_state(
     system: LinearSystem,
     point: ReleasePoint,
-    laws: Laws,
+    laws: PortLaws,
     displacements: FloatArray,
     unit_amplitudes: FloatArray,
     load: FloatArray,
@@ -156,11 +159,11 @@ def _held_state(
     if memory is not None:
         # the holding force carries the laws too
         rows = system.rows_of_laws(laws, 0.0)
-        holding += float(rows @ answer @ memory[:, LAGGED]) / compliance
-        acting = holding * row + load[0] - memory[:, LAGGED] @ rows
+        holding += float(rows @ answer @ memory[:, LAGGED_FORCE]) / compliance
+        acting = holding * row + load[0] - memory[:, LAGGED_FORCE] @ rows
         if system.is_truncated:
             # the part of the port's position that fades after the release
-            memory[:, FADING] = holding * (rows @ system.residual(row))
+            memory[:, FADING_POSITION] = holding * (rows @ system.residual(row))
     frequency = system.angular_frequency
     q = acting @ system.shapes / frequency**2 + deviation
-    return ReleasedState(Begin(q, np.zeros(len(frequency)), memory), holding * row)
+    return ReleasedState(InitialMotion(q, np.zeros(len(frequency)), memory), holding * row)

@@ -21,7 +21,8 @@ from discrepancy.errors import ModelError
 from discrepancy.system.excitation import Excitation
 from fe.compilation import compiled_kernel
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, Laws, static_solution
+from fe.runtime.motion import static_solution
+from fe.runtime.port_laws import NO_LAWS, PortLaws
 
 HEAVY = 1e12
 """Mass of a prescribed coordinate over the largest mass of the system."""
@@ -65,7 +66,7 @@ class SolvedStructure(Protocol):
         """Modes with inertia."""
 
     @property
-    def shapes(self) -> FloatArray:
+    def mode_shapes(self) -> FloatArray:
         """Mass-normalised shapes (n, M) of these modes."""
 
     def static(self, loads: FloatArray) -> FloatArray:
@@ -167,7 +168,7 @@ class LinearSystem:
         """Modes of what no drive prescribes."""
         if self.solved is not None:
             frequency = 2.0 * np.pi * self.solved.modes.frequency
-            return Modes(frequency, np.ascontiguousarray(self.solved.shapes), len(frequency))
+            return Modes(frequency, np.ascontiguousarray(self.solved.mode_shapes), len(frequency))
         squares, displacement_shapes = self._displacement_modes()
         n = self.displacement_count
         count = len(squares)
@@ -294,9 +295,9 @@ class LinearSystem:
             forces[:, mode_count:] = self.root_drive_mass * accelerations
         return forces
 
-    def rows_of_laws(self, laws: Laws, time: float | None = None) -> FloatArray:
+    def rows_of_laws(self, laws: PortLaws, time: float | None = None) -> FloatArray:
         """Return the rows (J, N) of the laws' ports; see `Laws.rows`."""
-        return laws.rows(self.ports, self.size, time)
+        return laws.port_rows(self.ports, self.size, time)
 
     # ------------------------------------------------------------ rest
 
@@ -344,7 +345,7 @@ class LinearSystem:
         modal_loads = loads @ self.shapes
         restoring = np.hstack(
             (
-                self.modal.whole[:mode_count, :count],
+                self.modal.full_stiffness[:mode_count, :count],
                 self.modal.damping[:mode_count, count:mode_count],
             )
         )
@@ -362,7 +363,7 @@ class LinearSystem:
     def static_path(
         self,
         directions: FloatArray,
-        laws: Laws = NO_LAWS,
+        laws: PortLaws = NO_LAWS,
         *,
         levels: FloatArray | None = None,
         memory: FloatArray | None = None,

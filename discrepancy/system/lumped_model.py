@@ -25,7 +25,7 @@ from discrepancy.system.system_state import LoadsAndMotions, PatchedTrial, Syste
 from discrepancy.system.time_history import FormulaHistory, RecordedHistory
 from fe.runtime import patch as changes
 from fe.runtime.laws import LAWS
-from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, course_of
+from fe.runtime.patch import SENSORS, ModelPatch, PortLoad, Primitive, time_formula
 from fe.runtime.state import Losses
 from reporting.words import comma_list
 
@@ -88,7 +88,7 @@ class LumpedModel(DescribedModel, SystemModel):
             all_ports_are_displaced = all(
                 np.any(row[:displacement_count]) for row in self.port_rows.values()
             )
-            return bool(self.port_rows) and (primitive.of_speed or all_ports_are_displaced)
+            return bool(self.port_rows) and (primitive.depends_on_speed or all_ports_are_displaced)
         can_move_load = any(section.station_derivative is not None for section in description.input)
         carried: dict[type[Primitive], bool] = {
             changes.StiffnessDrift: description.displacement_count > 0,
@@ -173,7 +173,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 f"it has {comma_list(self.law_directions)}."
             )
         spans = tuple(window.span for window in primitive.windows)
-        history = FormulaHistory(course_of(primitive.force, primitive.kind), spans)
+        history = FormulaHistory(time_formula(primitive.force, primitive.kind), spans)
         return Load(self.law_directions[primitive.port], history)
 
     def _offset_inputs(self, case: PatchedTrial) -> dict[str, OffsetInput]:

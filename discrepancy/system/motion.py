@@ -19,9 +19,11 @@ from discrepancy.system.output_equation import OutputEquation, rows_in_coordinat
 from discrepancy.system.response import Response
 from discrepancy.system.time_history import SMOOTH_PARTS, equivalent_ramps
 from fe.compilation import compiled_kernel
-from fe.runtime.arrays import LAGGED
-from fe.runtime.motion import Begin, Boundaries, Laws, advance, steps_under, substeps
-from fe.runtime.motion_arrays import ModalMotion, Steps
+from fe.runtime.arrays import LAGGED_FORCE
+from fe.runtime.motion import InitialMotion, integrate_motion
+from fe.runtime.motion_arrays import ModalMotion, StepArrays
+from fe.runtime.port_laws import PortLaws
+from fe.runtime.time_steps import Boundaries, loaded_steps, step_boundaries
 
 LEAST_LEAD = 1e-9
 """Share of an interval by which a first sample is later than the begin and still is at it."""
@@ -57,7 +59,7 @@ class Motion:
 
     system: LinearSystem
     excitation: Excitation
-    laws: Laws
+    laws: PortLaws
     time: FloatArray
     q: FloatArray
     velocity: FloatArray
@@ -70,13 +72,15 @@ class Motion:
     def acceleration(self) -> FloatArray:
         """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion."""
         modal = self.system.modal
-        restoring = self.q @ modal.whole.T
-        if self.laws.rate != 0.0:
-            restoring *= 1.0 + self.laws.rate * (self.time[:, None] - self.laws.since)
+        restoring = self.q @ modal.full_stiffness.T
+        if self.laws.stiffness_rate != 0.0:
+            restoring *= 1.0 + self.laws.stiffness_rate * (
+                self.time[:, None] - self.laws.drift_start
+            )
         forces = self.system.modal_forces(self.excitation, self.time)
         acceleration = forces - restoring - self.velocity @ modal.damping.T
         if len(self.laws):
-            acceleration -= self.port_forces @ self.laws.rows(modal.actions, self.q.shape[1])
+            acceleration -= self.port_forces @ self.laws.port_rows(modal.actions, self.q.shape[1])
         acceleration[: self.held_samples] = 0.0
         return acceleration
 
@@ -123,7 +127,7 @@ class Motion:
                 values[:, column] += factor * load.values_at(self.time)
             direction = equation.law_direction
             if direction is not None:
-                law_directions = self.laws.rows(self.system.law_directions, len(direction))
+                law_directions = self.laws.port_rows(self.system.law_directions, len(direction))
                 values[:, column] += self.port_forces @ (law_directions @ direction)
             if equation.feedthrough or direction is not None:
                 rates[:, column] = np.gradient(values[:, column], self.time)
@@ -150,7 +154,7 @@ class Motion:
 
 
 def motion_of(
-    system: LinearSystem, excitation: Excitation, laws: Laws, refinement: int = 1
+    system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int = 1
 ) -> Motion:
     """Return the motion of a trial, also of one whose clock makes the samples begin late.
 
@@ -170,14 +174,14 @@ def motion_of(
     ModelError
         If the motion begins at rest where there is no rest, or the release point cannot be moved.
     """
-    laws = replace(laws, since=float(excitation.time[0]))
+    laws = replace(laws, drift_start=float(excitation.time[0]))
     if excitation.release is None:
         return _motion_from_record(system, excitation, laws, refinement)
     return _motion_from_release(system, excitation, excitation.release, laws, refinement)
 
 
 def _motion_from_record(
-    system: LinearSystem, excitation: Excitation, laws: Laws, refinement: int
+    system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int
 ) -> Motion:
     """Return the motion from the first stamp of a record that is no ring-down."""
     times = excitation.sample_times
@@ -189,10 +193,10 @@ def _motion_from_record(
         # Laws of speed at ports that only drives move are zero where the drives begin at rest: the
         # kernel's
         # force would hold the drive as if it were a mass, and no reading shows that force.
-        rows = laws.rows(system.modal.ports, len(begin.v))
+        rows = laws.port_rows(system.modal.ports, len(begin.v))
         is_driven = ~np.any(rows[:, : len(system.angular_frequency)], axis=1)
         is_still = rows @ begin.v == 0.0
-        motion.port_forces[0, is_driven & is_still & (laws.of_speed == 1)] = 0.0
+        motion.port_forces[0, is_driven & is_still & (laws.depends_on_speed == 1)] = 0.0
     return Motion(
         system,
         excitation,
@@ -201,12 +205,16 @@ def _motion_from_record(
         q=motion.q,
         velocity=motion.v,
         port_forces=motion.port_forces,
-        lagged_forces=motion.lagged,
+        lagged_forces=motion.lagged_forces,
     )
 
 
 def _motion_from_release(
-    system: LinearSystem, excitation: Excitation, point: ReleasePoint, laws: Laws, refinement: int
+    system: LinearSystem,
+    excitation: Excitation,
+    point: ReleasePoint,
+    laws: PortLaws,
+    refinement: int,
 ) -> Motion:
     """Return the motion after a release at time zero.
 
@@ -236,7 +244,7 @@ def _motion_from_release(
         stamps = np.append(stamps, abs(times[-1]) + 1.0)
     if stamps[0] < 0.0:
         backwards = system.modal.exact_steps(stamps[:1])[0][0]
-        begin = Begin(*np.split(backwards @ np.concatenate((begin.q, begin.v)), 2))
+        begin = InitialMotion(*np.split(backwards @ np.concatenate((begin.q, begin.v)), 2))
     motion = _advance(system, excitation, laws, 0.0, stamps, begin, refinement)
     if held:
         motion = _with_held_samples(motion, released.begin, held, len(times))
@@ -248,16 +256,18 @@ def _motion_from_release(
         q=motion.q,
         velocity=motion.v,
         port_forces=motion.port_forces,
-        lagged_forces=motion.lagged,
+        lagged_forces=motion.lagged_forces,
         held_samples=held,
         holding_force=released.holding_force,
     )
 
 
-def _with_held_samples(motion: ModalMotion, begin: Begin, held: int, count: int) -> ModalMotion:
+def _with_held_samples(
+    motion: ModalMotion, begin: InitialMotion, held: int, count: int
+) -> ModalMotion:
     """Return a motion of `count` samples, of which the first `held` show the held shape."""
     laws = motion.port_forces.shape[1]
-    forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED]
+    forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
 
     def prepend(before: FloatArray, after: FloatArray) -> FloatArray:
         return np.vstack((np.tile(before, (held, 1)), after))[:count]
@@ -266,7 +276,7 @@ def _with_held_samples(motion: ModalMotion, begin: Begin, held: int, count: int)
         q=prepend(begin.q, motion.q),
         v=prepend(begin.v, motion.v),
         port_forces=prepend(forces, motion.port_forces),
-        lagged=prepend(forces, motion.lagged),
+        lagged_forces=prepend(forces, motion.lagged_forces),
         memory=motion.memory,
     )
 
@@ -277,10 +287,10 @@ def _with_held_samples(motion: ModalMotion, begin: Begin, held: int, count: int)
 def _advance(
     system: LinearSystem,
     excitation: Excitation,
-    laws: Laws,
+    laws: PortLaws,
     first: float,
     stamps: FloatArray,
-    begin: Begin,
+    begin: InitialMotion,
     refinement: int,
 ) -> ModalMotion:
     """Return the motion at stamps from a state at a time that may lie before them.
@@ -303,11 +313,11 @@ def _advance(
     is_excited = excitation.loads or excitation.prescribed_motions
     if not is_excited and laws.linear:
         since_begin = stamps - (first if is_late else stamps[0])
-        free = system.modal.free(begin.q, begin.v, since_begin)
+        free = system.modal.free_motion(begin.q, begin.v, since_begin)
         if free is not None:
             q, v = free
             no_forces = np.zeros((len(stamps), 0))
-            return ModalMotion(q, v, no_forces, no_forces, laws.memory())
+            return ModalMotion(q, v, no_forces, no_forces, laws.unloaded_memory())
     if not is_late:
         return _advance_in_steps(system, excitation, laws, stamps, begin, refinement)
     from_begin = np.append(first, stamps)
@@ -316,31 +326,31 @@ def _advance(
         q=motion.q[1:],
         v=motion.v[1:],
         port_forces=motion.port_forces[1:],
-        lagged=motion.lagged[1:],
+        lagged_forces=motion.lagged_forces[1:],
     )
 
 
 def _advance_in_steps(
     system: LinearSystem,
     excitation: Excitation,
-    laws: Laws,
+    laws: PortLaws,
     stamps: FloatArray,
-    begin: Begin,
+    begin: InitialMotion,
     refinement: int,
 ) -> ModalMotion:
     """Return the motion at stamps (N,) [s] from a state at the first of them, step by step."""
     modal = system.modal
     is_smooth = excitation.is_smooth or bool(excitation.prescribed_motions)
     least_parts = SMOOTH_PARTS if is_smooth else 1
-    edges = (*laws.edges, *excitation.edges)
-    boundaries = substeps(modal, laws, stamps, refinement, least_parts, edges)
+    edges = (*laws.switching_times, *excitation.edges)
+    boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
     # what loads add to the ports beyond the modes
     port_displacements = np.zeros((len(boundaries.time), len(laws)))
     if system.is_truncated and len(laws) and excitation.loads:
         residual = system.residual(system.rows_of_laws(laws).T)
         port_displacements = excitation.loads_at(boundaries.time, residual)
     steps = _steps(system, excitation, boundaries, port_displacements)
-    return advance(modal, laws, steps, begin, compiled_kernel())
+    return integrate_motion(modal, laws, steps, begin, compiled_kernel())
 
 
 def _steps(
@@ -348,7 +358,7 @@ def _steps(
     excitation: Excitation,
     boundaries: Boundaries,
     port_displacements: FloatArray,
-) -> Steps:
+) -> StepArrays:
     """Return the steps of all coordinates; drives follow their prescribed motions alone.
 
     `port_displacements` (K + 1, J) is what loads add to the positions of laws' ports beyond the
@@ -356,7 +366,7 @@ def _steps(
     """
     time = boundaries.time
     begin, end = equivalent_ramps(lambda times: system.modal_forces(excitation, times), time)
-    steps = steps_under(system.modal, boundaries, begin, end, port_displacements)
+    steps = loaded_steps(system.modal, boundaries, begin, end, port_displacements)
     motions = list(excitation.prescribed_motions.values())
     if not motions:
         return steps
@@ -368,5 +378,5 @@ def _steps(
         for order in (0, 1):
             row = coordinate + order * coordinate_count
             steps.transition[:, row] = 0.0
-            steps.push[:, row] = system.root_drive_mass * motion.values_at(time[1:], order)
+            steps.increment[:, row] = system.root_drive_mass * motion.values_at(time[1:], order)
     return steps

@@ -297,7 +297,7 @@ def observe_response(
     with CatalogueError.instead_of(InvalidPatchError):
         check_channels(patch, quantities)
         values, rates = apply_sensors(
-            patch, record, response.values, response.rates, *across, filtered=filtered_record
+            patch, record, response.values, response.rates, *across, high_pass=filtered_record
         )
     return Response(values, rates)
 

@@ -28,12 +28,13 @@ from discrepancy.system.time_history import RecordedHistory
 from fe.reduction.model_cache import patch_arrays
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.motion import PLANFORM, STATION_PORTS
 from fe.runtime.patch import INTERNAL_FORCES, PRIMITIVES, SENSORS, ModelPatch, Primitive
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
+from fe.runtime.port_laws import PLANFORM, STATION_PORTS
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import wing_names
-from fe.runtime.wing_rows import LOAD_PLACE, PORTS, PatchArrays, strain_gauge
+from fe.runtime.state import wing_input_names
+from fe.runtime.wing_rows import PORTS, STATIC_TEST_LOAD, strain_gauge
 from fe.structure.affine import PORT_PREFIX
 from fe.wing.design import WingDesign, load_design
 from reporting.progress import Progress
@@ -50,7 +51,7 @@ Prior = Mapping[str, tuple[float, float]]
 """Means and standard deviations of calibrated parameters, by the names of `STATE`."""
 
 
-class StructureInMotion(SolvedStructure, Protocol):
+class StructureWithMatrices(SolvedStructure, Protocol):
     """What the workflow asks of a reduced or a patched structure at one state.
 
     All matrices and rows are in n coordinates of the structure's own.
@@ -69,8 +70,8 @@ class StructureInMotion(SolvedStructure, Protocol):
         """Number of modes with inertia."""
 
     @property
-    def on_modes(self) -> frozenset[str]:
-        """Ports whose position is that of these modes alone."""
+    def rigid_ports(self) -> frozenset[str]:
+        """Ports without residual flexibility: these modes alone move them."""
 
 
 class StructureModel(SystemModel):
@@ -84,7 +85,7 @@ class StructureModel(SystemModel):
     Parameters
     ----------
     model : ReducedModel
-        The structure, with the ports of its file (`reduced_structure(..., with_ports=True)`).
+        The structure, with the ports of its file (`reduced_model(..., with_ports=True)`).
 
     Raises
     ------
@@ -113,9 +114,8 @@ class StructureModel(SystemModel):
         limits = [model.validity[name][1] for name in self.forces]
         self.largest_force = 0.5 * min(limits, default=np.inf)
         # outputs
-        _, outputs, accelerations = model.rows
         names = (*model.gauges, *model.displacements, *model.accelerations)
-        self._rows = dict(zip(names, (*outputs, *accelerations), strict=True))
+        self._rows = dict(zip(names, (*model.output_rows, *model.acceleration_rows), strict=True))
         displacements = [name for name in model.displacements if not _is_at_port(name)]
         self.quantities = {
             **dict.fromkeys(model.gauges, Quantity.STRAIN),
@@ -167,7 +167,7 @@ class StructureModel(SystemModel):
     def _load_under(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
         """Return the load (n,) under controls."""
         coefficients = self.model.load_coefficients(self._values(state, controls))
-        return np.asarray(self.model.rows[0] @ coefficients)
+        return np.asarray(self.model.unit_loads @ coefficients)
 
     def _unit_load(self, state: SystemState, control: str) -> FloatArray:
         """Return what a value of one of a control adds to the load (n,)."""
@@ -223,20 +223,20 @@ class StructureModel(SystemModel):
         return replace(excitation, loads=(*excitation.loads, Load(constant_load, always)))
 
     def build_system(self, state: SystemState) -> LinearSystem:
-        """Return the structure in a state, in the coordinates of `ReducedModel.at`.
+        """Return the structure in a state, in the coordinates of `ReducedStructure`.
 
         Raises
         ------
         OutsideModelError
             If a value lies outside the validity box of the reduced model.
         """
-        structure = self.model.at(self._values(state, {}))
+        structure = self.model.structure_at(self._values(state, {}))
         return _linear_system(structure, self.model.damping, self.port_rows)
 
 
 def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
     """Return the priors of a structure's parameters and free masses: nominal, with `DEVIATION`."""
-    nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
+    nominal = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
     units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")
     priors = []
     for name, unit in units.items():
@@ -259,7 +259,7 @@ def _acts_along(push: FloatArray, row: FloatArray) -> bool:
 
 
 def _linear_system(
-    structure: StructureInMotion,
+    structure: StructureWithMatrices,
     rayleigh: Iterable[float],
     ports: Mapping[str, FloatArray],
 ) -> LinearSystem:
@@ -267,7 +267,7 @@ def _linear_system(
 
     Parameters
     ----------
-    structure : StructureInMotion
+    structure : StructureWithMatrices
         The structure at one state.
     rayleigh : iterable of float
         Rayleigh damping: alpha [1/s] and beta [s].
@@ -282,7 +282,7 @@ def _linear_system(
         ports,
         mode_count=structure.mode_count,
         relaxation=beta,
-        on_modes=structure.on_modes,
+        on_modes=structure.rigid_ports,
         solved=structure,
     )
 
@@ -314,7 +314,7 @@ class WingModel(SystemModel):
     and displacement[y, x].
     """
 
-    reference = LOAD_PLACE
+    reference = STATIC_TEST_LOAD
 
     def __init__(
         self,
@@ -326,8 +326,8 @@ class WingModel(SystemModel):
         self.name = name
         self.design = design
         self.wing = PatchedWing(arrays)
-        self.wing.factorised = _solver_of
-        names = wing_names(arrays.regions)
+        self.wing.solver = _solver_of
+        names = wing_input_names(arrays.regions)
         validity = dict(zip(names, arrays.validity_box.tolist(), strict=True))
         self.parameters = wing_priors(validity, **prior)
         self.regions = arrays.regions
@@ -428,13 +428,13 @@ class WingModel(SystemModel):
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
         """Return the parts (2, n) of the lift."""
-        return self.wing.load_parts(change)
+        return self.wing.manoeuvre_loads(change)
 
     def distributed_scales(
         self, ports: Mapping[str, PortScale], shape: FloatArray
     ) -> dict[str, PortScale]:
         """Return the scales of a force over the planform, given the shape of the first mode."""
-        weights = self.wing.planform[1]
+        weights = self.wing.planform_stations.area_fraction
         motions = np.array([self.wing.port_rows[port] @ shape for port in STATION_PORTS])
         relative_motions = motions / float(weights @ motions)
         distribution = tuple(map(ForceShare, weights.tolist(), relative_motions.tolist()))
@@ -444,5 +444,5 @@ class WingModel(SystemModel):
         """Return the wing in a state."""
         stiffness_factor, servo_mass, pitot_mass, alpha, beta = state.parameters
         values = np.array((stiffness_factor, *state.losses, servo_mass, pitot_mass, 0.0, 0.0))
-        structure = self.wing.at(values, state.structure, state.temperature_rise)
+        structure = self.wing.structure_at(values, state.structure, state.temperature_rise)
         return _linear_system(structure, (alpha, beta), self.port_rows)

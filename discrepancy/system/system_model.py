@@ -37,8 +37,8 @@ from discrepancy.system.system_state import (
 from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime import patch as changes
 from fe.runtime.errors import FiniteElementError
-from fe.runtime.motion import NO_LAWS, Laws, laws_of
 from fe.runtime.patch import INTERNAL_FORCES, LOADS, STRUCTURE, ModelPatch, PortLoad
+from fe.runtime.port_laws import NO_LAWS, PortLaws, port_laws
 
 
 class SystemModel(Model):
@@ -146,10 +146,10 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ trials
 
-    def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> Laws:
+    def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
         """Return the laws at the ports, those of the model and those of a patch."""
         forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
-        return laws_of(forces, self.port_rows, in_windows=self.follows_windows)
+        return port_laws(forces, self.port_rows, in_windows=self.follows_windows)
 
     def patched_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
@@ -203,7 +203,7 @@ class SystemModel(Model):
         drives = tuple(excitation.prescribed_motions)
         return ExcitedSystem(self.system(case.state._replace(drives=drives)), excitation)
 
-    def motion(self, case: PatchedTrial, laws: Laws = NO_LAWS) -> Motion:
+    def motion(self, case: PatchedTrial, laws: PortLaws = NO_LAWS) -> Motion:
         """Return the motion in a dynamic trial.
 
         Raises
@@ -233,10 +233,10 @@ class SystemModel(Model):
         motion = self.motion(case, laws)
         return motion.response(self.output_equations(case, outputs, motion.excitation))
 
-    def _values_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: Laws) -> FloatArray:
+    def _values_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
         """Return what outputs show (N, C) in a trial at rest, along its load path."""
         trial = case.trial
-        if laws.spans or len(case.patch.of(PortLoad)):
+        if laws.active_spans or len(case.patch.of(PortLoad)):
             raise ModelError(
                 f"The trial {trial.name!r} has no time, which a law or force in time asks for."
             )

@@ -113,7 +113,7 @@ class FormulaHistory:
         """Return the values (N,) at times; a formula is never differentiated."""
         spans = self.spans or ((-inf, inf),)
         inside = np.any([(time >= begin) & (time < end) for begin, end in spans], axis=0)
-        return np.where(inside, self.formula.course(time, {"pi": pi}), 0.0)
+        return np.where(inside, self.formula.values_over_time(time, {"pi": pi}), 0.0)
 
 
 def equivalent_ramps(

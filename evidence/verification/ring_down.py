@@ -55,11 +55,11 @@ def ring_down_agreement(
     """
     model = reduce_structure(operators).model
     vector = model.vector(state.values, state.stiffness_loss)
-    integrator = ModalIntegrator(model, vector, state.damping_alpha, state.damping_beta)
+    integrator = ModalIntegrator(model.structure_at(vector), state.damping_alpha, state.damping_beta)
     frequency, row = integrator.modes.frequency, model.modes(vector).output[-1]
     increment, steps = 1.0 / (steps_per_period * float(frequency[0])), round(periods * steps_per_period)
-    initial = integrator.outputs(integrator.at_rest((0.0, TEST_FORCE)))[-1]
-    current = integrator.released(initial, (0.0, 0.0), TIP_FORCE)
+    initial = integrator.outputs(integrator.state_at_rest((0.0, TEST_FORCE)))[-1]
+    current = integrator.state_after_release(initial, (0.0, 0.0), TIP_FORCE)
     same_rule = _trapezoidal(2.0 * np.pi * frequency, integrator.damping_ratio, increment, steps)
     same_rule = row @ (same_rule * current.displacement[:, None])
     ours = np.empty(steps)

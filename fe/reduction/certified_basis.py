@@ -14,7 +14,8 @@ import numpy as np
 from fe.full.subspace import OrthonormalBasis, ProjectedBasis, project_terms, solve_near
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
-from fe.runtime.reduced import ReducedModel, StaticResponse
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.reduced_results import ReducedResponse
 from fe.structure.tables import StructureSettings
 from reporting.progress import Stage
 from reporting.words import counted
@@ -285,7 +286,7 @@ class StaticReduction:
         dropped = np.sqrt((1.0 + theta @ theta) * self.residuals.dropped_square)
         return float(dropped) + RESIDUAL_ROUNDING
 
-    def responses(self, model: ReducedModel, state: State) -> list[StaticResponse]:
+    def responses(self, model: ReducedModel, state: State) -> list[ReducedResponse]:
         """Return the responses of a reduced model at a state to each load alone."""
         values = model.nominal.copy()
         values[: len(state)] = state
@@ -300,7 +301,9 @@ class StaticReduction:
         """
         worst = 0.0
         for number, response in enumerate(self.responses(model, state)):
-            groups = [(outputs, bound) for outputs, bound in response.bounded if outputs.size]
+            groups = [
+                (outputs, bound) for outputs, bound in response.outputs_with_bounds if outputs.size
+            ]
             least_outputs = self.least_outputs[:, number]
             for (outputs, bound), least in zip(groups, least_outputs, strict=True):
                 largest = max(float(np.abs(outputs).max()), least)

@@ -11,16 +11,16 @@ expanded on the mesh by the static basis, which takes milliseconds.
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, TypeVar, overload
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from fe.elements.cells import CellMesh
 from fe.elements.kinds import HEXAHEDRA_20
-from fe.runtime.arrays import FloatArray, IntArray, KeptArrays
+from fe.runtime.arrays import FloatArray, IntArray, StoredArrays
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.wing_rows import PatchArrays
 from fe.structure.design import load_structure, structure_hash
 from fe.structure.operators import assemble_structure, write_vtu
 from fe.structure.tables import StructureSettings
@@ -40,7 +40,7 @@ MODELLING_PACKAGES = ("runtime", "elements", "full", "structure", "wing", "reduc
 A change in any of their files makes a new cache entry.
 """
 
-_Record = TypeVar("_Record", bound=KeptArrays)
+_Record = TypeVar("_Record", bound=StoredArrays)
 
 
 def modelling_hash() -> str:
@@ -96,7 +96,7 @@ class WingFields(ReducedModel):
         Modal basis vectors.
     """
 
-    what = "a field basis"
+    record_name = "a field basis"
 
     points: Annotated[FloatArray, "points", 3]
     cells: Annotated[IntArray, "cells", 20]
@@ -115,28 +115,58 @@ def _fields_of(model: ReducedModel) -> dict[str, Any]:
     return {field.name: getattr(model, field.name) for field in fields(ReducedModel)}
 
 
+@overload
 def reduced_model(
-    design: WingDesign | None = None,
+    source: WingDesign | None = None,
     progress: Progress | None = None,
     settings: StructureSettings | None = None,
+) -> ReducedModel: ...
+
+
+@overload
+def reduced_model(
+    source: Path | str,
+    progress: Progress | None = None,
+    *,
+    memory_limit: float | None = None,
+    with_ports: bool = False,
+) -> ReducedModel: ...
+
+
+def reduced_model(
+    source: WingDesign | Path | str | None = None,
+    progress: Progress | None = None,
+    settings: StructureSettings | None = None,
+    *,
+    memory_limit: float | None = None,
+    with_ports: bool = False,
 ) -> ReducedModel:
-    """Return the reduced model of a wing, from the cache if it is there.
+    """Return the reduced model of a wing, or of a structure file, from the cache if it is there.
 
     Parameters
     ----------
-    design : WingDesign, optional
-        The wing; the shipped one by default.
+    source : WingDesign, Path or str, optional
+        The design of a wing, by default the shipped one, or the path of a structure file.
     progress : Progress, optional
         Where a build reports.
     settings : StructureSettings, optional
-        The accuracy that is asked for; by default that of the design.
+        The accuracy that is asked for of a wing; by default that of the design.
+    memory_limit : float, optional
+        Bytes that assembly and factorisation of a structure may take, as in
+        `fe.structure.operators.load_and_assemble`.
+    with_ports : bool
+        Whether the model of a structure also has the force and the displacement at each port of the
+        file, see `AffineStructure.pushed_at_ports`. Its `design_hash` is that of the model without
+        them.
 
     Raises
     ------
     FiniteElementError
-        If the design cannot be modelled or reduced.
+        If the design or the structure cannot be read, modelled or reduced.
     """
-    wing = design or load_design()
+    if isinstance(source, Path | str):
+        return _reduced_structure(source, progress, memory_limit, with_ports=with_ports)
+    wing = source or load_design()
     return _cached(
         ReducedModel,
         cache_file("wing", wing.hash, settings),
@@ -221,33 +251,14 @@ def build_patch_arrays(design: WingDesign, progress: Progress | None = None) -> 
     return reduce_patches(_assembled(design, progress), progress)
 
 
-def reduced_structure(
+def _reduced_structure(
     file: Path | str,
-    progress: Progress | None = None,
+    progress: Progress | None,
+    memory_limit: float | None,
     *,
-    memory_limit: float | None = None,
-    with_ports: bool = False,
+    with_ports: bool,
 ) -> ReducedModel:
-    """Return the reduced model of a structure file, from the cache if it is there.
-
-    Parameters
-    ----------
-    file : Path or str
-        The structure file, beside its mesh.
-    progress : Progress, optional
-        Where a build reports.
-    memory_limit : float, optional
-        Bytes that assembly and factorisation may take, as in
-        `fe.structure.operators.load_and_assemble`.
-    with_ports : bool
-        Whether the model also has the force and the displacement at each port of the file, see
-        `AffineStructure.pushed_at_ports`. Its `design_hash` is that of the model without them.
-
-    Raises
-    ------
-    FiniteElementError
-        If the structure cannot be read, modelled or reduced.
-    """
+    """Return the reduced model of a structure file; the parameters are those of `reduced_model`."""
 
     def build() -> ReducedModel:
         from .reduced_basis import reduce_structure
@@ -354,7 +365,7 @@ def write_wing_vtu(path: str | Path, wing: WingFields, vector: FloatArray) -> No
     """
     displacement = wing.static_displacement @ wing.static_response(vector).coordinates
     strains = _strains_at_centres(wing, displacement)
-    region_losses = [vector[wing.chosen.index(name)] for name in wing.regions]
+    region_losses = [vector[wing.input_names.index(name)] for name in wing.regions]
     skin_loss, web_loss, rib_loss = 0.0, 0.0, 0.0
     losses = np.array([skin_loss, *region_losses, web_loss, rib_loss])
     write_vtu(

@@ -17,8 +17,8 @@ from scipy.linalg import eigh
 from fe.full.factorisation import Factorisation
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
-from fe.runtime.patched_wing import PatchedState, PatchedWing
-from fe.runtime.wing_rows import PatchArrays
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.patched_wing import PatchedStructure, PatchedWing
 from fe.structure.affine import natural_frequencies
 from fe.wing.operators import AffineOperators
 from fe.wing.patch_operators import PatchOperators, assemble_patch_operators
@@ -297,7 +297,7 @@ def _kept_directions(arrays: PatchArrays) -> FloatArray:
         is_unchanged = number == 0
         structure = _patched_state(wing, state_fractions, unchanged=is_unchanged)
         solutions = _unit_columns(structure.static(loads.columns)) * loads.weights
-        modes = _unit_columns(structure.lowest(MODES).shapes) * MODE_WEIGHTS
+        modes = _unit_columns(structure.lowest_modes(MODES).shapes) * MODE_WEIGHTS
         snapshots = np.concatenate((solutions, modes), axis=1)
         weight = UNCHANGED_WEIGHT**2 if is_unchanged else 1.0
         outer_products += snapshots @ snapshots.T * weight
@@ -332,7 +332,9 @@ def _unit_columns(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors / np.linalg.norm(vectors, axis=0))
 
 
-def _patched_state(wing: PatchedWing, fractions: FloatArray, *, unchanged: bool) -> PatchedState:
+def _patched_state(
+    wing: PatchedWing, fractions: FloatArray, *, unchanged: bool
+) -> PatchedStructure:
     """Return the wing at fractions of all ranges.
 
     Parameters
@@ -371,4 +373,4 @@ def _patched_state(wing: PatchedWing, fractions: FloatArray, *, unchanged: bool)
         tuple(part for part, present in zip(changes, has_change, strict=True) if present)
     )
     no_loads = (0.0, 0.0)
-    return wing.at(np.append(values, no_loads), patch)
+    return wing.structure_at(np.append(values, no_loads), patch)

@@ -8,7 +8,7 @@ import numpy as np
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.reduced import StaticResponse as ReducedResponse
+from fe.runtime.reduced_results import ReducedResponse as ReducedResponse
 from fe.structure.affine import (
     AffineResponse,
     AffineStructure,
@@ -210,7 +210,7 @@ def measured_errors(
     bounds = []
     frequency_error = 0.0
     for number, vector in enumerate(vectors):
-        values = dict(zip(model.chosen, vector.tolist(), strict=True))
+        values = dict(zip(model.input_names, vector.tolist(), strict=True))
         exact = static_response(structure, values)
         state_errors = _relative_errors(exact, model.static_response(vector))
         errors.append(state_errors.errors)
@@ -250,7 +250,7 @@ def _relative_errors(exact: AffineResponse, reduced: ReducedResponse) -> _Relati
     bounds = np.full(2, np.nan)
     for kind, outputs in enumerate((exact.strain, exact.output)):
         if outputs.size:
-            approximation, bound = reduced.bounded[kind]
+            approximation, bound = reduced.outputs_with_bounds[kind]
             largest = np.abs(outputs).max()
             errors[kind] = np.abs(approximation - outputs).max() / largest
             bounds[kind] = bound / largest
@@ -262,7 +262,7 @@ def _random_values(model: ReducedModel, count: int, seed: int) -> FloatArray:
     low, high = model.validity_box.T
     fractions = np.random.default_rng(seed).random((count, len(low)))
     vectors: FloatArray = low + (high - low) * fractions
-    first_control = len(model.chosen) - len(model.controls)
+    first_control = len(model.input_names) - len(model.controls)
     unit = np.clip(1.0, low, high)
     control_values = np.where(model.nominal == 0.0, unit, model.nominal)
     vectors[:, first_control:] = control_values[first_control:]

@@ -1,1 +1,1 @@
-"""Everything that is evaluated online, with NumPy alone: this folder goes into the FMU as a whole."""
+"""What is evaluated online, with NumPy alone: this folder goes into a Python FMU as a whole."""

@@ -1,56 +1,47 @@
-"""Types of arrays, columns of one, and records of arrays that live in one `.npz` file.
+"""Types of arrays, columns of a law's memory, and records of arrays stored in `.npz` files.
 
-Records are checked where they are made and read back to the last bit; the file has reproducible bytes, and
-nothing in it is pickled. NumPy and relative imports only: this file is copied into the FMU.
+A record is checked where it is made and read back to the last bit; its file has reproducible bytes,
+and nothing in it is pickled. NumPy and relative imports only: this file is copied into the FMU.
 """
 
 import io
 import zipfile
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import Field, dataclass, fields
 from math import isfinite
 from pathlib import Path
-from typing import Any, ClassVar, NoReturn, Self, get_args
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from .errors import ReducedModelFileError
-from .state import MOST_REGIONS, GivenLosses, Losses, losses_of
+from .state import MOST_REGIONS, Losses, LossValues, losses_of
 
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
+AnyArray = npt.NDArray[Any]
 
-HELD, PLACE, LAGGED, FADING, FORCE, HEAD = range(6)
-"""Columns of a law's memory, see `laws.interface`; from `HEAD` on its hysteretic elements."""
-
+STUCK, POSITION, LAGGED_FORCE, FADING_POSITION, FORCE, FIRST_ELEMENT = range(6)
+"""Columns of a law's memory, see `laws.interface`; from `FIRST_ELEMENT` on its hysteretic
+elements."""
 
 _TIMESTAMP = (1980, 1, 1, 0, 0, 0)  # the earliest that a zip archive can hold
 
 
-def _names(array: npt.NDArray[Any]) -> tuple[str, ...]:
-    if array.dtype.kind != "U" or array.ndim != 1:
-        raise ValueError(f"names are wanted, not {array.dtype} of shape {array.shape}")
-    return tuple(array.tolist())
-
-
-KINDS: Mapping[object, Callable[[Any], Any]] = {str: str, int: int, float: float, tuple: _names}
-"""What makes the value of a field that is no array, by its type, of the array that a file has of it."""
-
-
-def arrays_to_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """Return the bytes of an `.npz` archive; equal arrays give equal bytes on every machine and day.
+def arrays_to_bytes(arrays: Mapping[str, AnyArray]) -> bytes:
+    """Return the bytes of an `.npz` archive; equal arrays give equal bytes everywhere.
 
     Parameters
     ----------
-    arrays : mapping of str to ndarray
-        The arrays by name; object arrays are refused (they would need pickle).
+    arrays : mapping of str to array
+        The arrays by name; object arrays are refused, because they would need pickle.
 
     Returns
     -------
     bytes
-        The archive: not compressed, since the result of a compression depends on the library's version.
+        The archive, without compression: its result depends on the version of the library.
 
     Raises
     ------
@@ -66,7 +57,15 @@ def arrays_to_bytes(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
 
 
 def archive_bytes(members: Mapping[str, bytes], first: str = "") -> bytes:
-    """Return a zip archive with fixed dates and order; stored, since compression differs between versions."""
+    """Return the bytes of an uncompressed zip archive whose dates and order are fixed.
+
+    Parameters
+    ----------
+    members : mapping of str to bytes
+        The files of the archive by name.
+    first : str
+        Name of the file that comes first; the others are sorted.
+    """
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name in sorted(members, key=lambda name: (name != first, name)):
@@ -78,22 +77,22 @@ def archive_bytes(members: Mapping[str, bytes], first: str = "") -> bytes:
 
 
 def arrays_from_bytes(
-    content: bytes, where: str, wanted: Collection[str] = ()
-) -> dict[str, npt.NDArray[Any]]:
-    """Return the arrays of an `.npz` archive, checksums verified.
+    content: bytes, where: str, required: Collection[str] = ()
+) -> dict[str, AnyArray]:
+    """Return the arrays of an `.npz` archive after checking its checksums.
 
     Parameters
     ----------
     content : bytes
         The archive.
     where : str
-        What is being read, for the error message.
-    wanted : collection of str
-        Names that must be there.
+        The name of the source, for the error message.
+    required : collection of str
+        Names of arrays that the archive must hold.
 
     Returns
     -------
-    dict of str to ndarray
+    dict of str to array
         The arrays by name.
 
     Raises
@@ -101,38 +100,41 @@ def arrays_from_bytes(
     ReducedModelFileError
         If the archive is damaged, cut short, lacks an array or holds anything but plain arrays.
     """
-    arrays: dict[str, npt.NDArray[Any]] = {}
+    arrays: dict[str, AnyArray] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             for entry in archive.namelist():
                 member = io.BytesIO(archive.read(entry))
-                arrays[entry.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
+                array = np.lib.format.read_array(member, allow_pickle=False)
+                arrays[entry.removesuffix(".npy")] = array
                 if member.read(1):
                     raise ValueError("bytes follow an array")
-    except Exception as cause:  # zipfile and NumPy answer damage with nearly every exception that there is
+    except Exception as cause:  # zipfile and NumPy answer damage with nearly every exception
         reason = " ".join(str(cause).split()) or type(cause).__name__
         raise ReducedModelFileError(
-            f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it anew."
+            f"{where} is not a sound archive of plain arrays ({reason}); delete it and build it "
+            "anew."
         ) from cause
-    missing = [name for name in wanted if name not in arrays]
+    missing = [name for name in required if name not in arrays]
     if missing:
         raise ReducedModelFileError(f"{where} lacks {', '.join(missing)}; build it anew.")
     return arrays
 
 
 @dataclass(frozen=True, repr=False)
-class KeptArrays:
-    """Arrays and plain numbers that were made of one design with K damage regions, 1 to 8.
+class StoredArrays:
+    """A checked record of arrays and numbers of one design, which is stored in an `.npz` file.
 
-    A kind of record is a subclass with its fields. An array is declared with its axes,
-    `Annotated[FloatArray, "loads", 2]`: a number is the length, and a name means one length in all arrays,
-    which `_lengths` or else the first array with that axis tells. A number may be declared with its least and
-    largest value, `Annotated[float, 0.0, 1.0]`. A tuple holds names.
+    A kind of record is a subclass with its fields. An array is declared with the lengths of its
+    axes, `Annotated[FloatArray, "loads", 2]`. A number is the length itself. A name stands for one
+    length in all arrays of the record; `_axis_lengths` says it, or else the first array with that
+    axis. A number may be declared with its least and largest value, `Annotated[float, 0.0, 1.0]`.
+    A tuple holds names.
 
     Class attributes
     ----------------
-    what : str
-        What it is, with its article, for sentences.
+    record_name : str
+        What the record is, with its article, for sentences.
     version : int
         Version of the layout of its file.
 
@@ -141,10 +143,15 @@ class KeptArrays:
     design_hash : str
         Hash of the design.
     regions : tuple of str
-        Names of the damage regions in the order of their stiffness terms.
+        Names of the K damage regions, 1 to 8, in the order of their stiffness terms.
+
+    Raises
+    ------
+    ReducedModelFileError
+        If an array has another shape or type than declared, or a number is out of its range.
     """
 
-    what: ClassVar[str]
+    record_name: ClassVar[str]
     version: ClassVar[int]
 
     design_hash: str
@@ -152,51 +159,94 @@ class KeptArrays:
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.regions) <= MOST_REGIONS:
-            self.refuse(f"must have 1 to {MOST_REGIONS} damage regions, but names {len(self.regions)}")
-        lengths = self._lengths()
-        for item in fields(self):
-            axes: tuple[str | int, ...] = getattr(item.type, "__metadata__", ())
-            if not axes:
+            raise self._error(
+                f"must have 1 to {MOST_REGIONS} damage regions, but names {len(self.regions)}"
+            )
+        lengths = self._axis_lengths()
+        for field in fields(self):
+            declared: tuple[str | int | float, ...] = getattr(field.type, "__metadata__", ())
+            if not declared:
                 continue
-            array, number = getattr(self, item.name), get_args(item.type)[0]
-            if number is float:
-                low, high = map(float, axes)
-                if not (isfinite(array) and low <= array <= high):
-                    self.refuse(f"must have a {item.name} between {low:.2g} and {high:g}, but has {array!r}")
-                continue
-            (kind,) = get_args(get_args(number)[1])
-            lengths = {**dict(zip(axes, array.shape, strict=False)), **lengths}
-            expected = tuple(axis if isinstance(axis, int) else lengths.get(axis, 0) for axis in axes)
-            if array.shape != expected or array.dtype != kind or not np.isfinite(array).all():
-                self.refuse(
-                    f"must hold finite numbers in shape {expected} in its array {item.name}, but that has "
-                    f"shape {array.shape} and type {array.dtype}"
-                )
+            if get_args(field.type)[0] is float:
+                self._check_range(field, declared)
+            else:
+                self._check_shape(field, declared, lengths)
+
+    def _check_range(self, field: Field[Any], limits: tuple[str | int | float, ...]) -> None:
+        """Raise `ReducedModelFileError` unless a number lies between its declared limits."""
+        value = getattr(self, field.name)
+        low, high = map(float, limits)
+        if not (isfinite(value) and low <= value <= high):
+            raise self._error(
+                f"must have a {field.name} between {low:.2g} and {high:g}, but has {value!r}"
+            )
+
+    def _check_shape(
+        self,
+        field: Field[Any],
+        axes: tuple[str | int | float, ...],
+        lengths: dict[str, int],
+    ) -> None:
+        """Check an array against its declared axes; learn the lengths of axes that are new.
+
+        Parameters
+        ----------
+        field : Field
+            The field of the array.
+        axes : tuple of str or int
+            Names or lengths of the array's axes.
+        lengths : dict of str to int
+            The known lengths by the name of the axis; new ones are added.
+
+        Raises
+        ------
+        ReducedModelFileError
+            If the array has another shape or type, or holds a number that is not finite.
+        """
+        array = getattr(self, field.name)
+        (dtype,) = get_args(get_args(get_args(field.type)[0])[1])
+        for axis, length in zip(axes, array.shape, strict=False):
+            if isinstance(axis, str):
+                lengths.setdefault(axis, length)
+        shape = tuple(lengths.get(axis, 0) if isinstance(axis, str) else axis for axis in axes)
+        if array.shape != shape or array.dtype != dtype or not np.isfinite(array).all():
+            raise self._error(
+                f"must hold finite numbers in shape {shape} in its array {field.name}, but that "
+                f"has shape {array.shape} and type {array.dtype}"
+            )
 
     def __repr__(self) -> str:
-        told = ((item.name, getattr(self, item.name)) for item in fields(self))
-        plain = (f"{name}={value!r}" for name, value in told if not isinstance(value, np.ndarray))
-        return f"{type(self).__name__}({', '.join(plain)})"
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        plain_values = [
+            f"{name}={value!r}"
+            for name, value in values.items()
+            if not isinstance(value, np.ndarray)
+        ]
+        return f"{type(self).__name__}({', '.join(plain_values)})"
 
-    def refuse(self, fault: str) -> NoReturn:
-        """Refuse a record that cannot be: `fault` says what is wrong with it."""
-        raise ReducedModelFileError(f"{self.what[0].upper()}{self.what[1:]} {fault}; build it anew.")
+    def _error(self, fault: str) -> ReducedModelFileError:
+        """Return the error of an inconsistent record; `fault` is the rest of its sentence."""
+        name = f"{self.record_name[0].upper()}{self.record_name[1:]}"
+        return ReducedModelFileError(f"{name} {fault}; build it anew.")
 
-    def losses(self, stiffness_loss: GivenLosses) -> Losses:
-        """Return one stiffness loss for each region, in their order; see `fe.runtime.state.losses_of`."""
+    def losses(self, stiffness_loss: LossValues) -> Losses:
+        """Return one stiffness loss for each region; see `fe.runtime.state.losses_of`."""
         return losses_of(stiffness_loss, self.regions)
 
-    def _lengths(self) -> dict[str | int, int]:
-        """Return the lengths of axes that follow from others or from names."""
+    def _axis_lengths(self) -> dict[str, int]:
+        """Return the lengths of axes that follow from other axes or from the numbers of names."""
         return {}
 
     def to_bytes(self) -> bytes:
         """Return the bytes of an `.npz` file; equal records give equal bytes."""
-        values = {"format": self.version, **{item.name: getattr(self, item.name) for item in fields(self)}}
-        kinds = {tuple: np.str_}  # also of no names at all
-        return arrays_to_bytes(
-            {name: np.array(value, dtype=kinds.get(type(value))) for name, value in values.items()}
-        )
+        arrays: dict[str, AnyArray] = {"format": np.array(self.version)}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, tuple):
+                arrays[field.name] = np.array(value, dtype=np.str_)  # also of no names at all
+            else:
+                arrays[field.name] = np.array(value)
+        return arrays_to_bytes(arrays)
 
     @classmethod
     def from_bytes(cls, content: bytes, where: str = "") -> Self:
@@ -207,35 +257,73 @@ class KeptArrays:
         content : bytes
             An `.npz` archive.
         where : str
-            What is being read, for the error message.
+            The name of the source, for the error message.
 
         Raises
         ------
         ReducedModelFileError
             If the archive is damaged, incomplete or of another layout.
         """
-        where = where or f"The {cls.what.removeprefix('a ')}"
+        where = where or f"The {cls.record_name.removeprefix('a ')}"
         arrays = arrays_from_bytes(content, where, ["format"])
         if arrays["format"].tolist() != cls.version:
             raise ReducedModelFileError(
-                f"{where} has the format {arrays['format']}, but this version reads {cls.version}; build it "
-                "anew."
+                f"{where} has the format {arrays['format']}, but this version reads "
+                f"{cls.version}; build it anew."
             )
         try:
-            values: dict[str, Any] = {
-                item.name: KINDS[kind](arrays[item.name]) if kind in KINDS else arrays[item.name]
-                for item in fields(cls)
-                for kind in (getattr(item.type, "__origin__", item.type),)
-            }
+            values = {field.name: _value_from_array(field, arrays) for field in fields(cls)}
             return cls(**values)
         except KeyError as missing:
-            raise ReducedModelFileError(f"{where} lacks {missing.args[0]}; build it anew.") from missing
+            raise ReducedModelFileError(
+                f"{where} lacks {missing.args[0]}; build it anew."
+            ) from missing
         except (TypeError, ValueError, IndexError) as cause:
             raise ReducedModelFileError(
-                f"{where} does not hold the arrays of {cls.what} ({cause}); build it anew."
+                f"{where} does not hold the arrays of {cls.record_name} ({cause}); build it anew."
             ) from cause
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read a file of `to_bytes`; raises `FileNotFoundError` or `ReducedModelFileError`."""
+        """Return the record in a file that `to_bytes` made.
+
+        Raises
+        ------
+        FileNotFoundError
+            If there is no such file.
+        ReducedModelFileError
+            If the file is damaged, incomplete or of another layout.
+        """
         return cls.from_bytes(Path(path).read_bytes(), str(path))
+
+
+def _value_from_array(field: Field[Any], arrays: Mapping[str, AnyArray]) -> Any:
+    """Return the value of a field of a record: a number, text or names, or else the array itself.
+
+    Raises
+    ------
+    KeyError
+        If the file has no array of that name.
+    TypeError, ValueError
+        If the array does not hold such a value.
+    """
+    array = arrays[field.name]
+    declared_type = getattr(field.type, "__origin__", field.type)
+    convert = _CONVERSIONS.get(declared_type)
+    return array if convert is None else convert(array)
+
+
+def _names_from_array(array: AnyArray) -> tuple[str, ...]:
+    """Return the names in an array of text; raise `ValueError` for any other array."""
+    if array.dtype.kind != "U" or array.ndim != 1:
+        raise ValueError(f"names are wanted, not {array.dtype} of shape {array.shape}")
+    return tuple(array.tolist())
+
+
+_CONVERSIONS: Mapping[object, Callable[[AnyArray], Any]] = {
+    str: str,
+    int: int,
+    float: float,
+    tuple: _names_from_array,
+}
+"""Conversions of stored arrays to the values of fields that are not arrays, by their type."""

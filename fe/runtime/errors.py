@@ -1,16 +1,19 @@
-"""Errors of the wing model, named by cause (standard library only: this file also runs inside the FMU)."""
+"""Errors of structural models, named by their cause.
+
+Standard library only: this file is copied into the FMU.
+"""
 
 
 class FiniteElementError(Exception):
-    """Any error that the wing model raises on purpose."""
+    """Any error that the packages of structures raise on purpose."""
 
 
 class InvalidStateError(FiniteElementError, ValueError):
-    """A digital state holds a value that no wing can have."""
+    """A digital state holds a value that no structure can have."""
 
 
 class InvalidDesignError(FiniteElementError, ValueError):
-    """A wing design cannot be built; the sentence names the place in the design."""
+    """A wing design cannot be built; the sentence names the table and the key."""
 
 
 class DesignFileError(InvalidDesignError):
@@ -22,7 +25,7 @@ class MeshError(FiniteElementError, RuntimeError):
 
 
 class OutsideModelError(FiniteElementError, ValueError):
-    """A value lies outside the range for which the model was made."""
+    """A value lies outside the range for which the reduced model was made."""
 
 
 class InvalidPatchError(FiniteElementError, ValueError):

@@ -1,6 +1,7 @@
-"""Arithmetic in a text, for one value of each name or for many times; it is checked to be nothing else.
+"""Formulas that users write: texts that are checked to hold nothing but arithmetic.
 
-NumPy and relative imports only: this file is copied into the FMU.
+An expression has one value for one value of each name, or a value at each of many times. NumPy and
+relative imports only: this file is copied into the FMU.
 """
 
 import ast
@@ -9,7 +10,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache, reduce
 from types import CodeType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -19,47 +20,78 @@ from .errors import InvalidPatchError
 LONGEST = 600
 """Longest expression [characters]."""
 
+
+def _smallest(*values: Any) -> Any:
+    """Return the smallest of numbers or arrays, element by element."""
+    return reduce(np.minimum, values)
+
+
+def _largest(*values: Any) -> Any:
+    """Return the largest of numbers or arrays, element by element."""
+    return reduce(np.maximum, values)
+
+
+def _step(value: Any) -> Any:
+    """Return 0 below zero and 1 from zero on."""
+    return np.where(np.asarray(value) >= 0.0, 1.0, 0.0)
+
+
 _OPERATORS = (ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.UAdd, ast.USub)
 _FUNCTIONS: dict[str, Callable[..., Any]] = {
-    **{name: getattr(np, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "abs")},
-    "min": lambda *given: reduce(np.minimum, given),
-    "max": lambda *given: reduce(np.maximum, given),
-    "step": lambda value: np.where(np.asarray(value) >= 0.0, 1.0, 0.0),
+    "sqrt": np.sqrt,
+    "exp": np.exp,
+    "log": np.log,
+    "sin": np.sin,
+    "cos": np.cos,
+    "tan": np.tan,
+    "abs": np.abs,
+    "min": _smallest,
+    "max": _largest,
+    "step": _step,
 }
-_KNOWN = {"__builtins__": {}, **_FUNCTIONS}
+_GLOBALS = {"__builtins__": {}, **_FUNCTIONS}
+
 RESERVED = frozenset({*_FUNCTIONS, "pi", "place", "time"})
-"""What names in an expression mean already: no event and no parameter can have one of them."""
+"""Names with a meaning of their own in expressions: no event and no parameter may have one."""
+
+
+class _ParsedExpression(NamedTuple):
+    """The syntax tree of an expression, and the code that evaluates it."""
+
+    tree: ast.expr
+    code: CodeType
 
 
 @lru_cache(maxsize=1024)  # an expression is evaluated at every step of a fit
-def _read(text: str) -> tuple[ast.expr, CodeType]:
+def _parse(text: str) -> _ParsedExpression:
+    """Return the parsed expression; raises what `ast.parse` and `compile` raise."""
     tree = ast.parse(text, mode="eval")
     for node in ast.walk(tree):
         if isinstance(node, ast.Constant) and type(node.value) is int:
             node.value = float(node.value)  # no integer grows beyond a float's range
-    return tree.body, compile(tree, "an expression", "eval")
+    return _ParsedExpression(tree.body, compile(tree, "an expression", "eval"))
 
 
 @dataclass(frozen=True)
 class Expression:
     """An arithmetic expression such as "0.1 * mass_ratio * modal_mass".
 
-    Numbers, names, + - * / **, brackets, and the functions sqrt, exp, log, sin, cos, tan, abs, min, max,
-    step (0 below zero, 1 from zero on).
+    It holds numbers, names, + - * / **, brackets, and the functions sqrt, exp, log, sin, cos, tan,
+    abs, min, max, step (0 below zero, 1 from zero on).
 
     Attributes
     ----------
     text : str
-        As written.
+        The expression as written.
     names : collection of str
-        Names that it may use.
+        The names that it may use.
     where : str
-        Where it stands, for error messages.
+        The source of the text, for error messages.
 
     Raises
     ------
     InvalidPatchError
-        If it holds anything else.
+        If the text holds anything else.
     """
 
     text: str
@@ -68,80 +100,105 @@ class Expression:
 
     def __post_init__(self) -> None:
         if len(self.text) > LONGEST:
-            self._refuse(f" must have at most {LONGEST} characters, but has {len(self.text)}")
+            raise self._error(f" must have at most {LONGEST} characters, but has {len(self.text)}")
         try:
-            tree, _ = _read(self.text.strip())
-        except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError):
-            self._refuse(f" is not an arithmetic expression: {self.text!r}")
-        self._check(tree)
+            parsed = _parse(self.text.strip())
+        except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as cause:
+            raise self._error(f" is not an arithmetic expression: {self.text!r}") from cause
+        self._check(parsed.tree)
 
     def _check(self, node: ast.expr) -> None:
+        """Raise `InvalidPatchError` where a node of the syntax tree is not plain arithmetic."""
         match node:
-            case ast.Constant(value=value) if isinstance(value, int | float) and not isinstance(value, bool):
+            case ast.Constant(value=value) if type(value) in (int, float):
                 return
             case ast.Name(id=name):
-                if name not in self.names:
-                    self._refuse(
-                        f" uses the unknown name {name!r}; known are {', '.join(sorted(self.names))}"
-                    )
-            case ast.BinOp(left=left, op=op, right=right) if isinstance(op, _OPERATORS):
+                self._check_name(name)
+            case ast.BinOp(left=left, op=operator, right=right) if isinstance(operator, _OPERATORS):
                 self._check(left)
                 self._check(right)
-            case ast.UnaryOp(op=op, operand=operand) if isinstance(op, _OPERATORS):
+            case ast.UnaryOp(op=operator, operand=operand) if isinstance(operator, _OPERATORS):
                 self._check(operand)
-            case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in _FUNCTIONS and args:
-                if name not in ("min", "max") and len(args) != 1:
-                    self._refuse(f": {name} takes one argument, but has {len(args)}")
-                for argument in args:
-                    self._check(argument)
+            case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if (
+                name in _FUNCTIONS and arguments
+            ):
+                self._check_call(name, arguments)
             case _:
-                self._refuse(
-                    f" may hold numbers, names, + - * / **, brackets and {', '.join(_FUNCTIONS)}, but holds "
-                    f"{ast.get_source_segment(self.text.strip(), node)!r}"
+                raise self._error(
+                    f" may hold numbers, names, + - * / **, brackets and {', '.join(_FUNCTIONS)}, "
+                    f"but holds {ast.get_source_segment(self.text.strip(), node)!r}"
                 )
 
-    def _refuse(self, fault: str) -> NoReturn:
-        raise InvalidPatchError(f"{self.where}{fault}.")
+    def _check_name(self, name: str) -> None:
+        """Raise `InvalidPatchError` for a name that the expression may not use."""
+        if name not in self.names:
+            raise self._error(
+                f" uses the unknown name {name!r}; known are {', '.join(sorted(self.names))}"
+            )
+
+    def _check_call(self, function: str, arguments: list[ast.expr]) -> None:
+        """Raise `InvalidPatchError` where a function has too many arguments, or invalid ones."""
+        if function not in ("min", "max") and len(arguments) != 1:
+            raise self._error(f": {function} takes one argument, but has {len(arguments)}")
+        for argument in arguments:
+            self._check(argument)
+
+    def _error(self, fault: str) -> InvalidPatchError:
+        """Return the error of an invalid expression; `fault` is the rest of its sentence."""
+        return InvalidPatchError(f"{self.where}{fault}.")
 
     def value(self, values: Mapping[str, float]) -> float:
-        """Return the value for values of the names.
+        """Return the value of the expression for values of its names.
 
         Raises
         ------
         InvalidPatchError
             If a name has no value, or the result is not a finite real number.
         """
-        return float(self._result(values))
+        return float(self._evaluate(values))
 
-    def course(self, time: FloatArray, values: Mapping[str, float]) -> FloatArray:
-        """Return the values (N,) at times (N,), which are the name `time`; raises as `value`."""
-        result = self._result({**values, "time": time}, " at every time")
+    def values_over_time(self, time: FloatArray, values: Mapping[str, float]) -> FloatArray:
+        """Return the values (N,) at times (N,), which the expression calls `time`.
+
+        Raises
+        ------
+        InvalidPatchError
+            If another name has no value, or a result is not a finite real number.
+        """
+        result = self._evaluate({**values, "time": time}, " at every time")
         return np.array(np.broadcast_to(result, time.shape), dtype=np.float64)
 
-    def _result(self, values: Mapping[str, Any], when: str = "") -> Any:
+    def _evaluate(self, values: Mapping[str, float | FloatArray], when: str = "") -> Any:
+        """Return the checked result, a number or an array; `when` ends the sentence of an error."""
         try:
             with np.errstate(all="ignore"):
-                # `_check` lets pass nothing but numbers, the known names and functions, and operators
-                result = eval(_read(self.text.strip())[1], _KNOWN, dict(values))
+                # `_check` has found nothing but numbers, known names, functions and operators
+                result = eval(_parse(self.text.strip()).code, _GLOBALS, dict(values))
         except NameError as cause:
-            self._refuse(f": {self.text!r} needs {cause.name!r}, which has no value at this place")
+            raise self._error(
+                f": {self.text!r} needs {cause.name!r}, which has no value at this place"
+            ) from cause
         except (ArithmeticError, ValueError, TypeError) as cause:
-            self._refuse(f": {self.text!r} cannot be evaluated ({cause})")
+            raise self._error(f": {self.text!r} cannot be evaluated ({cause})") from cause
         if np.iscomplexobj(result) or not np.isfinite(result).all():
-            self._refuse(f": {self.text!r} is not a finite number{when}")
+            raise self._error(f": {self.text!r} is not a finite number{when}")
         return result
 
-    def used(self) -> frozenset[str]:
-        """Return the names that it uses."""
-        return frozenset(_read(self.text.strip())[1].co_names) - _FUNCTIONS.keys()
+    def used_names(self) -> frozenset[str]:
+        """Return the names that the expression uses, without its functions."""
+        return frozenset(_parse(self.text.strip()).code.co_names) - _FUNCTIONS.keys()
 
     def with_numbers(self, values: Mapping[str, float]) -> str:
-        """Return the text with numbers in the place of names; powers of negative ones stay what they are."""
+        """Return the text with numbers in the place of names.
 
-        def number(name: re.Match[str]) -> str:
-            if name[0] not in values:
-                return name[0]
-            value = float(values[name[0]])
+        A negative number stands in brackets, so that a power of it stays what it is.
+        """
+
+        def number_for(match: re.Match[str]) -> str:
+            name = match[0]
+            if name not in values:
+                return name
+            value = float(values[name])
             return f"({value!r})" if value < 0.0 else repr(value)
 
-        return re.sub(r"\b[A-Za-z_]\w*", number, self.text)
+        return re.sub(r"\b[A-Za-z_]\w*", number_for, self.text)

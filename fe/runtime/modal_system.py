@@ -1,20 +1,26 @@
-"""A linear system in few coordinates, Rayleigh damping, and its exact step under a force linear in time.
+"""A linear system in few coordinates, Rayleigh damping, and exact time steps under linear forces.
 
-The damping is that of Kapteyn et al. 2021, eqs. (17) and (18).
-
-NumPy and relative imports only: this file is copied into the FMU.
+The damping is that of Kapteyn et al. 2021, eqs. (17) and (18). NumPy and relative imports only:
+this file is copied into the FMU.
 """
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from .arrays import FloatArray
+
+ComplexArray = npt.NDArray[np.complexfloating[Any, Any]]
+
+_TAYLOR_ORDER = 14
+"""Order of the Taylor polynomial of a matrix exponential."""
+LARGEST_CONDITION = 1e4
+"""Condition of the eigenvectors up to which free motion is computed as a sum of them."""
 
 
 def rayleigh_damping_ratio(alpha: float, beta: float, frequency: npt.ArrayLike) -> FloatArray:
@@ -33,11 +39,11 @@ def rayleigh_damping_ratio(alpha: float, beta: float, frequency: npt.ArrayLike) 
 
     Returns
     -------
-    (M,) ndarray
+    (M,) array
         Damping ratios [1]; values of 1 and more mean that the mode does not oscillate.
     """
-    angular: Any = 2.0 * math.pi * np.asarray(frequency, dtype=np.float64)
-    return np.asarray(0.5 * (alpha / angular + beta * angular), dtype=np.float64)
+    omega: FloatArray = 2.0 * math.pi * np.asarray(frequency, dtype=np.float64)
+    return np.asarray(0.5 * (alpha / omega + beta * omega), dtype=np.float64)
 
 
 def rayleigh_coefficients(
@@ -69,37 +75,42 @@ def rayleigh_coefficients(
     first, second = (2.0 * math.pi * f for f in frequency)
     if not (first > 0.0 and second > 0.0) or first == second:
         raise ValueError(
-            f"Two different positive frequencies are needed for two Rayleigh coefficients, but {frequency} "
-            "Hz were given."
+            "Two different positive frequencies are needed for two Rayleigh coefficients, but "
+            f"{frequency} Hz were given."
         )
     difference = second**2 - first**2
     beta = 2.0 * (damping_ratio[1] * second - damping_ratio[0] * first) / difference
-    alpha = 2.0 * first * second * (damping_ratio[0] * second - damping_ratio[1] * first) / difference
+    alpha = (
+        2.0 * first * second * (damping_ratio[0] * second - damping_ratio[1] * first) / difference
+    )
     return alpha, beta
 
 
 @dataclass(frozen=True)
 class ModalSystem:
-    """A linear system in mass-normalised coordinates: q'' + D q' + S q = forces.
+    """A linear system in M mass-normalised coordinates: q'' + D q' + S q = forces.
+
+    The coordinates may be modes of a structure or states of first order.
 
     Attributes
     ----------
-    angular_frequency : (M,) ndarray
-        Undamped angular frequencies [rad/s]; zero is allowed, and is that of coordinates of first order.
-    damping : (M, M) ndarray
-        D [1/s]; diagonal 2 zeta w for modal damping.
-    ports : mapping of str to (M,) ndarray
-        Modal rows of the ports: the motion of a port is row . q, and what the flexibility adds.
-    flexibility : (P,) ndarray, optional
-        Position of each port, in their order, by a unit force there that these modes leave out; none if it is
-        left out [m/N, rad/(N m) and so on].
+    angular_frequency : (M,) array
+        Undamped angular frequencies [rad/s]; a coordinate of first order has zero.
+    damping : (M, M) array
+        D [1/s]; the diagonal 2 zeta w for modal damping.
+    ports : mapping of str to (M,) array
+        Modal rows of the P ports: the motion of a port is row . q, and what the residual
+        flexibility adds.
+    flexibility : (P,) array, optional
+        Residual flexibility of each port: its position under a unit force there, without the part
+        that these modes give [m/N, rad/(N m) and so on]. None: the ports have none.
     relaxation : float
-        What is left out follows a force with this lag, the factor of damping in proportion to the stiffness
-        [s].
-    stiffness_matrix : (M, M) ndarray, optional
-        S [1/s^2]; the squared angular frequencies where it is left out.
-    actions : mapping of str to (M,) ndarray
-        Rows along which laws at ports act, where that is not how they see; empty: everywhere the same.
+        Time constant with which the residual position follows a force: the factor of damping in
+        proportion to the stiffness [s].
+    stiffness_matrix : (M, M) array, optional
+        S [1/s^2]; by default the squared angular frequencies.
+    actions : mapping of str to (M,) array
+        Modal rows along which laws at the ports act, if they are not those of `ports`.
     """
 
     angular_frequency: FloatArray
@@ -112,140 +123,267 @@ class ModalSystem:
 
     @cached_property
     def stiffness(self) -> FloatArray:
-        """Squared angular frequencies (M,) [1/s^2]."""
+        """The squared angular frequencies (M,) [1/s^2]."""
         return np.ascontiguousarray(self.angular_frequency**2)
 
     @cached_property
     def coupled(self) -> bool:
         """Whether damping or stiffness couples the coordinates."""
-        return self.stiffness_matrix is not None or bool(
-            np.any(self.damping != np.diag(np.diag(self.damping)))
-        )
+        if self.stiffness_matrix is not None:
+            return True
+        return bool(np.any(self.damping != np.diag(np.diag(self.damping))))
 
     @cached_property
-    def whole(self) -> FloatArray:
-        """S, a matrix where no coordinate is coupled too."""
+    def full_stiffness(self) -> FloatArray:
+        """S (M, M), also where the stiffness couples no coordinates."""
         return np.diag(self.stiffness) if self.stiffness_matrix is None else self.stiffness_matrix
 
     @cached_property
-    def _eigen(self) -> tuple[FloatArray, Any, Any]:
-        """Units (M,) of the speeds, eigenvalues (2M,) [1/s] and eigenvectors (2M, 2M) of (q, v) in them."""
-        none, unit = np.zeros_like(self.damping), np.where(self.stiffness > 0.0, self.angular_frequency, 1.0)
-        matrix = np.block([[none, np.diag(unit)], [-self.whole / unit[:, None], -self.damping]])
-        return unit, *np.linalg.eig(matrix)
+    def _eigenvectors(self) -> "_Eigenvectors":
+        """The eigenvectors of the motion, in the state (q, v)."""
+        zero = np.zeros_like(self.damping)
+        speed_unit = np.where(self.stiffness > 0.0, self.angular_frequency, 1.0)
+        matrix = np.block(
+            [
+                [zero, np.diag(speed_unit)],
+                [-self.full_stiffness / speed_unit[:, None], -self.damping],
+            ]
+        )
+        rates, vectors = np.linalg.eig(matrix)
+        return _Eigenvectors(speed_unit, rates, vectors)
 
     @cached_property
-    def paces(self) -> FloatArray:
-        """Frequencies, or magnitudes (2M,) of the eigenvalues [1/s] of the motion that are not zero."""
+    def motion_rates(self) -> FloatArray:
+        """How fast the system can move: nonzero frequencies or magnitudes of eigenvalues [1/s]."""
         if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
             return self.angular_frequency
-        found = np.abs(self._eigen[1])
-        return np.asarray(found[found > 1e-7 * np.max(found, initial=0.0)])
+        magnitude = np.abs(self._eigenvectors.rates)
+        return np.asarray(magnitude[magnitude > 1e-7 * np.max(magnitude, initial=0.0)])
 
     @cached_property
-    def _waves(self) -> tuple[Any, Any, Any] | None:
-        """Rates (R,) [1/s] of free motion, one of each conjugate pair, shapes (2M, R) and amounts (R, 2M).
+    def _free_modes(self) -> "_FreeModes | None":
+        """The free motion as damped oscillations; None where eigenvectors are nearly parallel.
 
-        None where shapes are hardly apart, as under critical damping.
+        That is the case near critical damping.
         """
-        unit, rates, shapes = self._eigen
-        if not np.linalg.cond(shapes) < APART:
+        speed_unit, rates, vectors = self._eigenvectors
+        if not np.linalg.cond(vectors) < LARGEST_CONDITION:
             return None
-        scale, kept = np.concatenate((np.ones_like(unit), unit)), rates.imag >= 0.0
-        amounts = np.linalg.inv(shapes) / scale * np.where(rates.imag > 0.0, 2.0, 1.0)[:, None]
-        return rates[kept], scale[:, None] * shapes[:, kept], amounts[kept]
+        scale = np.concatenate((np.ones_like(speed_unit), speed_unit))
+        # of a conjugate pair the one with positive frequency counts twice
+        chosen = rates.imag >= 0.0
+        multiplicity = np.where(rates.imag > 0.0, 2.0, 1.0)
+        amplitudes = np.linalg.inv(vectors) / scale * multiplicity[:, None]
+        return _FreeModes(rates[chosen], scale[:, None] * vectors[:, chosen], amplitudes[chosen])
 
-    def free(self, q: FloatArray, v: FloatArray, time: FloatArray) -> tuple[FloatArray, FloatArray] | None:
-        """Return free motion q and v (N, M) at times (N,) from that at zero; None: steps must tell it."""
-        if self._waves is None:
-            return None
-        rates, shapes, amounts = self._waves
-        even, first = np.linspace(time[0], time[-1], len(time)), np.zeros(1)
-        if np.abs(time - even).max() <= 1e-9 * (even[-1] - even[0]) / len(time):
-            block = math.isqrt(len(time))
-            time, first = even[::block], even[:block] - even[0]
-        moved = shapes * (amounts @ np.concatenate((q, v)))
-        moved = (np.exp(np.outer(first, rates))[:, None] * moved).reshape(-1, len(rates)).T
-        waves = np.exp(np.outer(time, rates))
-        found = np.hstack((waves.real, -waves.imag)) @ np.vstack((moved.real, moved.imag))
-        found = found.reshape(-1, 2 * len(q))[: len(even)]
-        return found[:, : len(q)], found[:, len(q) :]
+    def free_motion(
+        self, q: FloatArray, v: FloatArray, time: FloatArray
+    ) -> tuple[FloatArray, FloatArray] | None:
+        """Return the free motion from a state at time zero, as a sum of damped oscillations.
 
-    def exact_steps(self, lengths: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return the exact steps under forces that are linear in time, for lengths (S,) [s].
-
-        The exponential of one matrix (Van Loan 1978) by scaling, a Taylor polynomial and squaring, all
-        lengths at once.
+        Parameters
+        ----------
+        q, v : (M,) array
+            Coordinates and speeds at time zero.
+        time : (N,) array
+            Times [s].
 
         Returns
         -------
-        transition : (S, 2M, 2M) ndarray
-            Of (q, v).
-        begin, end : (S, 2M, M) ndarray
-            By the forces at the begin and at the end of a step.
+        q, v : (N, M) array
+            The motion, or None where it cannot be written so (near critical damping); time steps
+            must give it then.
         """
-        matrix = self.whole if self.coupled else self.stiffness
-        return _exact_steps(matrix.tobytes(), self.damping.tobytes(), lengths.tobytes())
+        if self._free_modes is None:
+            return None
+        rates, shapes, amplitudes = self._free_modes
+        # At evenly spaced times e^(r (t_i + s_j)) = e^(r t_i) e^(r s_j): blocks of the square root
+        # of N times, of which only the first is computed by exponentials.
+        block_begin = time
+        offset = np.zeros(1)
+        even_time = np.linspace(time[0], time[-1], len(time))
+        if np.abs(time - even_time).max() <= 1e-9 * (even_time[-1] - even_time[0]) / len(time):
+            block = math.isqrt(len(time))
+            block_begin = even_time[::block]
+            offset = even_time[:block] - even_time[0]
+        at_begin = shapes * (amplitudes @ np.concatenate((q, v)))
+        at_offsets = np.exp(np.outer(offset, rates))[:, None] * at_begin
+        in_block = at_offsets.reshape(-1, len(rates)).T
+        wave = np.exp(np.outer(block_begin, rates))
+        # real part of the product of complex matrices
+        motion = np.hstack((wave.real, -wave.imag)) @ np.vstack((in_block.real, in_block.imag))
+        motion = motion.reshape(-1, 2 * len(q))[: len(even_time)]
+        return motion[:, : len(q)], motion[:, len(q) :]
+
+    def exact_steps(self, lengths: FloatArray) -> "ExactSteps":
+        """Return the exact time steps under forces that are linear in time.
+
+        The exponential of one matrix (Van Loan 1978), for all lengths at once.
+
+        Parameters
+        ----------
+        lengths : (S,) array
+            Lengths of the steps [s].
+        """
+        stiffness = self.full_stiffness if self.coupled else self.stiffness
+        return _exact_steps(stiffness.tobytes(), self.damping.tobytes(), lengths.tobytes())
 
 
-_TAYLOR = 14
-APART = 1e4
-"""Condition up to which the shapes of free motion are apart."""
+class _Eigenvectors(NamedTuple):
+    """Eigenvalues and eigenvectors of the motion of M coordinates.
+
+    Attributes
+    ----------
+    speed_unit : (M,) array
+        Units in which the vectors have their speeds, which balances the matrix [1/s].
+    rates : (2M,) array
+        Eigenvalues [1/s].
+    vectors : (2M, 2M) array
+        Eigenvectors, in columns: coordinates, then speeds in their units.
+    """
+
+    speed_unit: FloatArray
+    rates: ComplexArray
+    vectors: ComplexArray
+
+
+class _FreeModes(NamedTuple):
+    """Damped oscillations that free motion consists of, one for each conjugate pair.
+
+    Attributes
+    ----------
+    rates : (R,) array
+        Eigenvalues [1/s].
+    shapes : (2M, R) array
+        Coordinates and speeds of each oscillation.
+    amplitudes : (R, 2M) array
+        Amplitude of each by the coordinates and speeds at time zero.
+    """
+
+    rates: ComplexArray
+    shapes: ComplexArray
+    amplitudes: ComplexArray
+
+
+class ExactSteps(NamedTuple):
+    """Exact time steps of S lengths for the state (q, v) of M coordinates.
+
+    Attributes
+    ----------
+    transition : (S, 2M, 2M) array
+        New state by the old one.
+    begin, end : (S, 2M, M) array
+        What the forces at the begin and at the end of a step add to the new state.
+    """
+
+    transition: FloatArray
+    begin: FloatArray
+    end: FloatArray
 
 
 @lru_cache(maxsize=16)  # the same system is often moved again with other laws
-def _exact_steps(
-    stiffness: bytes, damping: bytes, lengths: bytes
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the steps by S (M, M), or (M,) where nothing couples the coordinates, and by D (M, M)."""
-    own, duration = np.frombuffer(stiffness), np.frombuffer(lengths)
-    count, size = math.isqrt(len(damping) // 8), len(duration)
-    matrix = np.frombuffer(damping).reshape(count, count)
-    if len(own) != count:
-        transition, begin, end = _exponential(own.reshape(1, count, count), matrix[None], duration)
-        return transition[:, 0], begin[:, 0], end[:, 0]
+def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps:
+    """Return the exact steps of a system; bytes of arrays, so that the results can be cached.
+
+    Parameters
+    ----------
+    stiffness : bytes of (M, M) or (M,) array
+        S, or its diagonal where nothing couples the coordinates.
+    damping : bytes of (M, M) array
+        D.
+    lengths : bytes of (S,) array
+        Lengths of the steps [s].
+    """
+    stiffness_values = np.frombuffer(stiffness)
+    duration = np.frombuffer(lengths)
+    count = math.isqrt(len(damping) // 8)
+    damping_matrix = np.frombuffer(damping).reshape(count, count)
+    if len(stiffness_values) != count:
+        steps = _linear_force_exponentials(
+            stiffness_values.reshape(1, count, count), damping_matrix[None], duration
+        )
+        return ExactSteps(steps.transition[:, 0], steps.begin[:, 0], steps.end[:, 0])
+    # each coordinate by itself, as a system of one
+    single = _linear_force_exponentials(
+        stiffness_values[:, None, None], np.diag(damping_matrix)[:, None, None], duration
+    )
     mode = np.arange(count)
-    parts = _exponential(own[:, None, None], np.diag(matrix)[:, None, None], duration)
-    whole, forces = np.zeros((size, 2, count, 2, count)), np.zeros((2, size, 2, count, count))
-    whole[:, :, mode, :, mode] = parts[0].transpose(1, 0, 2, 3)
-    for force, part in zip(forces, parts[1:], strict=True):
-        force[:, :, mode, mode] = part[..., 0].transpose(0, 2, 1)
-    begin, end = forces.reshape(2, size, 2 * count, count)
-    return whole.reshape(size, 2 * count, 2 * count), begin, end
+    steps_count = len(duration)
+    transition = np.zeros((steps_count, 2, count, 2, count))
+    transition[:, :, mode, :, mode] = single.transition.transpose(1, 0, 2, 3)
+    begin = np.zeros((steps_count, 2, count, count))
+    begin[:, :, mode, mode] = single.begin[..., 0].transpose(0, 2, 1)
+    end = np.zeros((steps_count, 2, count, count))
+    end[:, :, mode, mode] = single.end[..., 0].transpose(0, 2, 1)
+    return ExactSteps(
+        transition=transition.reshape(steps_count, 2 * count, 2 * count),
+        begin=begin.reshape(steps_count, 2 * count, count),
+        end=end.reshape(steps_count, 2 * count, count),
+    )
 
 
-def _exponential(
+def _linear_force_exponentials(
     stiffness: FloatArray, damping: FloatArray, lengths: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the same for B systems (B, n, n) each by itself, as (S, B, 2n, 2n) and (S, B, 2n, n)."""
-    count, own = stiffness.shape[1], np.eye(stiffness.shape[1])
-    # Velocities are measured in units of the highest frequency, which balances the matrix.
-    largest = (np.abs(part).max(axis=(1, 2), keepdims=True) for part in (stiffness, damping))
-    fastest, damped = largest
-    unit = np.maximum(np.maximum(np.sqrt(fastest), damped), 1.0 / (float(lengths.max()) or 1.0))
+) -> ExactSteps:
+    """Return the exact steps of B systems of n coordinates, each by itself.
+
+    The state (q, v) is extended by the force f and its change s over the step, which makes the
+    system homogeneous (Van Loan 1978).
+
+    Parameters
+    ----------
+    stiffness, damping : (B, n, n) array
+        S and D.
+    lengths : (S,) array
+        Lengths of the steps [s].
+
+    Returns
+    -------
+    ExactSteps
+        Arrays (S, B, 2n, 2n) and (S, B, 2n, n).
+    """
+    count = stiffness.shape[1]
+    unity = np.eye(count)
+    # speeds in units of the highest frequency, which balances the matrix
+    largest_stiffness = np.abs(stiffness).max(axis=(1, 2), keepdims=True)
+    largest_damping = np.abs(damping).max(axis=(1, 2), keepdims=True)
+    speed_unit = np.maximum(
+        np.maximum(np.sqrt(largest_stiffness), largest_damping),
+        1.0 / (float(lengths.max()) or 1.0),
+    )
     q, v, f, s = (slice(number * count, (number + 1) * count) for number in range(4))
+    state = slice(0, 2 * count)
+    # the matrix of the extended state
     matrix = np.zeros((len(stiffness), 4 * count, 4 * count))
-    matrix[:, q, v] = unit * own
-    matrix[:, v, q] = -stiffness / unit
+    matrix[:, q, v] = speed_unit * unity
+    matrix[:, v, q] = -stiffness / speed_unit
     matrix[:, v, v] = -damping
-    matrix[:, v, f] = own / unit
+    matrix[:, v, f] = unity / speed_unit
     scaled = matrix * lengths[:, None, None, None]
-    scaled[:, :, f, s] = own  # the force changes by one over the step
-    both, result = slice(0, 2 * count), exponential(scaled)
-    scale = np.concatenate((np.ones_like(unit), unit), axis=1).repeat(count, axis=1)
-    slope, whole = result[:, :, both, s] * scale, result[:, :, both, f] * scale
-    transition = result[:, :, both, both] * scale / scale.transpose(0, 2, 1)
-    return np.ascontiguousarray(transition), whole - slope, np.ascontiguousarray(slope)
+    scaled[:, :, f, s] = unity  # the force changes by one over the step
+    result = exponential(scaled)
+    # back to the units of the state
+    scale = np.concatenate((np.ones_like(speed_unit), speed_unit), axis=1).repeat(count, axis=1)
+    by_change = result[:, :, state, s] * scale
+    by_constant = result[:, :, state, f] * scale
+    transition = result[:, :, state, state] * scale / scale.transpose(0, 2, 1)
+    return ExactSteps(
+        transition=np.ascontiguousarray(transition),
+        begin=by_constant - by_change,
+        end=np.ascontiguousarray(by_change),
+    )
 
 
 def exponential(matrix: FloatArray) -> FloatArray:
-    """Return e^A of matrices (..., n, n), by a Taylor polynomial of A in small parts, and squares."""
+    """Return e^A of matrices A (..., n, n), by scaling, a Taylor polynomial and squaring."""
     norm = float(np.max(np.sum(np.abs(matrix), axis=-1), initial=0.0))
-    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))  # squares double rounding
-    part, unity = matrix / 2.0**squarings, np.eye(matrix.shape[-1])
+    # few squarings, because each doubles the rounding
+    squarings = max(0, int(np.ceil(np.log2(max(norm, 1e-300) / 0.5))))
+    scaled = matrix / 2.0**squarings
+    unity = np.eye(matrix.shape[-1])
     result = np.broadcast_to(unity, matrix.shape)
-    for order in range(_TAYLOR, 0, -1):
-        result = unity + part @ result / order
+    for order in range(_TAYLOR_ORDER, 0, -1):
+        result = unity + scaled @ result / order
     for _ in range(squarings):
         result = result @ result
     return np.asarray(result)

@@ -1,256 +1,345 @@
-"""Motion of a few modes with internal forces at ports: loops over numbers, and nothing else.
+"""Motion of a few modes with laws at ports, step by step: loops over numbers, and nothing else.
 
-q'' + D q' + W^2 (1 + r t) q = f(t) - sum_j p_j F_j(p_j . q, p_j . v, memory_j). The linear part is advanced
-exactly, in steps of any lengths that come from `fe.runtime.motion`; internal forces are split off
-symmetrically (Strang 1968): laws of speed, laws of position, linear motion, laws of position, laws of speed.
-Laws of speed have a closed form. Where friction turns over inside a step, the impulse and its first moment
-are corrected for the moment of the turn; where it holds, the port is held in place by the impulses that this
-needs, as long as friction can give them. What a law is `fe.runtime.laws.interface` says; none is known here.
+The equation of motion is q'' + D q' + W^2 (1 + r t) q = f(t) - sum_j p_j F_j(p_j . q, p_j . v,
+memory_j).
 
-Last laws at ports that lie on flexibility R which the modes leave out: x = p . q - R D + e, where D is the
-force of the laws there after a lag, beta D' + D = F (the lag of damping in proportion to the stiffness;
-backward Euler), and e what loads add. The force of a law is that at the step's end, where it obeys the law at
-its own position: a monotone equation in one unknown. Dry friction is then an elasto-plastic element of
-stiffness 1/R.
+The linear part is advanced exactly, in steps of any lengths that `fe.runtime.motion` prepares. The
+laws act as half impulses at both ends of a step (splitting of Strang 1968), in the order laws of
+speed, laws of position, linear motion, laws of position, laws of speed. Laws of speed have a closed
+form. Where friction reverses within a step, its impulse and first moment are corrected for the time
+after the reversal. Where friction holds a port, impulses keep it in its position as long as
+friction can give them. What a law is `fe.runtime.laws.interface` says; this file knows no law.
 
-Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
-into the FMU. `fe.compilation` has the same compiled.
+A port may have a residual flexibility R that the modes leave out. Its position is then x = p . q -
+R L + e: L is the force of the laws there after a lag, beta L' + L = F (the lag of damping in
+proportion to the stiffness; backward Euler), and e is what loads add. The force of a law obeys the
+law at the port's position at the end of a step, a monotone equation in one unknown. Dry friction is
+then an elasto-plastic element of stiffness 1/R.
+
+Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file
+is copied into the FMU. `fe.compilation` compiles it.
 """
 
 import numpy as np
 
 from . import laws
-from .arrays import FADING, FORCE, HELD, LAGGED, PLACE, FloatArray
+from .arrays import FADING_POSITION, FORCE, LAGGED_FORCE, POSITION, STUCK, FloatArray
+from .dry_friction import correct_reversal, hold_stuck_ports, port_acceleration
 from .laws import speed
-from .motion_arrays import SPEED, STILL, Kept, ModalMotion, Ports, State, Steps, Unnamed, add, at_port
-from .static_path import settle_port
+from .motion_arrays import (
+    IMMOVABLE,
+    SPEED_LAW,
+    ModalMotion,
+    ModalState,
+    PortArrays,
+    RecordFields,
+    StepArrays,
+    StepWorkspace,
+    add_scaled,
+    port_value,
+)
+from .static_path import solve_port_position
 
 
 def integrate(
-    steps: Unnamed, first: int, last: int, sample: int, coupled: bool, known: bool, at_ports: Unnamed,
-    begin: Unnamed, out: Unnamed,
-) -> None:  # fmt: skip
-    """Integrate from boundary `first` to `last`, the state in place; `out` is filled from `sample` on.
+    step_fields: RecordFields,
+    first: int,
+    last: int,
+    sample: int,
+    coupled: bool,
+    memory_is_known: bool,
+    port_fields: RecordFields,
+    state_fields: RecordFields,
+    motion_fields: RecordFields,
+) -> None:
+    """Integrate the motion over some of the steps, and record it at the samples there.
 
-    Given are the fields of `Steps`, `Ports`, `State` and `ModalMotion` without their names: numba takes three
-    times as long for a tuple with names as for one without. `coupled`: steps couple modes. `known`: the
-    memory is that of a state; otherwise each law is loaded from zero to its first position.
+    Records are given by their fields alone: numba takes three times as long for a tuple with names.
+
+    Parameters
+    ----------
+    step_fields : tuple
+        Fields of `StepArrays`.
+    first, last : int
+        Boundaries of the steps at which the motion begins and ends.
+    sample : int
+        First sample to record.
+    coupled : bool
+        Whether the linear steps couple the modes.
+    memory_is_known : bool
+        Whether the laws' memory belongs to the state; otherwise each law is loaded from zero to the
+        first position of its port.
+    port_fields : tuple
+        Fields of `PortArrays`.
+    state_fields : tuple
+        Fields of `ModalState`; changed in place.
+    motion_fields : tuple
+        Fields of `ModalMotion`; its samples are filled.
     """
-    go, ports, state, samples = Steps(*steps), Ports(*at_ports), State(*begin), ModalMotion(*out)
-    none, still = np.zeros((4, len(ports.numbers))), np.zeros((4, len(state.q)))
-    kept = Kept(still[0], still[1], still[2:].ravel(), none[0], none[1], none[2], none[3])
-    begin_laws(ports, state, known)
-    # At the begin, a step of no duration: the lagged forces stay, or follow at once.
-    h, keep, fade = 0.0, 1.0 if known and ports.relaxation > 0.0 else 0.0, 1.0
+    steps = StepArrays(*step_fields)
+    ports = PortArrays(*port_fields)
+    state = ModalState(*state_fields)
+    motion = ModalMotion(*motion_fields)
+    by_law = np.zeros((4, len(ports.law_number)))
+    by_mode = np.zeros((4, len(state.q)))
+    workspace = StepWorkspace(
+        by_mode[0], by_mode[1], by_mode[2:].ravel(), by_law[0], by_law[1], by_law[2], by_law[3]
+    )
+    start_laws(ports, state, memory_is_known)
+    # at the begin, a step without duration: lagged forces stay, or follow at once
+    h = 0.0
+    lag = 1.0 if memory_is_known and ports.relaxation > 0.0 else 0.0
+    fade = 1.0
     for k in range(first, last + 1):
         if k > first:
-            h = go.length[go.which[k - 1]]
-            keep = ports.relaxation / (ports.relaxation + h)
-            fade = keep
-            first_half(go, k - 1, ports, kept, state, h)
-            move(go, k - 1, state, kept.room, coupled)
-            hold(go, k - 1, ports, kept, state, h)
-        carry(go, k, ports, state, h, keep, fade, known)
+            h = steps.length[steps.length_of_step[k - 1]]
+            lag = ports.relaxation / (ports.relaxation + h)
+            fade = lag
+            first_half_impulse(steps, k - 1, ports, workspace, state, h)
+            linear_step(steps, k - 1, state, workspace.new_state, coupled)
+            hold_stuck_ports(steps, k - 1, ports, workspace, state, h)
+        update_position_laws(steps, k, ports, state, h, lag, fade, memory_is_known)
         if k > first:
-            second_half(go, k - 1, ports, kept, state, h)
-        if k == go.sample[sample]:
-            record(go, k, ports, state, go.end[k - 1] if k > first else go.begin[k], sample, samples)
+            second_half_impulse(steps, k - 1, ports, workspace, state, h)
+        if k == steps.sample_boundary[sample]:
+            applied = steps.end_force[k - 1] if k > first else steps.begin_force[k]
+            record_sample(steps, k, ports, state, applied, sample, motion)
             sample += 1
 
 
-def begin_laws(ports: Ports, state: State, known: bool) -> None:
-    """Set what the laws pull with at the begin; without a known memory those of speed move steadily."""
-    for j in range(len(ports.numbers)):
-        x, v = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-        law, memory = ports.values[j], state.memory[j]
-        if ports.leader[j] == SPEED:
+def start_laws(ports: PortArrays, state: ModalState, memory_is_known: bool) -> None:
+    """Set the forces of the laws at the begin; without a known memory, speeds have been steady."""
+    for j in range(len(ports.law_number)):
+        x = port_value(ports.motion_rows, j, state.q)
+        v = port_value(ports.motion_rows, j, state.v)
+        law = ports.parameters[j]
+        memory = state.memory[j]
+        if ports.leader[j] == SPEED_LAW:
             memory[FORCE] = 0.0
-            if speed.holds(law) and v == 0.0 and speed.strength(law, x, ports.weight[j]) > 0.0:
-                memory[HELD], memory[PLACE] = 1.0, x
-        elif ports.leader[j] == STILL:
-            memory[FORCE] = memory[LAGGED] = 0.0
-        elif ports.of_speed[j] == 0:
-            memory[FORCE], _ = laws.pull(ports.numbers[j], law, memory, memory[PLACE], 1.0)
-        elif not known:
-            memory[FORCE] = memory[LAGGED] = speed.steady(law, x, v)
+            holds = speed.can_hold(law) and speed.strength(law, x, ports.inverse_mass[j]) > 0.0
+            if holds and v == 0.0:
+                memory[STUCK] = 1.0
+                memory[POSITION] = x
+        elif ports.leader[j] == IMMOVABLE:
+            memory[FORCE] = 0.0
+            memory[LAGGED_FORCE] = 0.0
+        elif ports.depends_on_speed[j] == 0:
+            memory[FORCE], _ = laws.force_and_slope(
+                ports.law_number[j], law, memory, memory[POSITION], 1.0
+            )
+        elif not memory_is_known:
+            memory[FORCE] = speed.steady_force(law, x, v)
+            memory[LAGGED_FORCE] = memory[FORCE]
 
 
-def first_half(go: Steps, k: int, ports: Ports, kept: Kept, state: State, h: float) -> None:
-    """Give the modes the first half of the impulse of the internal forces."""
-    half = 0.5 * h
-    modes, count = len(state.q), len(ports.numbers)
-    for m in range(modes):
-        kept.q[m], kept.v[m] = state.q[m], state.v[m]
-    for j in range(count):
-        kept.forces[j], kept.freed[j], kept.lost[j] = state.memory[j, FORCE], 0.0, 0.0
-        if ports.leader[j] != SPEED:
-            continue
-        kept.speed[j] = at_port(ports.rows, j, state.v)
-        if state.memory[j, HELD] == 1.0:
-            continue
-        now = speed.strength(ports.values[j], at_port(ports.rows, j, state.q), ports.weight[j])
-        # dry friction is not stopped at zero: the turn is looked for after the step
-        kept.lost[j] = kept.speed[j] - speed.kick(ports.values[j], kept.speed[j], now, half, True)
-        add(state.v, ports.acts[j], -kept.lost[j] / ports.weight[j])
-    for j in range(count):
-        if kept.forces[j] != 0.0:
-            add(state.v, ports.acts[j], -kept.forces[j] * half)
-    if ports.rate != 0.0:
-        for m in range(modes):
-            state.v[m] -= half * ports.rate * go.time[k] * go.stiffness[m] * state.q[m]
-
-
-def move(go: Steps, k: int, state: State, new: FloatArray, coupled: bool) -> None:
-    """Move the linear structure, exactly; modes that are not coupled each by itself."""
-    modes, step = len(state.q), go.which[k]
-    for m in range(modes):
-        i, low, high = modes + m, 0 if coupled else m, modes if coupled else m + 1
-        q, v = go.push[k, m], go.push[k, i]
-        for n in range(low, high):
-            q += go.transition[step, m, n] * state.q[n] + go.transition[step, m, modes + n] * state.v[n]
-            v += go.transition[step, i, n] * state.q[n] + go.transition[step, i, modes + n] * state.v[n]
-        new[m], new[i] = q, v
-    for m in range(modes):
-        state.q[m], state.v[m] = new[m], new[modes + m]
-
-
-def hold(go: Steps, k: int, ports: Ports, kept: Kept, state: State, h: float) -> None:
-    """Keep the ports that friction holds in place, by an impulse at the begin of the step."""
-    modes = len(state.q)
-    for j in range(len(ports.numbers)):
-        if ports.leader[j] != SPEED or state.memory[j, HELD] != 1.0:
-            continue
-        answer = ports.answer[go.which[k], j]
-        place, weight = state.memory[j, PLACE], ports.weight[j]
-        limit = speed.holding_limit(ports.values[j], speed.strength(ports.values[j], place, weight), 0.5 * h)
-        impulse = (place - at_port(ports.rows, j, state.q)) / at_port(ports.rows, j, answer[:modes])
-        if abs(impulse) * weight > limit:
-            state.memory[j, HELD], kept.freed[j] = 0.0, 1.0
-            impulse = (limit if impulse > 0.0 else -limit) / weight
-        add(state.q, answer, impulse)
-        add(state.v, answer[modes:], impulse)
-
-
-def carry(
-    go: Steps, k: int, ports: Ports, state: State, h: float, keep: float, fade: float, known: bool
+def first_half_impulse(
+    steps: StepArrays,
+    k: int,
+    ports: PortArrays,
+    workspace: StepWorkspace,
+    state: ModalState,
+    h: float,
 ) -> None:
-    """Carry the laws at flexible positions to boundary `k`, and give the second half of their impulse.
+    """Give the modes the first half of the internal impulse of step `k`, of duration `h` [s]."""
+    half = 0.5 * h
+    mode_count = len(state.q)
+    law_count = len(ports.law_number)
+    # the begin, for reversals of friction
+    for m in range(mode_count):
+        workspace.q[m] = state.q[m]
+        workspace.v[m] = state.v[m]
+    # laws of speed, in closed form
+    for j in range(law_count):
+        workspace.forces[j] = state.memory[j, FORCE]
+        workspace.broke_loose[j] = 0.0
+        workspace.speed_lost[j] = 0.0
+        if ports.leader[j] != SPEED_LAW:
+            continue
+        workspace.speed[j] = port_value(ports.motion_rows, j, state.v)
+        if state.memory[j, STUCK] == 1.0:
+            continue
+        law = ports.parameters[j]
+        x = port_value(ports.motion_rows, j, state.q)
+        strength = speed.strength(law, x, ports.inverse_mass[j])
+        # dry friction does not stop at zero: the reversal is looked for after the step
+        new_speed = speed.speed_after(law, workspace.speed[j], strength, half, True)
+        workspace.speed_lost[j] = workspace.speed[j] - new_speed
+        add_scaled(state.v, ports.force_rows[j], -workspace.speed_lost[j] / ports.inverse_mass[j])
+    # laws of position
+    for j in range(law_count):
+        if workspace.forces[j] != 0.0:
+            add_scaled(state.v, ports.force_rows[j], -workspace.forces[j] * half)
+    # drift of the whole stiffness
+    if ports.stiffness_rate != 0.0:
+        for m in range(mode_count):
+            state.v[m] -= (
+                half * ports.stiffness_rate * steps.time[k] * steps.stiffness[m] * state.q[m]
+            )
 
-    `keep` of the lagged forces stays, `fade` of what gone loads add; a rigid port has neither.
+
+def linear_step(
+    steps: StepArrays, k: int, state: ModalState, new_state: FloatArray, coupled: bool
+) -> None:
+    """Move the linear structure through step `k`, exactly; uncoupled modes each by itself."""
+    mode_count = len(state.q)
+    transition = steps.transition[steps.length_of_step[k]]
+    for m in range(mode_count):
+        i = mode_count + m  # row of the speed
+        low = 0 if coupled else m
+        high = mode_count if coupled else m + 1
+        q = steps.increment[k, m]
+        v = steps.increment[k, i]
+        for n in range(low, high):
+            q += transition[m, n] * state.q[n] + transition[m, mode_count + n] * state.v[n]
+            v += transition[i, n] * state.q[n] + transition[i, mode_count + n] * state.v[n]
+        new_state[m] = q
+        new_state[i] = v
+    for m in range(mode_count):
+        state.q[m] = new_state[m]
+        state.v[m] = new_state[mode_count + m]
+
+
+def update_position_laws(
+    steps: StepArrays,
+    k: int,
+    ports: PortArrays,
+    state: ModalState,
+    h: float,
+    lag: float,
+    fade: float,
+    memory_is_known: bool,
+) -> None:
+    """Carry the laws of ports to boundary `k`, and give the second half of their impulse.
+
+    It does so for laws of position, and for laws of speed at ports with residual flexibility.
+
+    Parameters
+    ----------
+    steps, ports, state
+        Arrays of the steps and of the ports; the state, changed in place.
+    k : int
+        The boundary.
+    h : float
+        Duration of the step [s].
+    lag : float
+        Fraction of the lagged force that remains after the step; a rigid port has no lag.
+    fade : float
+        Fraction of the position by removed loads that remains after the step.
+    memory_is_known : bool
+        Whether the memory at the first boundary belongs to the state.
     """
-    for port in range(len(ports.numbers)):
+    for port in range(len(ports.law_number)):
         if ports.leader[port] != port:
             continue
-        r, x = ports.flexibility[port], at_port(ports.rows, port, state.q)
-        if r > 0.0:
-            x += go.feed[k, port] + fade * state.memory[port, FADING]
-            for j in range(len(ports.numbers)):
+        # position of the port, at which all of its laws obey their equations
+        flexibility = ports.flexibility[port]
+        x = port_value(ports.motion_rows, port, state.q)
+        if flexibility > 0.0:
+            x += steps.residual_position[k, port] + fade * state.memory[port, FADING_POSITION]
+            for j in range(len(ports.law_number)):
                 if ports.leader[j] == port:
-                    x -= r * keep * state.memory[j, LAGGED]
-            x = settle_port(port, ports, state.memory, x, (1.0 - keep) * r, h)
-        for j in range(len(ports.numbers)):
+                    x -= flexibility * lag * state.memory[j, LAGGED_FORCE]
+            x = solve_port_position(port, ports, state.memory, x, (1.0 - lag) * flexibility, h)
+        # memory and impulse of each law there
+        for j in range(len(ports.law_number)):
             if ports.leader[j] != port:
                 continue
-            memory, stays = state.memory[j], keep if r > 0.0 else 0.0
-            if ports.of_speed[j] == 0:
-                laws.advance(ports.numbers[j], ports.values[j], memory, x)
-            if ports.of_speed[j] == 0 or h > 0.0 or not known:
-                memory[PLACE] = x
-            if r == 0.0:
-                memory[FORCE], _ = laws.pull(ports.numbers[j], ports.values[j], memory, x, 1.0)
-            memory[LAGGED] = stays * memory[LAGGED] + (1.0 - stays) * memory[FORCE]
-            memory[FADING] *= fade
-            add(state.v, ports.acts[j], -0.5 * h * memory[FORCE])
+            memory = state.memory[j]
+            law_lag = lag if flexibility > 0.0 else 0.0
+            is_of_position = ports.depends_on_speed[j] == 0
+            if is_of_position:
+                laws.advance(ports.law_number[j], ports.parameters[j], memory, x)
+            if is_of_position or h > 0.0 or not memory_is_known:
+                memory[POSITION] = x
+            if flexibility == 0.0:
+                memory[FORCE], _ = laws.force_and_slope(
+                    ports.law_number[j], ports.parameters[j], memory, x, 1.0
+                )
+            memory[LAGGED_FORCE] = law_lag * memory[LAGGED_FORCE] + (1.0 - law_lag) * memory[FORCE]
+            memory[FADING_POSITION] *= fade
+            add_scaled(state.v, ports.force_rows[j], -0.5 * h * memory[FORCE])
 
 
-def second_half(go: Steps, k: int, ports: Ports, kept: Kept, state: State, h: float) -> None:
-    """Give the modes the second half of the impulse; look for friction that turned over."""
+def second_half_impulse(
+    steps: StepArrays,
+    k: int,
+    ports: PortArrays,
+    workspace: StepWorkspace,
+    state: ModalState,
+    h: float,
+) -> None:
+    """Give the modes the second half of the impulse of step `k`; correct friction that reversed."""
     half = 0.5 * h
-    if ports.rate != 0.0:
+    # drift of the whole stiffness
+    if ports.stiffness_rate != 0.0:
         for m in range(len(state.q)):
-            state.v[m] -= half * ports.rate * (go.time[k] + h) * go.stiffness[m] * state.q[m]
-    for j in range(len(ports.numbers) - 1, -1, -1):
-        if ports.leader[j] != SPEED:
+            state.v[m] -= (
+                half * ports.stiffness_rate * (steps.time[k] + h) * steps.stiffness[m] * state.q[m]
+            )
+    # laws of speed, in the opposite order of the first half
+    for j in range(len(ports.law_number) - 1, -1, -1):
+        if ports.leader[j] != SPEED_LAW:
             continue
-        x, v = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-        law, memory = ports.values[j], state.memory[j]
-        if memory[HELD] == 1.0:
-            limit = speed.holding_limit(law, speed.strength(law, memory[PLACE], ports.weight[j]), half)
+        x = port_value(ports.motion_rows, j, state.q)
+        v = port_value(ports.motion_rows, j, state.v)
+        law = ports.parameters[j]
+        memory = state.memory[j]
+        inverse_mass = ports.inverse_mass[j]
+        if memory[STUCK] == 1.0:
+            # the impulse that stops the port, as large as friction can give
+            strength = speed.strength(law, memory[POSITION], inverse_mass)
+            limit = speed.holding_limit(law, strength, half)
             if abs(v) > limit:
                 v = limit if v > 0.0 else -limit
-                memory[HELD] = 0.0
-            add(state.v, ports.acts[j], -v / ports.weight[j])
+                memory[STUCK] = 0.0
+            add_scaled(state.v, ports.force_rows[j], -v / inverse_mass)
             continue
-        now, can_hold = speed.strength(law, x, ports.weight[j]), speed.holds(law)
-        if (
-            can_hold
-            and kept.freed[j] == 0.0
-            and kept.speed[j] != 0.0
-            and kept.speed[j] * (v - kept.lost[j]) <= 0.0
-        ):
-            turn_over(go, k, ports, kept, state, j, now, h)
+        strength = speed.strength(law, x, inverse_mass)
+        can_hold = speed.can_hold(law)
+        was_moving = workspace.broke_loose[j] == 0.0 and workspace.speed[j] != 0.0
+        end_speed = v - workspace.speed_lost[j]
+        if can_hold and was_moving and workspace.speed[j] * end_speed <= 0.0:
+            correct_reversal(steps, k, ports, workspace, state, j, strength, h)
         else:
-            after = speed.kick(law, v, now, half, False)
-            if after == 0.0 and can_hold and now > 0.0:
-                memory[HELD], memory[PLACE] = 1.0, x
-            add(state.v, ports.acts[j], (after - v) / ports.weight[j])
+            new_speed = speed.speed_after(law, v, strength, half, False)
+            if new_speed == 0.0 and can_hold and strength > 0.0:
+                memory[STUCK] = 1.0
+                memory[POSITION] = x
+            add_scaled(state.v, ports.force_rows[j], (new_speed - v) / inverse_mass)
 
 
-def acceleration(
-    go: Steps, ports: Ports, j: int, q: FloatArray, v: FloatArray, forces: FloatArray, push: FloatArray,
-    t: float,
-) -> float:  # fmt: skip
-    """Return the acceleration of the port of law `j` under a push of the modes and the forces of laws.
-
-    Laws of speed have none.
-    """
-    total = 0.0
-    for m in range(len(q)):
-        own = push[m] - go.stiffness[m] * (1.0 + ports.rate * t) * q[m]
-        for k in range(len(q)):
-            own -= go.damping[m, k] * v[k]
-        for k in range(len(forces)):
-            own -= ports.acts[k, m] * forces[k]
-        total += ports.rows[j, m] * own
-    return total
-
-
-def turn_over(
-    go: Steps, k: int, ports: Ports, kept: Kept, state: State, j: int, now: float, h: float
+def record_sample(
+    steps: StepArrays,
+    k: int,
+    ports: PortArrays,
+    state: ModalState,
+    applied: FloatArray,
+    sample: int,
+    motion: ModalMotion,
 ) -> None:
-    """Correct speed and position of a port whose friction turned over within a step."""
-    lost, forces, end = kept.lost[j], state.memory[:, FORCE], go.time[k] + h
-    at_begin = acceleration(go, ports, j, kept.q, kept.v, kept.forces, go.begin[k], go.time[k])
-    at_end = acceleration(go, ports, j, state.q, state.v, forces, go.end[k], end)
-    friction = -2.0 * lost / h  # of the first sign, at both ends
-    v, slopes = at_port(ports.rows, j, state.v), (at_begin + friction, at_end + friction)
-    change, way, held = speed.crossing(ports.values[j], kept.speed[j], v - lost, slopes, lost, now, h)
-    if held == 1.0:
-        change = -v
-        x = at_port(ports.rows, j, state.q)
-        way += at_port(ports.rows, j, kept.q) - x
-        state.memory[j, HELD], state.memory[j, PLACE] = 1.0, x + way
-    add(state.q, ports.acts[j], way / ports.weight[j])
-    add(state.v, ports.acts[j], change / ports.weight[j])
-
-
-def record(
-    go: Steps, k: int, ports: Ports, state: State, push: FloatArray, sample: int, out: ModalMotion
-) -> None:
-    """Write state and forces at a sample, where modal forces push."""
+    """Record state and forces of boundary `k` as a sample; `applied` (M,) are the modal forces."""
     for m in range(len(state.q)):
-        out.q[sample, m], out.v[sample, m] = state.q[m], state.v[m]
-    for j in range(len(ports.numbers)):
-        law, memory, weight = ports.values[j], state.memory[j], ports.weight[j]
+        motion.q[sample, m] = state.q[m]
+        motion.v[sample, m] = state.v[m]
+    for j in range(len(ports.law_number)):
+        law = ports.parameters[j]
+        memory = state.memory[j]
+        inverse_mass = ports.inverse_mass[j]
         force = memory[FORCE]
-        if ports.leader[j] == SPEED:
-            x, v = at_port(ports.rows, j, state.q), at_port(ports.rows, j, state.v)
-            force = speed.steady(law, x, v)
-            if memory[HELD] == 1.0:  # what it takes to hold the port
-                others = state.memory[:, FORCE]
-                force = acceleration(go, ports, j, state.q, state.v, others, push, go.time[k]) / weight
-                if law[1] == 0.0:
-                    most = speed.strength(law, x, weight) / weight
-                    force = min(max(force, -most), most)
-            memory[LAGGED] = force
-        out.port_forces[sample, j], out.lagged[sample, j] = force, memory[LAGGED]
+        if ports.leader[j] == SPEED_LAW:
+            x = port_value(ports.motion_rows, j, state.q)
+            v = port_value(ports.motion_rows, j, state.v)
+            force = speed.steady_force(law, x, v)
+            if memory[STUCK] == 1.0:
+                # the force that it takes to hold the port, as large as dry friction can be
+                forces = state.memory[:, FORCE]
+                acceleration = port_acceleration(
+                    steps, ports, j, state.q, state.v, forces, applied, steps.time[k]
+                )
+                force = acceleration / inverse_mass
+                if speed.is_dry_friction(law):
+                    limit = speed.strength(law, x, inverse_mass) / inverse_mass
+                    force = min(max(force, -limit), limit)
+            memory[LAGGED_FORCE] = force
+        motion.port_forces[sample, j] = force
+        motion.lagged_forces[sample, j] = memory[LAGGED_FORCE]

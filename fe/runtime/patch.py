@@ -1,7 +1,7 @@
-"""Primitive changes of a model: what a missing effect is made of, and the patch that carries them.
+"""Model patches: sets of primitive changes that a missing physical effect consists of.
 
 A patch is plain data. The reduced model, the full model, the FMU and the twin understand the same
-primitives; which physical effect a set of them stands for is not known here (`discrepancy.catalogue` knows).
+primitives; which physical effect a set of them stands for only `discrepancy.catalogue` knows.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -22,7 +22,7 @@ from .laws.speed import Overflow as Overflow
 from .laws.speed import PowerDamping as PowerDamping
 from .primitive import Primitive as Primitive
 from .primitive import Window as Window
-from .primitive import course_of as course_of
+from .primitive import time_formula as time_formula
 from .sensor_primitives import CHANNEL_UNIT as CHANNEL_UNIT
 from .sensor_primitives import EVERY_CHANNEL as EVERY_CHANNEL
 from .sensor_primitives import PER_RELEASE as PER_RELEASE
@@ -45,20 +45,23 @@ from .sensor_primitives import ThermalStrain as ThermalStrain
 
 
 class PointMass(Primitive):
-    """A mass [kg] on the elastic line at `station` [m] from the root (lumped model: at a named place)."""
+    """A point mass [kg] on the elastic line at `station` [m] from the root.
+
+    In a lumped model it sits at a named location.
+    """
 
     mass: Annotated[float, "kg"]
     station: Annotated[float, "m"]
 
 
 class RootCompliance(Primitive):
-    """A rotational spring in series with the root: `compliance` [rad/(N m)] about the flapping axis."""
+    """A rotational spring is in series with the root: `compliance` about the flapping axis."""
 
     compliance: Annotated[float, "rad/(N m)"]
 
 
 class LocalStiffnessLoss(Primitive):
-    """The skin between `start` and `start + length` [m] from the root keeps 1 - `loss` of its stiffness."""
+    """The skin loses `loss` of its stiffness over `length` beyond `start` [m from the root]."""
 
     loss: Annotated[float, "1"]
     start: Annotated[float, "m"]
@@ -66,88 +69,113 @@ class LocalStiffnessLoss(Primitive):
 
 
 class ModulusTemperature(Primitive):
-    """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref)), `coefficient` [1/K]."""
+    """Young's modulus falls with temperature: E (1 - `coefficient` (T - T_ref))."""
 
     coefficient: Annotated[float, "1/K"]
 
 
 class StiffnessDrift(Primitive):
-    """The whole stiffness changes with time within a record: K (1 + `rate` t), `rate` [1/s]."""
+    """The whole stiffness drifts within a record: K (1 + `rate` t), t since its start."""
 
     rate: Annotated[float, "1/s"]
 
 
 # ---------------------------------------------------------------- internal forces
-# The laws of `fe.runtime.laws` act against the motion x of a port (displacement [m] or rotation [rad]): -F on
-# x, F in N or N m. Ports of the wing: "root" (flapping rotation of the root), "tip" (upward displacement of
-# the tip's load point), "span" (upward displacement of all stations, weighted by the share of planform area;
-# the weights sum to one), "planform" (the law acts at every place on the place's own upward displacement,
-# with a force by the place's share of the area: `motion.PLANFORM`). A lumped model declares its own.
+# The laws of `fe.runtime.laws` act against the motion x of a port (displacement [m] or rotation
+# [rad]): -F on x, F in N or N m. A lumped model declares its ports. Ports of the wing:
+# - "root": flapping rotation of the root
+# - "tip": upward displacement of the tip's load point
+# - "span": mean upward displacement of all stations, weighted by planform area
+# - "planform": every station by itself; the law acts on the station's upward displacement, with a
+#   force in proportion to its fraction of the area (`motion.PLANFORM`)
 
 
 # ---------------------------------------------------------------- loads
 
 
 class LoadPlace(Primitive):
-    """Applied forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
+    """Forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
 
     along_span: Annotated[float, "m"]
     along_chord: Annotated[float, "m"]
 
 
 class LoadGain(Primitive):
-    """The force that acts is (1 + `gain`) times the recorded one plus `tare` [N], while one is applied."""
+    """While a force is applied, (1 + `gain`) times the recorded force plus `tare` [N] acts."""
 
     gain: Annotated[float, "1"]
     tare: Annotated[float, "N"]
 
 
 class Washout(Primitive):
-    """Lift in flight is l (1 - `coefficient` n eta^`exponent`), eta = y / semi-span, n the load factor."""
+    """Bending unloads the outer wing: lift in flight is l (1 - `coefficient` n eta^`exponent`).
+
+    eta is y / semi-span, n the load factor and l the lift of the model.
+    """
 
     coefficient: Annotated[float, "1"]
     exponent: Annotated[float, "1"]
 
 
 class InertiaRelief(Primitive):
-    """In flight the structure's weight times n relieves the lift by this `fraction` more than modelled."""
+    """In flight the structure's weight relieves the lift by this `fraction` more than modelled.
+
+    The weight counts with the load factor n.
+    """
 
     fraction: Annotated[float, "1"]
 
 
 class PortLoad(Primitive):
-    """A force [N or N m] that pushes a port along its motion, a formula in `time` [s] of the trial."""
+    """A `force` [N or N m] pushes a port along its motion, a formula in `time` [s] of the trial."""
 
-    in_windows: ClassVar[bool] = True
-    courses: ClassVar[tuple[str, ...]] = ("force",)
+    can_act_in_windows: ClassVar[bool] = True
+    formula_fields: ClassVar[tuple[str, ...]] = ("force",)
     port: str
     force: str
 
 
 STRUCTURE = (PointMass, RootCompliance, LocalStiffnessLoss, ModulusTemperature)
-"""Primitives that change the linear structure: it is solved anew."""
+"""Primitives that change the linear structure, which must be solved anew."""
 INTERNAL_FORCES = (*LAWS, StiffnessDrift)
 """Primitives that act as forces inside the structure while it moves."""
 LOADS = (LoadPlace, LoadGain, Washout, InertiaRelief)
-"""Primitives that change the loads that are known."""
+"""Primitives that change the known loads."""
 SENSORS = (
-    SensorGain, SensorSaturation, SensorDrift, ChannelOffset, SensorRotation, ThermalStrain, HighPass, Clock,
-    LoggerClock, Line, DecayingLine, RunOffset,
-)  # fmt: skip
+    SensorGain,
+    SensorSaturation,
+    SensorDrift,
+    ChannelOffset,
+    SensorRotation,
+    ThermalStrain,
+    HighPass,
+    Clock,
+    LoggerClock,
+    Line,
+    DecayingLine,
+    RunOffset,
+)
 """Primitives that change what is read, not what happens."""
-_EVERY: tuple[type[Primitive], ...] = (*STRUCTURE, StiffnessDrift, *LAWS, *LOADS, PortLoad, *SENSORS)
-PRIMITIVES = {primitive.kind: primitive for primitive in _EVERY}
-"""Every primitive by its kind."""
+_PRIMITIVE_TYPES: tuple[type[Primitive], ...] = (
+    *STRUCTURE,
+    StiffnessDrift,
+    *LAWS,
+    *LOADS,
+    PortLoad,
+    *SENSORS,
+)
+PRIMITIVES = {primitive_type.kind: primitive_type for primitive_type in _PRIMITIVE_TYPES}
+"""The class of every primitive by its kind."""
 
 
 @dataclass(frozen=True)
 class ModelPatch:
-    """A set of primitive changes; the empty patch is the model as it was.
+    """A set of primitive changes of a model; an empty patch changes nothing.
 
     Attributes
     ----------
     primitives : tuple of Primitive
-        The changes, applied together; sensors in the order given.
+        The changes, applied together; sensors in this order.
     """
 
     primitives: tuple[Primitive, ...] = ()
@@ -162,32 +190,44 @@ class ModelPatch:
         return ModelPatch(self.primitives + other.primitives)
 
     def in_trial(self, trial: str) -> "ModelPatch":
-        """Return what acts in a trial: no windows of other trials, and none of what acts throughout."""
+        """Return the part of the patch that acts in a trial.
+
+        A primitive keeps its windows of this trial only. It has none left where a window spans the
+        whole trial, and it drops out where all its windows lie in other trials.
+        """
         if not self.has_windows:
             return self
-        found = []
-        for item in self.primitives:
-            own = tuple(window for window in item.windows if window.trial == trial)
-            if own or not item.windows:
-                open_ended = any(window.begin is None and window.end is None for window in own)
-                found.append(replace(item, windows=() if open_ended else own))
-        return ModelPatch(tuple(found))
+        acting: list[Primitive] = []
+        for primitive in self.primitives:
+            if not primitive.windows:
+                acting.append(primitive)
+                continue
+            windows = tuple(window for window in primitive.windows if window.trial == trial)
+            if not windows:
+                continue
+            spans_trial = any(window.begin is None and window.end is None for window in windows)
+            acting.append(replace(primitive, windows=() if spans_trial else windows))
+        return ModelPatch(tuple(acting))
 
     @property
     def has_windows(self) -> bool:
         """Whether a primitive acts in windows only."""
-        return any(item.windows for item in self.primitives)
+        return any(primitive.windows for primitive in self.primitives)
 
     def of(self, *kinds: type[Primitive]) -> "ModelPatch":
-        """Return the part whose primitives are of the given classes."""
-        return ModelPatch(tuple(item for item in self.primitives if isinstance(item, kinds)))
+        """Return the part of the patch whose primitives are of the given classes."""
+        return ModelPatch(
+            tuple(primitive for primitive in self.primitives if isinstance(primitive, kinds))
+        )
 
     def without(self, *kinds: type[Primitive]) -> "ModelPatch":
-        """Return the part whose primitives are of other classes."""
-        return ModelPatch(tuple(item for item in self.primitives if not isinstance(item, kinds)))
+        """Return the part of the patch whose primitives are of no given class."""
+        return ModelPatch(
+            tuple(primitive for primitive in self.primitives if not isinstance(primitive, kinds))
+        )
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Return the primitives as plain data; `from_list` gives the patch back, equal to the last bit."""
+        """Return the primitives as plain data; `from_list` restores the patch to the last bit."""
         return [primitive.to_mapping() for primitive in self.primitives]
 
     @classmethod
@@ -199,47 +239,87 @@ class ModelPatch:
         rows : list of mapping
             Kind and values of each primitive.
         where : str
-            What is being read, for the error message.
+            The name of the source, for the error message.
 
         Raises
         ------
         InvalidPatchError
-            If a kind is unknown, a value is missing, superfluous, of the wrong type or not finite.
+            If a kind is unknown, or a value is missing, superfluous, of the wrong type or not
+            finite.
         """
         if not isinstance(rows, list):
-            raise InvalidPatchError(f"{where} must be a list of primitives, but is a {type(rows).__name__}.")
-        return cls(tuple(_primitive(row, f"{where}, primitive {n}") for n, row in enumerate(rows, start=1)))
+            raise InvalidPatchError(
+                f"{where} must be a list of primitives, but is a {type(rows).__name__}."
+            )
+        return cls(
+            tuple(
+                _primitive_from_row(row, f"{where}, primitive {number}")
+                for number, row in enumerate(rows, start=1)
+            )
+        )
 
 
-_ACCEPTED: dict[type, tuple[type, ...]] = {float: (float, int), int: (int,), str: (str,)}
-_WINDOW = {"trial": str, "begin": float, "end": float}
+_ACCEPTED_TYPES: dict[type, tuple[type, ...]] = {float: (float, int), int: (int,), str: (str,)}
+"""Types in a file that stand for a value's type."""
+_WINDOW_TYPES: dict[str, type] = {"trial": str, "begin": float, "end": float}
 
 
-def _values(row: Mapping[Any, Any], types: Mapping[str, Any], needed: Iterable[str], where: str) -> Any:
-    """Return the values of a row of a file by name, each of its type."""
+def _primitive_from_row(row: object, where: str) -> Primitive:
+    """Return the primitive of a row of a file; raises `InvalidPatchError` as `from_list` does."""
+    kind = row.get("kind") if isinstance(row, Mapping) else row
+    if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
+        raise InvalidPatchError(
+            f"{where} has the kind {kind!r}, but known are {', '.join(PRIMITIVES)}."
+        )
+    primitive_type = PRIMITIVES[kind]
+    values = {name: value for name, value in row.items() if name not in ("kind", "windows")}
+    required = [item.name for item in fields(primitive_type) if item.default is MISSING]
+    return primitive_type(
+        **_checked_values(values, primitive_type.value_types(), required, where),
+        windows=_windows_from_rows(row.get("windows", ()), where),
+    )
+
+
+def _windows_from_rows(rows: object, where: str) -> tuple[Window, ...]:
+    """Return the windows of a primitive from a file; raises `InvalidPatchError`."""
+    if not isinstance(rows, list | tuple) or not all(isinstance(row, Mapping) for row in rows):
+        raise InvalidPatchError(f"{where}: windows must be a list of tables, but is {rows!r}.")
+    windows = []
+    for row in rows:
+        limits = {name: value for name, value in row.items() if value is not None}
+        values = _checked_values(limits, _WINDOW_TYPES, ["trial"], f"{where}, a window")
+        windows.append(Window(**values))
+    return tuple(windows)
+
+
+def _checked_values(
+    row: Mapping[str, object], types: Mapping[str, type], required: Iterable[str], where: str
+) -> dict[str, Any]:
+    """Return the values of a row of a file, each converted to its type.
+
+    Parameters
+    ----------
+    row : mapping of str to object
+        The values as read.
+    types : mapping of str to type
+        The type of every value that the row may have.
+    required : iterable of str
+        Names of the values that the row must have.
+    where : str
+        The name of the row, for the error message.
+
+    Raises
+    ------
+    InvalidPatchError
+        If a value is missing, superfluous or of another type.
+    """
     for name, value in row.items():
         if name not in types:
             raise InvalidPatchError(f"{where} has no value {name!r}; it has {', '.join(types)}.")
-        if isinstance(value, bool) or not isinstance(value, _ACCEPTED[types[name]]):
-            wanted = "text" if types[name] is str else "a number"
-            raise InvalidPatchError(f"{where}: {name} must be {wanted}, but is {value!r}.")
-    missing = [name for name in needed if name not in row]
+        if isinstance(value, bool) or not isinstance(value, _ACCEPTED_TYPES[types[name]]):
+            type_name = "text" if types[name] is str else "a number"
+            raise InvalidPatchError(f"{where}: {name} must be {type_name}, but is {value!r}.")
+    missing = [name for name in required if name not in row]
     if missing:
         raise InvalidPatchError(f"{where} lacks {', '.join(missing)}.")
     return {name: types[name](value) for name, value in row.items()}
-
-
-def _primitive(row: object, where: str) -> Primitive:
-    kind = row.get("kind") if isinstance(row, Mapping) else row
-    if not isinstance(row, Mapping) or not isinstance(kind, str) or kind not in PRIMITIVES:
-        raise InvalidPatchError(f"{where} has the kind {kind!r}, but known are {', '.join(PRIMITIVES)}.")
-    primitive, windows = PRIMITIVES[kind], row.get("windows", ())
-    if not isinstance(windows, list | tuple) or not all(isinstance(window, Mapping) for window in windows):
-        raise InvalidPatchError(f"{where}: windows must be a list of tables, but is {windows!r}.")
-    types, own = primitive.values(), {name: row[name] for name in row if name not in ("kind", "windows")}
-    needed = [item.name for item in fields(primitive) if item.default is MISSING]
-    spans = ({name: value for name, value in window.items() if value is not None} for window in windows)
-    return primitive(
-        **_values(own, types, needed, where),
-        windows=tuple(Window(**_values(span, _WINDOW, ["trial"], f"{where}, a window")) for span in spans),
-    )

@@ -5,39 +5,65 @@ NumPy and relative imports only: this file is copied into the FMU. The arrays ar
 """
 
 from collections.abc import Callable
-from functools import cached_property, partial
+from functools import cached_property
 from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
 
 from .arrays import FloatArray
+from .dense_matrices import lowest_modes
 from .errors import InvalidPatchError
-from .motion import STATION_PORTS, laws_of
 from .patch import LOADS, LoadGain, ModelPatch, ModulusTemperature, PointMass, RootCompliance
-from .reduced import lowest_modes
+from .port_laws import STATION_PORTS, port_laws
+from .skin_losses import remaining_skin
 from .state import Losses
-from .wing_rows import EMPTY, LOAD_PLACE, WingRows, remaining_skin
+from .wing_rows import NO_PATCH, STATIC_TEST_LOAD, WingRows
 
 ITERATIONS = 3
 """Steps of the subspace iteration for the modes of a patched wing."""
-HELD = 1e-7
-"""Part of a static shape, relative to it, below which a basis of motion holds it already."""
+NEGLIGIBLE_REMAINDER = 1e-7
+"""Size of what a basis leaves out of a static shape, relative to the shape, below which it is
+held."""
+MODE_COUNT = 6
+"""Number of modes that move."""
+HOLDING_LOAD = 3
+"""Number of the load that holds the wing before a release."""
+
+Solver = Callable[[FloatArray], FloatArray]
+"""K^-1 of loads (n,) or (n, k)."""
 
 
-Factorised = Callable[[FloatArray], Callable[[FloatArray], FloatArray]]
+class PatchedModes(NamedTuple):
+    """First M undamped modes of a patched wing.
 
-
-class Modes(NamedTuple):
-    """Modes that move: frequencies (M,) [Hz], shapes (n, M), displacements to modal coordinates (M, n)."""
+    Attributes
+    ----------
+    frequency : (M,) array
+        Natural frequencies [Hz].
+    shapes : (n, M) array
+        Mass-normalised shapes; the tip moves up in each.
+    projection : (M, n) array
+        Modal coordinates of a displacement.
+    """
 
     frequency: FloatArray
     shapes: FloatArray
-    to_modes: FloatArray
+    projection: FloatArray
+
+
+def solver_by_inverse(stiffness: FloatArray) -> Solver:
+    """Return the solver of a stiffness (n, n) by its inverse: NumPy has no Cholesky solution."""
+    inverse = np.linalg.inv(stiffness)
+
+    def solve(loads: FloatArray) -> FloatArray:
+        return np.asarray(inverse @ loads)
+
+    return solve
 
 
 def motion_basis(
-    static: Callable[[FloatArray], FloatArray], mass: FloatArray, start: FloatArray, solutions: FloatArray
+    static: Solver, mass: FloatArray, start: FloatArray, static_shapes: FloatArray
 ) -> FloatArray:
     """Return a basis of the first modes of a structure, by subspace iteration.
 
@@ -45,34 +71,35 @@ def motion_basis(
     ----------
     static : callable
         K^-1 of loads (n, k).
-    mass : (n, n) ndarray
+    mass : (n, n) array
         M.
-    start : (n, r) ndarray
-        Modes of a structure near by.
-    solutions : (n, s) ndarray
-        Static shapes that the basis is to hold as well.
+    start : (n, r) array
+        Modes of a similar structure.
+    static_shapes : (n, s) array
+        Static shapes that the basis holds as well.
 
     Returns
     -------
-    (n, r + s) ndarray
-        Orthonormal; fewer where the modes or other shapes hold a static shape already.
+    (n, r + s) array
+        Orthonormal columns; fewer where the modes, or other shapes, hold a static shape already.
     """
     basis = start
     for _ in range(ITERATIONS):
         basis = np.linalg.qr(static(mass @ basis))[0]
-    for shape in (solutions / np.linalg.norm(solutions, axis=0)).T:
-        # a static shape is held already but for a small part: two passes
-        rest = shape - basis @ (basis.T @ shape)
-        rest = rest - basis @ (basis.T @ rest)
-        size = float(np.linalg.norm(rest))
-        # what is held already, or given twice, would add a direction of rounding
-        if size > HELD:
-            basis = np.concatenate((basis, rest[:, np.newaxis] / size), axis=1)
+    for shape in (static_shapes / np.linalg.norm(static_shapes, axis=0)).T:
+        # Gram and Schmidt in two passes, because the basis holds the shape but for a small
+        # remainder
+        remainder = shape - basis @ (basis.T @ shape)
+        remainder = remainder - basis @ (basis.T @ remainder)
+        size = float(np.linalg.norm(remainder))
+        # a shape that is held already, or given twice, would add a direction of rounding
+        if size > NEGLIGIBLE_REMAINDER:
+            basis = np.concatenate((basis, remainder[:, np.newaxis] / size), axis=1)
     return np.asarray(basis)
 
 
 class PatchedWing(WingRows):
-    """The wing in a basis that holds the changes of `fe.runtime.patch`.
+    """The wing in a basis that can hold the changes of `fe.runtime.patch`.
 
     Parameters
     ----------
@@ -81,171 +108,264 @@ class PatchedWing(WingRows):
 
     Attributes
     ----------
-    factorised : callable
-        From a stiffness (n, n) to what gives K^-1 loads. By its inverse, as NumPy has no Cholesky solution;
-        where SciPy is at hand another one takes a tenth of the time.
+    solver : callable
+        Function that returns the `Solver` of a stiffness (n, n). Where SciPy is available, a
+        Cholesky solution takes a tenth of the time of the inverse.
     """
 
-    factorised: Factorised = staticmethod(lambda stiffness: partial(np.matmul, np.linalg.inv(stiffness)))
+    solver: Callable[[FloatArray], Solver] = staticmethod(solver_by_inverse)
 
-    def mass(self, servo_mass: float, pitot_mass: float, patch: ModelPatch = EMPTY) -> FloatArray:
+    def mass(
+        self, servo_mass: float, pitot_mass: float, patch: ModelPatch = NO_PATCH
+    ) -> FloatArray:
         """Return the mass (n, n) with the point masses of a patch [kg].
+
+        Parameters
+        ----------
+        servo_mass, pitot_mass : float
+            Mass of each servo and of the pitot tube [kg].
+        patch : ModelPatch
+            The patch whose point masses act.
 
         Raises
         ------
         InvalidPatchError
-            If a place lies off the wing.
+            If a point mass lies off the wing.
         """
         arrays = self.arrays
         mass = arrays.mass[0] + servo_mass * arrays.mass[1] + pitot_mass * arrays.mass[2]
-        for item in patch:
-            if isinstance(item, PointMass):
-                for row in self._along(item.station) @ arrays.line_rows[:3]:
-                    mass += item.mass * np.multiply.outer(row, row)
+        for primitive in patch:
+            if isinstance(primitive, PointMass):
+                rows = self._station_weights(primitive.station) @ arrays.line_rows[:3]
+                for row in rows:
+                    mass += primitive.mass * np.multiply.outer(row, row)
         return np.asarray(mass)
 
     def stiffness(
         self,
         young_modulus_factor: float,
         stiffness_loss: Losses,
-        patch: ModelPatch = EMPTY,
+        patch: ModelPatch = NO_PATCH,
         temperature_difference: float = 0.0,
     ) -> FloatArray:
-        """Return the stiffness (n, n) at a state under a patch; primitives of other kinds are passed over.
+        """Return the stiffness (n, n) at a state under a patch.
 
         Parameters
         ----------
         young_modulus_factor, stiffness_loss
-            As of `fe.runtime.state.DigitalState`.
+            Modulus factor and losses, see `fe.runtime.state.DigitalState`.
         patch : ModelPatch
-            Its root compliances, local losses and temperature coefficients act.
+            The patch whose root compliances, local losses and temperature coefficients act.
         temperature_difference : float
-            Temperature less the reference temperature [K].
+            Temperature minus the reference temperature [K].
 
         Raises
         ------
         InvalidPatchError
             If a change leaves no stiffness.
         """
-        arrays, e = self.arrays, young_modulus_factor
-        compliance = 0.0
-        for item in patch:
-            if isinstance(item, ModulusTemperature):
-                e = e * (1.0 - item.coefficient * temperature_difference)
-            elif isinstance(item, RootCompliance):
-                compliance += item.compliance
-        theta = np.array((e, *(1.0 - z for z in arrays.losses(stiffness_loss)), 1.0))
-        if not (isfinite(e) and theta.min() > 0.0):
+        factor = young_modulus_factor
+        for primitive in patch:
+            if isinstance(primitive, ModulusTemperature):
+                factor = factor * (1.0 - primitive.coefficient * temperature_difference)
+        healthy = [1.0 - loss for loss in self.arrays.losses(stiffness_loss)]
+        theta = np.array([factor, *healthy, 1.0])
+        if not (isfinite(factor) and theta.min() > 0.0):
             raise InvalidPatchError(
-                f"The factors on the stiffness of skin and damage regions must be positive, but are "
-                f"{', '.join(f'{factor:g}' for factor in theta[:-1])}; lessen the losses or the coefficient."
+                "The factors on the stiffness of skin and damage regions must be positive, but are "
+                f"{', '.join(f'{value:g}' for value in theta[:-1])}; lessen the losses or the "
+                "coefficient."
             )
-        stiffness = np.tensordot(theta, arrays.stiffness, 1)
-        if compliance != 0.0:
-            flexibility = 1.0 / arrays.flap_spring + compliance
-            if flexibility <= 0.0:
-                raise InvalidPatchError(
-                    f"The root's compliance of {1.0 / arrays.flap_spring:g} rad/(N m) cannot be reduced by "
-                    f"{-compliance:g}; give a compliance above {-1.0 / arrays.flap_spring:g}."
-                )
-            spring = 1.0 / flexibility - arrays.flap_spring
-            stiffness += spring * np.multiply.outer(arrays.flap_row, arrays.flap_row)
-        skin = remaining_skin(patch, arrays.strip_lines)
-        if skin is not None:
-            weights = (skin.of_strips[arrays.strip_of] - 1.0) * theta[arrays.term_of]
-            changed = np.flatnonzero(weights)
-            lower = np.zeros_like(stiffness)
-            lower[np.tril_indices(self.size)] = weights[changed] @ arrays.strip_stiffness[changed]
-            stiffness += lower + np.tril(lower, -1).T
+        stiffness = np.tensordot(theta, self.arrays.stiffness, 1)
+        self._add_root_compliance(stiffness, patch)
+        self._add_local_losses(stiffness, patch, theta)
         return np.asarray(stiffness)
 
-    def at(
-        self, vector: FloatArray, patch: ModelPatch = EMPTY, temperature_difference: float = 0.0
-    ) -> "PatchedState":
-        """Return the wing at all that can be chosen, (V,), under a patch; see `stiffness` and `mass`.
+    def _add_root_compliance(self, stiffness: FloatArray, patch: ModelPatch) -> None:
+        """Put the root compliances of a patch in series with the spring at the root, in place.
+
+        Raises `InvalidPatchError` where they leave no spring.
+        """
+        spring = self.arrays.flap_spring
+        compliance = sum(
+            (primitive.compliance for primitive in patch if isinstance(primitive, RootCompliance)),
+            0.0,
+        )
+        if compliance == 0.0:
+            return
+        flexibility = 1.0 / spring + compliance
+        if flexibility <= 0.0:
+            raise InvalidPatchError(
+                f"The root's compliance of {1.0 / spring:g} rad/(N m) cannot be reduced by "
+                f"{-compliance:g}; give a compliance above {-1.0 / spring:g}."
+            )
+        change = 1.0 / flexibility - spring
+        stiffness += change * np.multiply.outer(self.arrays.flap_row, self.arrays.flap_row)
+
+    def _add_local_losses(
+        self, stiffness: FloatArray, patch: ModelPatch, theta: FloatArray
+    ) -> None:
+        """Take the local losses of a patch, smeared over strips, from a stiffness (n, n) in place.
+
+        `theta` (K + 2,) are the coefficients of the stiffness terms.
+        """
+        arrays = self.arrays
+        skin = remaining_skin(patch, arrays.strip_lines)
+        if skin is None:
+            return
+        changes = (skin.by_strip[arrays.strip_of] - 1.0) * theta[arrays.term_of]
+        changed = np.flatnonzero(changes)
+        lower = np.zeros_like(stiffness)
+        lower[np.tril_indices(self.size)] = changes[changed] @ arrays.strip_stiffness[changed]
+        stiffness += lower + np.tril(lower, -1).T
+
+    def structure_at(
+        self,
+        vector: FloatArray,
+        patch: ModelPatch = NO_PATCH,
+        temperature_difference: float = 0.0,
+    ) -> "PatchedStructure":
+        """Return the wing at inputs under a patch, for `fe.runtime.transient.ModalIntegrator`.
+
+        Parameters
+        ----------
+        vector : (V,) array
+            Values of all inputs, in the order of `fe.runtime.state.wing_input_names`; those of the
+            controls do not matter.
+        patch : ModelPatch
+            The patch.
+        temperature_difference : float
+            Temperature minus the reference temperature [K].
 
         Raises
         ------
         InvalidPatchError
             If the wing cannot carry the patch.
         """
-        e, *losses, servo, pitot = vector[:-2].tolist()
-        stiffness = self.stiffness(e, tuple(losses), patch, temperature_difference)
-        return PatchedState(self, stiffness, self.mass(servo, pitot, patch), patch)
+        factor, *losses, servo_mass, pitot_mass = vector[:-2].tolist()
+        return PatchedStructure(
+            wing=self,
+            stiffness=self.stiffness(factor, tuple(losses), patch, temperature_difference),
+            mass=self.mass(servo_mass, pitot_mass, patch),
+            patch=patch,
+        )
 
 
-class PatchedState:
-    """The wing in one state and under one patch, as `fe.runtime.transient` takes it.
+class PatchedStructure:
+    """The wing in one state and under one patch, as a `StructureInMotion` in n coordinates.
 
-    The loads are load factor, its square, the force at the load point as the patch has it, and one at the
-    load point itself, which holds the wing before a release. Outputs are the gauges and the tip.
+    Its loads are the load factor, its square, the force at the load point as the patch moves it,
+    and a force at the load point itself, which holds the wing before a release. Its outputs are the
+    gauges and the tip.
+
+    Parameters
+    ----------
+    wing : PatchedWing
+        The wing.
+    stiffness, mass : (n, n) array
+        Its matrices in this state and under this patch.
+    patch : ModelPatch
+        The patch.
 
     Attributes
     ----------
-    stiffness, mass : (n, n) ndarray
-        In the basis of the wing's arrays.
-    components : (2, G, n) ndarray
-        Rows of the strains across the gauges, and of shear.
+    stiffness, mass : (n, n) array
+        The matrices.
+    laws : PortLaws
+        The laws of the patch at the ports of the wing.
     """
 
-    holding, mode_count, on_modes = 3, 6, frozenset(STATION_PORTS)
-    """Number of the load that holds the wing before a release; modes that move, whose frequencies the FMU
-    shows; ports whose position in motion is that of the modes alone: beyond the modes, neighbouring stations
-    move one another half as much as themselves, which a flexibility of each port by itself does not hold."""
+    holding_load = HOLDING_LOAD
+    mode_count = MODE_COUNT
+    # Beyond the modes neighbouring stations move one another half as much as themselves, which a
+    # residual flexibility of each port by itself cannot represent.
+    rigid_ports = frozenset(STATION_PORTS)
 
-    def __init__(self, wing: PatchedWing, stiffness: FloatArray, mass: FloatArray, patch: ModelPatch) -> None:
-        self._arrays = arrays = wing.arrays
-        self._gains = [item for item in patch if isinstance(item, LoadGain)]
-        self.stiffness, self.mass, self._factorised = stiffness, mass, wing.factorised
-        self.laws = laws_of(wing.internal_forces(patch), wing.port_rows)
-        self._held = wing.held
-        force = wing.force_row(LOAD_PLACE, patch.of(*LOADS))
-        ports = self.laws.rows(wing.port_rows, wing.size)
-        parts = wing.load_parts(patch.of(*LOADS, PointMass))
-        self.loads = np.vstack((parts, force, arrays.load_tip, ports)).T
-        factors, strains = wing.strain_factors(patch), arrays.strain_rows
+    def __init__(
+        self, wing: PatchedWing, stiffness: FloatArray, mass: FloatArray, patch: ModelPatch
+    ) -> None:
+        arrays = wing.arrays
+        self.stiffness = stiffness
+        self.mass = mass
+        self._solver = wing.solver
+        self._start_shapes = arrays.start_shapes
+        self._tip_row = arrays.tip_row
+        self._static_shape_rows = wing.static_shape_rows
+        self._load_gains = [primitive for primitive in patch if isinstance(primitive, LoadGain)]
+        # loads, and laws at ports
+        self.laws = port_laws(wing.internal_forces(patch), wing.port_rows)
+        self.unit_loads = np.vstack(
+            (
+                wing.manoeuvre_loads(patch.of(*LOADS, PointMass)),
+                wing.force_row(STATIC_TEST_LOAD, patch.of(*LOADS)),
+                arrays.load_tip,
+                self.laws.port_rows(wing.port_rows, wing.size),
+            )
+        ).T
+        # outputs
+        strains = arrays.strain_rows
+        factors = wing.strain_factors(patch)
         if factors is not None:
             strains = factors[:, np.newaxis] * strains
-        self.outputs, self.components = np.vstack((strains[0], arrays.tip_row)), strains[1:]
-        self.accelerations = np.zeros((0, wing.size))
+        self.output_rows = np.vstack((strains[0], arrays.tip_row))
+        self.strain_component_rows = strains[1:]
+        self.acceleration_rows = np.zeros((0, wing.size))
 
-    def acting(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients (4,) of the loads."""
+    def load_coefficients(self, vector: FloatArray) -> FloatArray:
+        """Return the coefficients (4,) of the loads at inputs (V,) of the wing."""
         load_factor, tip_force = vector[-2:].tolist()
         force = tip_force
-        for item in self._gains:
-            force = (1.0 + item.gain) * force + (item.tare if tip_force != 0.0 else 0.0)
+        for load_gain in self._load_gains:
+            tare = load_gain.tare if tip_force != 0.0 else 0.0
+            force = (1.0 + load_gain.gain) * force + tare
         return np.array((load_factor, load_factor**2, force, 0.0))
 
     @cached_property
-    def _solve(self) -> Callable[[FloatArray], FloatArray]:
-        return self._factorised(self.stiffness)
+    def _solve(self) -> Solver:
+        return self._solver(self.stiffness)
 
     def static(self, loads: FloatArray) -> FloatArray:
         """Return the displacements K^-1 f of loads (n,) or (n, k)."""
         return np.asarray(self._solve(loads))
 
     @cached_property
-    def answers(self) -> FloatArray:
+    def unit_responses(self) -> FloatArray:
         """Displacements (n, 4 + J) at rest under the unit loads."""
-        return self.static(self.loads)
+        return self.static(self.unit_loads)
 
-    def lowest(self, count: int, held: FloatArray | None = None) -> Modes:
-        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16); the tip moves up in each of them.
+    def lowest_modes(self, count: int, static_shape_rows: FloatArray | None = None) -> PatchedModes:
+        """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
 
-        The basis that they are found in holds the static shapes of the rows `held` (s, n) as well.
+        Parameters
+        ----------
+        count : int
+            Number of modes.
+        static_shape_rows : (s, n) array, optional
+            Loads as rows, whose static shapes the basis of the modes holds as well.
         """
-        solutions = np.zeros((len(self.mass), 0)) if held is None else self.static(held.T)
-        basis = motion_basis(self.static, self.mass, self._arrays.start_shapes, solutions)
-        frequency, own = lowest_modes(basis.T @ self.stiffness @ basis, basis.T @ self.mass @ basis, count)
-        shapes = basis @ own
-        shapes = shapes * np.where(self._arrays.tip_row @ shapes < 0.0, -1.0, 1.0)
-        return Modes(frequency, shapes, shapes.T @ self.mass)
+        if static_shape_rows is None:
+            static_shapes = np.zeros((len(self.mass), 0))
+        else:
+            static_shapes = self.static(static_shape_rows.T)
+        basis = motion_basis(self.static, self.mass, self._start_shapes, static_shapes)
+        frequency, coordinates = lowest_modes(
+            basis.T @ self.stiffness @ basis, basis.T @ self.mass @ basis, count
+        )
+        shapes = basis @ coordinates
+        shapes = shapes * np.where(self._tip_row @ shapes < 0.0, -1.0, 1.0)
+        return PatchedModes(frequency, shapes, projection=shapes.T @ self.mass)
 
     @cached_property
-    def modes(self) -> Modes:
+    def modes(self) -> PatchedModes:
         """The modes that move."""
-        return self.lowest(self.mode_count, self._held)
+        return self.lowest_modes(MODE_COUNT, self._static_shape_rows)
 
-    shapes = property(lambda self: self.modes.shapes, doc="Their shapes (n, M).")
-    to_modes = property(lambda self: self.modes.to_modes, doc="Modal coordinates (M, n) of a displacement.")
+    @property
+    def mode_shapes(self) -> FloatArray:
+        """Shapes (n, M) of the modes that move."""
+        return self.modes.shapes
+
+    @property
+    def modal_projection(self) -> FloatArray:
+        """Modal coordinates (M, n) of a displacement."""
+        return self.modes.projection

@@ -1,4 +1,4 @@
-"""What every primitive change of a model has in common.
+"""The base class of all primitive changes of a model, and the time windows in which one acts.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -17,7 +17,10 @@ from .expression import Expression
 
 
 class Window(NamedTuple):
-    """A stretch of one trial, in its time [s]: from `begin` (None: from the first sample on) to `end`."""
+    """A stretch of one trial, from `begin` to `end` in the trial's time [s].
+
+    Without a begin it starts with the first sample; without an end it lasts to the last one.
+    """
 
     trial: str
     begin: float | None = None
@@ -25,34 +28,52 @@ class Window(NamedTuple):
 
     @property
     def span(self) -> tuple[float, float]:
-        """Begin and end, infinite where it is open."""
-        return -inf if self.begin is None else self.begin, inf if self.end is None else self.end
+        """Begin and end [s], infinite where the window is open."""
+        begin = -inf if self.begin is None else self.begin
+        end = inf if self.end is None else self.end
+        return begin, end
 
 
-def course_of(text: str, kind: str) -> Expression:
-    """Return a formula in `time`; raises `InvalidPatchError`."""
+def time_formula(text: str, kind: str) -> Expression:
+    """Return a formula in `time` and `pi` of a primitive of a kind.
+
+    Raises
+    ------
+    InvalidPatchError
+        If the text is not such a formula.
+    """
     return Expression(text, ("time", "pi"), f"The formula of the primitive {kind!r}")
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(field,))
 @dataclass(frozen=True)
 class Primitive:
-    """One primitive change; `kind` names its class in a file. All values SI; zero magnitude is no change.
+    """One primitive change of a model, such as a point mass, a law at a port or a sensor's gain.
 
-    A class of primitives is a frozen record of its annotated values, without a decorator of its own.
+    A subclass is a frozen record of its annotated values, without a decorator of its own. All
+    values are in SI units; a primitive whose magnitude is zero changes nothing.
 
-    With `windows` it acts within these only, and in no trial that they do not name; without, always.
+    Attributes
+    ----------
+    windows : tuple of Window
+        The primitive acts within these only, and in no trial that they do not name; without
+        windows it acts always.
+
+    Raises
+    ------
+    InvalidPatchError
+        If a number is not finite, a formula is invalid, or a window is empty or not possible.
     """
 
     kind: ClassVar[str]
-    """Name of the class in a file: its own name in lower case, words apart by underscores."""
+    """Name of the class in a file: the class name in lower case, words apart by underscores."""
     units: ClassVar[dict[str, str]] = {}
-    """Unit of each real number, which its type is annotated with; at a port, "of one that is displaced or one
-    that turns"."""
-    in_windows: ClassVar[bool] = False
-    """Whether it can act in windows only."""
-    courses: ClassVar[tuple[str, ...]] = ()
-    """Which of its texts are formulas in `time`."""
+    """Unit of each real number, from the annotation of its type. At a port "N or N m" and the like:
+    the unit for a port that is displaced, then the unit for one that turns."""
+    can_act_in_windows: ClassVar[bool] = False
+    """Whether the primitive can act in windows only."""
+    formula_fields: ClassVar[tuple[str, ...]] = ()
+    """Names of the texts that are formulas in `time`."""
 
     windows: tuple[Window, ...] = field(default=(), kw_only=True)
 
@@ -60,47 +81,60 @@ class Primitive:
         dataclass(frozen=True)(cls)
         if "kind" not in cls.__dict__:
             cls.kind = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
-        hints = get_annotations(cls).items()
-        cls.units = {name: hint.__metadata__[0] for name, hint in hints if hasattr(hint, "__metadata__")}
+        cls.units = {
+            name: hint.__metadata__[0]
+            for name, hint in get_annotations(cls).items()
+            if hasattr(hint, "__metadata__")
+        }
 
     def __post_init__(self) -> None:
-        if self.windows and not self.in_windows:
-            raise InvalidPatchError(f"The primitive {self.kind!r} cannot act in a window only.")
-        for window in self.windows:
-            if not window.span[0] < window.span[1] or not all(
-                value is None or isfinite(value) for value in window[1:]
-            ):
-                raise InvalidPatchError(
-                    f"A window of the primitive {self.kind!r} must begin before it ends, but that in "
-                    f"{window.trial!r} goes from {window.begin} s to {window.end} s."
-                )
+        self._check_windows()
         for item in fields(self):
             value = getattr(self, item.name)
-            if isinstance(value, float | int) and not isinstance(value, bool) and not isfinite(value):
+            is_number = isinstance(value, float | int) and not isinstance(value, bool)
+            if is_number and not isfinite(value):
                 raise InvalidPatchError(
                     f"{item.name} of the primitive {self.kind!r} must be finite, but is {value!r}."
                 )
-        for name in self.courses:
-            course_of(getattr(self, name), self.kind)
+        for name in self.formula_fields:
+            time_formula(getattr(self, name), self.kind)
 
-    def acts(self, time: FloatArray) -> BoolArray:
-        """Return whether it acts at times (N,); its windows are those of their trial."""
-        inside = np.full(len(time), not self.windows)
-        for begin, end in (window.span for window in self.windows):
-            inside |= (begin <= time) & (time < end)
-        return inside
+    def _check_windows(self) -> None:
+        """Raise `InvalidPatchError` for windows where there can be none, or an empty window."""
+        if self.windows and not self.can_act_in_windows:
+            raise InvalidPatchError(f"The primitive {self.kind!r} cannot act in a window only.")
+        for window in self.windows:
+            begin, end = window.span
+            limits = [limit for limit in (window.begin, window.end) if limit is not None]
+            if not begin < end or not all(map(isfinite, limits)):
+                raise InvalidPatchError(
+                    f"A window of the primitive {self.kind!r} must begin before it ends, but that "
+                    f"in {window.trial!r} goes from {window.begin} s to {window.end} s."
+                )
+
+    def acts_at(self, time: FloatArray) -> BoolArray:
+        """Return whether the primitive acts at times (N,) [s] of the trial of its windows."""
+        acts = np.full(len(time), not self.windows)
+        for window in self.windows:
+            begin, end = window.span
+            acts |= (begin <= time) & (time < end)
+        return acts
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return kind and values as plain data."""
+        """Return the kind and the values as plain data, for a file."""
         values = asdict(self)
         windows = [window._asdict() for window in values.pop("windows")]
-        return {"kind": self.kind, **values, **({"windows": windows} if windows else {})}
+        mapping = {"kind": self.kind, **values}
+        if windows:
+            mapping["windows"] = windows
+        return mapping
 
     @classmethod
-    def values(cls) -> dict[str, Any]:
-        """Return the types of its values by name, all but `windows`."""
-        return {
-            item.name: getattr(item.type, "__origin__", item.type)
-            for item in fields(cls)
-            if item.name != "windows"
-        }
+    def value_types(cls) -> dict[str, type]:
+        """Return the type of each value by its name, without the windows."""
+        types: dict[str, type] = {}
+        for item in fields(cls):
+            annotation: Any = item.type
+            if item.name != "windows":
+                types[item.name] = getattr(annotation, "__origin__", annotation)
+        return types

@@ -1,7 +1,8 @@
-"""The reduced model of a structure, as a wing is one: everything that is evaluated online, with NumPy alone.
+"""The reduced model of a structure: its statics with error bounds, its modes, and its motion.
 
-NumPy and relative imports only: this file is copied into the FMU. The equations are in
-`docs/reduced_model.md`, the offline part is `fe.reduction.reduced_basis`.
+Everything here is evaluated online, with NumPy alone. The equations are in `docs/reduced_model.md`;
+`fe.reduction.reduced_basis` makes reduced models. NumPy and relative imports only: this file is
+copied into the FMU.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,161 +15,113 @@ import numpy.typing as npt
 from numpy.linalg import solve
 
 from .arrays import FloatArray, IntArray
+from .dense_matrices import dense_sum, lowest_modes
 from .errors import OutsideModelError
-from .reduced_arrays import OnlineArrays, ReducedArrays
-from .state import GivenLosses
+from .reduced_arrays import CertifiedSolver, ReducedArrays
+from .reduced_results import ReducedModes, ReducedResponse
+from .state import TIP_FORCE, LossValues
 
-Values = Mapping[str, float] | FloatArray
-"""What is chosen: by name, or all of it (V,) in the order of `ReducedArrays.chosen`."""
-
-
-def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
-    """Return the sum of coefficients (T,) times dense terms (T, n, m)."""
-    return np.asarray((coefficients @ terms.reshape(len(terms), -1)).reshape(terms.shape[1:]))
+InputValues = Mapping[str, float] | FloatArray
+"""Values of a model's inputs: some by name, or all (V,) in the order of
+`ReducedArrays.input_names`."""
 
 
-def lowest_modes(stiffness: FloatArray, mass: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest frequencies (M,) [Hz] and mass-normalised shapes (n, M) of dense matrices (n, n)."""
-    # M x = K x / omega^2: the stiffness is well conditioned in a basis of modes, the mass is not, and the low
-    # modes are the largest eigenvalues, which keep all their digits.
-    to_standard = np.linalg.inv(np.linalg.cholesky(stiffness))
-    inverse_square, vectors = np.linalg.eigh(to_standard @ mass @ to_standard.T)
-    root = np.sqrt(inverse_square[::-1][:count])
-    return 1.0 / (2.0 * np.pi * root), to_standard.T @ vectors[:, ::-1][:, :count] / root
+class ReducedStructure:
+    """A reduced structure at fixed inputs, as a `StructureInMotion` in Nm + N coordinates.
 
+    The first Nm coordinates belong to the modal basis, the others to the static basis. Motion
+    happens in the modal basis; the static basis holds what the modes leave out, and is solved by
+    itself.
 
-@dataclass(frozen=True, slots=True)
-class StaticResponse:
-    """Static response of a structure.
-
-    Attributes
+    Parameters
     ----------
-    strain : (G,) ndarray
-        Gauge strains, dimensionless; of a wing positive where the upper skin is compressed.
-    displacement : (D,) ndarray
-        Displacement outputs [m]; of a wing that of the tip, upwards.
-    strain_error_bound, displacement_error_bound : float
-        Certified: no gauge, and no displacement output, of the full model differs by more than this.
-    coordinates : (N,) ndarray
-        Coefficients of the static basis vectors, from which a field can be reconstructed.
-    """
-
-    strain: FloatArray
-    displacement: FloatArray
-    strain_error_bound: float
-    displacement_error_bound: float
-    coordinates: FloatArray
-
-    @property
-    def bounded(self) -> tuple[tuple[FloatArray, float], ...]:
-        """Strains and displacements, each with their bound."""
-        return (self.strain, self.strain_error_bound), (self.displacement, self.displacement_error_bound)
-
-
-@dataclass(frozen=True, slots=True)
-class Modes:
-    """First undamped eigenmodes of a structure, in ascending frequency, Kapteyn et al. 2021, eq. (16).
-
-    Attributes
-    ----------
-    frequency : (M,) ndarray
-        Natural frequencies [Hz].
-    shape : (Nm, M) ndarray
-        Coefficients of the modal basis vectors; mass-normalised, the last output of a mode is positive.
-    output : (O, M) ndarray
-        Gauges, displacements and accelerations (as displacements) per unit of modal coordinate.
-    participation : (L, M) ndarray
-        Modal force of each load [N kg^-1/2].
-    mass : (Nm, Nm) ndarray
-        The mass in the modal basis [kg].
-    followed : tuple of int
-        The mode that is most like each of the shapes that are followed; of a wing those of the first and
-        second flapwise bending, found by their shape, never by their rank.
-    followed_mac : tuple of float
-        Modal assurance criterion (mass-weighted) of these modes against the shapes.
-    """
-
-    frequency: FloatArray
-    shape: FloatArray
-    output: FloatArray
-    participation: FloatArray
-    mass: FloatArray
-    followed: tuple[int, ...]
-    followed_mac: tuple[float, ...]
-
-
-class ReducedState:
-    """A reduced structure in one state, as `fe.runtime.transient` takes it, in Nm + N coordinates.
-
-    These are those of the modal and of the static basis; a motion is in the one and what modes leave out in
-    the other, so that nothing is solved in both.
+    model : ReducedModel
+        The reduced model.
+    vector : (V,) array
+        Values of its inputs.
     """
 
     laws = None
-    holding = None
-    on_modes: frozenset[str] = frozenset()
-    components = np.zeros((2, 0, 0))
+    holding_load = None
+    rigid_ports: frozenset[str] = frozenset()
+    strain_component_rows = np.zeros((2, 0, 0))
 
     def __init__(self, model: "ReducedModel", vector: FloatArray) -> None:
-        self.modes = modes = model.modes(vector)
-        self.acting, self.mode_count = model.load_coefficients, model.mode_count
-        self.loads, self.outputs, self.accelerations = model.rows
+        self.modes = model.modes(vector)
+        self.mode_count = model.mode_count
+        self.load_coefficients = model.load_coefficients
+        self.unit_loads = model.unit_loads
+        self.output_rows = model.output_rows
+        self.acceleration_rows = model.acceleration_rows
+        # sizes of the two bases
+        static = len(model.static_load.T)
+        modal = len(self.modes.shape)
+        # statics
         theta = model.stiffness_coefficients(vector)
-        cross = dense_sum(model.mass_coefficients(vector), model.cross_mass)
-        size, moving = len(model.static_load.T), len(modes.shape)
-        self.shapes = np.pad(modes.shape, ((0, size), (0, 0)))
-        self._static = dense_sum(theta, model.static_stiffness)
-        self.answers = self.static(self.loads)
-        self.mass = np.pad(modes.mass, (0, size))
-        self.mass[:moving, moving:], self.mass[moving:, :moving] = cross, cross.T
-        self.stiffness = np.pad(dense_sum(theta, model.modal_stiffness), (0, size))
-        self.to_modes = self.shapes.T @ self.mass
+        self._static_stiffness = dense_sum(theta, model.static_stiffness)
+        self.unit_responses = self.static(self.unit_loads)
+        # mass and stiffness in both bases
+        cross_mass = dense_sum(model.mass_coefficients(vector), model.cross_mass)
+        self.mass = np.pad(self.modes.mass, (0, static))
+        self.mass[:modal, modal:] = cross_mass
+        self.mass[modal:, :modal] = cross_mass.T
+        self.stiffness = np.pad(dense_sum(theta, model.modal_stiffness), (0, static))
+        # modes
+        self.mode_shapes = np.pad(self.modes.shape, ((0, static), (0, 0)))
+        self.modal_projection = self.mode_shapes.T @ self.mass
 
     def static(self, loads: FloatArray) -> FloatArray:
-        """Return the displacements K^-1 f of loads (Nm + N,) or (Nm + N, k), in the static basis."""
-        moving = len(self.loads) - len(self._static)
-        return np.concatenate((np.zeros_like(loads[:moving]), solve(self._static, loads[moving:])))
+        """Return K^-1 f of loads (Nm + N,) or (Nm + N, k), displacements in the static basis."""
+        modal = len(loads) - len(self._static_stiffness)
+        static_part = solve(self._static_stiffness, loads[modal:])
+        return np.concatenate((np.zeros_like(loads[:modal]), static_part))
 
 
 @dataclass(frozen=True, repr=False)
 class ReducedModel(ReducedArrays):
-    """Reduced structure: `ReducedArrays`, evaluated.
+    """The reduced model of a structure: `ReducedArrays`, with what is computed from them.
 
-    `fe.reduction.model_cache` makes one, `load` and `from_bytes` read one. Values are given by the names of
-    `chosen`, as a mapping or as keywords, the losses also together as `stiffness_loss`; what is left out is
-    nominal, and healthy.
+    `fe.reduction.model_cache` makes one; `load` and `from_bytes` read one. Inputs are given by
+    name, as a mapping or as keywords, and the losses also together as `stiffness_loss`. An input
+    that is left out has its nominal value, and a region without a loss is healthy.
     """
 
     @cached_property
-    def _online(self) -> OnlineArrays:
-        return OnlineArrays(self)
+    def _solver(self) -> CertifiedSolver:
+        return CertifiedSolver(self)
 
-    @cached_property
-    def _places(self) -> list[IntArray]:
-        """Places (2, T) and (2, L) of the factors of stiffness terms and loads: one, values, what is kept."""
-        controls = len(self.chosen) - len(self.controls)
-        of_load, of_stiffness = (controls, controls - len(self.masses)), (0, len(self.chosen))
-        tables = ((self.stiffness_factors, of_stiffness), (self.load_factors, of_load))
-        return [np.where(factors > 0, factors + offsets, 0).T for factors, offsets in tables]
+    # ------------------------------------------------------------ inputs
 
     @cached_property
     def validity(self) -> Mapping[str, tuple[float, float]]:
-        """Least and largest value for which the model was made, by name (SI units)."""
-        return dict(zip(self.chosen, map(tuple, self.validity_box.tolist()), strict=True))
+        """Least and largest value of each input of the model, by name (SI units)."""
+        limits = [(low, high) for low, high in self.validity_box.tolist()]
+        return dict(zip(self.input_names, limits, strict=True))
+
+    @cached_property
+    def _loss_inputs(self) -> slice:
+        """The losses of the regions among the inputs."""
+        first = len(self.parameters)
+        return slice(first, first + len(self.regions))
 
     def vector(
-        self, values: Values | None = None, stiffness_loss: GivenLosses = (), **named: float
+        self, values: InputValues | None = None, stiffness_loss: LossValues = (), **named: float
     ) -> FloatArray:
-        """Return all that can be chosen, (V,), of the values that are given; the others are nominal.
+        """Return the values of all inputs; those that are not given are nominal.
 
         Parameters
         ----------
-        values : mapping of str to float, or (V,) ndarray, optional
-            By name; an array is returned as it is.
+        values : mapping of str to float, or (V,) array, optional
+            Values by name; an array is returned as it is.
         stiffness_loss : mapping or iterable of float
-            Losses of the damage regions together, as of `fe.runtime.state.losses_of`.
+            Losses of the damage regions together, see `fe.runtime.state.losses_of`.
         **named : float
             More values by name.
+
+        Returns
+        -------
+        (V,) array
+            The values in the order of `input_names`.
 
         Raises
         ------
@@ -179,36 +132,48 @@ class ReducedModel(ReducedArrays):
         """
         if isinstance(values, np.ndarray):
             return values
-        found, first = self.nominal.copy(), len(self.parameters)
-        found[first : first + len(self.regions)] = self.losses(stiffness_loss)
+        vector = self.nominal.copy()
+        vector[self._loss_inputs] = self.losses(stiffness_loss)
         for name, value in {**(values or {}), **named}.items():
-            found[self._place(name)] = value
-        return found
+            vector[self._input_number(name)] = value
+        return vector
 
     def vectors(self, columns: Mapping[str, npt.ArrayLike]) -> FloatArray:
-        """Return all that can be chosen, (B, V), of columns (B,) or numbers by name; the others are nominal.
+        """Return the values of all inputs for B cases; inputs that are not given are nominal.
+
+        Parameters
+        ----------
+        columns : mapping of str to (B,) array_like or float
+            Values by the name of the input.
+
+        Returns
+        -------
+        (B, V) array
+            The values in the order of `input_names`.
 
         Raises
         ------
         OutsideModelError
             If a name is unknown.
         """
-        arrays = np.broadcast_arrays(np.zeros(1), *(np.asarray(column) for column in columns.values()))
-        found = np.tile(self.nominal, (len(arrays[0]), 1))
-        for name, array in zip(columns, arrays[1:], strict=True):
-            found[:, self._place(name)] = array
-        return found
+        arrays = [np.asarray(column) for column in columns.values()]
+        one_case, *broadcast = np.broadcast_arrays(np.zeros(1), *arrays)
+        vectors = np.tile(self.nominal, (len(one_case), 1))
+        for name, array in zip(columns, broadcast, strict=True):
+            vectors[:, self._input_number(name)] = array
+        return vectors
 
-    def _place(self, name: str) -> int:
-        if name not in self.chosen:
+    def _input_number(self, name: str) -> int:
+        """Return the number of an input; raise `OutsideModelError` for an unknown name."""
+        if name not in self.input_names:
             raise OutsideModelError(
                 f"The structure {self.name} has nothing named {name!r} to be chosen; it has "
-                f"{', '.join(self.chosen)}."
+                f"{', '.join(self.input_names)}."
             )
-        return self.chosen.index(name)
+        return self.input_names.index(name)
 
     def check_validity(self, values: Sequence[float]) -> None:
-        """Check that each of the values (V,) lies in the validity box; also refuses NaN and infinity.
+        """Check that each of the inputs (V,) lies in the validity box; NaN and infinity do not.
 
         Raises
         ------
@@ -218,65 +183,105 @@ class ReducedModel(ReducedArrays):
         for (name, (low, high)), value in zip(self.validity.items(), values, strict=True):
             if not low <= value <= high:
                 raise OutsideModelError(
-                    f"{name} must lie between {low:g} and {high:g}, the range of the reduced model of "
-                    f"{self.name}, but is {float(value)!r}; give a value inside, or reduce it for a wider "
-                    "range."
+                    f"{name} must lie between {low:g} and {high:g}, the range of the reduced model "
+                    f"of {self.name}, but is {float(value)!r}; give a value inside, or reduce it "
+                    "for a wider range."
                 )
 
-    def _coefficients(self, vectors: FloatArray, number: int) -> FloatArray:
-        first = len(self.parameters)
-        kept = 1.0 - vectors[..., first : first + len(self.regions)]
-        known = np.concatenate((np.ones_like(vectors[..., :1]), vectors, kept), axis=-1)
-        one, other = self._places[number]
-        return np.asarray(known[..., one] * known[..., other])
+    # ------------------------------------------------------------ coefficients of terms
 
     @cached_property
-    def rows(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Loads (n, L), static outputs (O', n) and accelerations (A, n) in the coordinates of `at`."""
-        static, modal = self.static_output, self.modal_output
-        loads = np.concatenate((self.modal_load, self.static_load), axis=1).T
-        outputs = np.concatenate((modal[: len(static)], static), axis=1)
-        return loads, outputs, np.pad(modal[len(static) :], ((0, 0), (0, static.shape[1])))
+    def _stiffness_factor_columns(self) -> IntArray:
+        """Columns (2, T) of the two factors of each stiffness term, see `_products`."""
+        first_parameter = 0
+        first_healthy_fraction = len(self.input_names)
+        return self._factor_columns(self.stiffness_factors, first_parameter, first_healthy_fraction)
 
-    def at(self, vector: FloatArray) -> ReducedState:
-        """Return the structure in motion at values (V,) of all that can be chosen.
+    @cached_property
+    def _load_factor_columns(self) -> IntArray:
+        """Columns (2, L) of the two factors of each load, see `_products`."""
+        first_control = len(self.input_names) - len(self.controls)
+        first_mass = first_control - len(self.masses)
+        return self._factor_columns(self.load_factors, first_control, first_mass)
+
+    @staticmethod
+    def _factor_columns(factors: IntArray, first: int, second: int) -> IntArray:
+        """Return columns of factors (k, 2) that are counted from one, after these two columns.
+
+        Zero stays zero: the column of ones.
+        """
+        return np.where(factors > 0, factors + np.array((first, second)), 0).T
+
+    def _products(self, vectors: FloatArray, columns: IntArray) -> FloatArray:
+        """Return the products (..., k) of two columns (2, k) at inputs (..., V).
+
+        Column 0 is one, then come the inputs, then the healthy fractions 1 - loss of the regions.
+        """
+        healthy = 1.0 - vectors[..., self._loss_inputs]
+        values = np.concatenate((np.ones_like(vectors[..., :1]), vectors, healthy), axis=-1)
+        first, second = columns
+        return np.asarray(values[..., first] * values[..., second])
+
+    def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
+        """Return the coefficients (..., T) of the stiffness terms at inputs (..., V)."""
+        return self._products(vectors, self._stiffness_factor_columns)
+
+    def load_coefficients(self, vectors: FloatArray) -> FloatArray:
+        """Return the coefficients (..., L) of the loads at inputs (..., V)."""
+        return self._products(vectors, self._load_factor_columns)
+
+    def mass_coefficients(self, vector: FloatArray) -> FloatArray:
+        """Return the coefficients (1 + P,) of the mass terms at inputs (V,)."""
+        first = self._loss_inputs.stop
+        return np.concatenate(([1.0], vector[first : first + len(self.masses)]))
+
+    # ------------------------------------------------------------ motion
+
+    @cached_property
+    def unit_loads(self) -> FloatArray:
+        """The loads (Nm + N, L) in the coordinates of a `ReducedStructure`."""
+        return np.concatenate((self.modal_load, self.static_load), axis=1).T
+
+    @cached_property
+    def output_rows(self) -> FloatArray:
+        """Rows (O', Nm + N) of the static outputs in the coordinates of a `ReducedStructure`."""
+        modal_output = self.modal_output[: len(self.static_output)]
+        return np.concatenate((modal_output, self.static_output), axis=1)
+
+    @cached_property
+    def acceleration_rows(self) -> FloatArray:
+        """Rows (A, Nm + N) of the accelerations in the coordinates of a `ReducedStructure`."""
+        modal_output = self.modal_output[len(self.static_output) :]
+        return np.pad(modal_output, ((0, 0), (0, self.static_output.shape[1])))
+
+    def structure_at(self, vector: FloatArray) -> ReducedStructure:
+        """Return the structure at inputs (V,), for `fe.runtime.transient.ModalIntegrator`.
 
         Raises
         ------
         OutsideModelError
             If a value lies outside the validity box or is not finite.
         """
-        return ReducedState(self, vector)
+        return ReducedStructure(self, vector)
 
-    def stiffness_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients (..., T) of the stiffness terms at values (..., V)."""
-        return self._coefficients(vectors, 0)
-
-    def load_coefficients(self, vectors: FloatArray) -> FloatArray:
-        """Return the coefficients (..., L) of the loads at values (..., V)."""
-        return self._coefficients(vectors, 1)
-
-    def mass_coefficients(self, vector: FloatArray) -> FloatArray:
-        """Return the coefficients (1 + P,) of the mass terms at values (V,)."""
-        start = len(self.parameters) + len(self.regions)
-        return np.concatenate(([1.0], vector[start : start + len(self.masses)]))
+    # ------------------------------------------------------------ statics
 
     def static_response(
         self,
-        values: Values | None = None,
-        stiffness_loss: GivenLosses = (),
+        values: InputValues | None = None,
+        stiffness_loss: LossValues = (),
         *,
         load: FloatArray | None = None,
         **named: float,
-    ) -> StaticResponse:
-        """Return the static response with its certified error bounds, Kapteyn et al. 2021, eqs. (13), (15).
+    ) -> ReducedResponse:
+        """Return the static response with certified bounds, Kapteyn et al. 2021, eqs. (13), (15).
 
         Parameters
         ----------
         values, stiffness_loss, **named
-            As of `vector`.
-        load : (L,) ndarray, optional
-            Coefficients of the loads in the place of those of the controls.
+            Values of the inputs, see `vector`.
+        load : (L,) array, optional
+            Coefficients of the loads, by default those of the controls.
 
         Raises
         ------
@@ -284,23 +289,31 @@ class ReducedModel(ReducedArrays):
             If a value is unknown, lies outside the validity box or is not finite.
         """
         vector = self.vector(values, stiffness_loss, **named)
-        chosen = vector.tolist()
-        self.check_validity(chosen)
-        first, gauges = len(self.parameters), len(self.gauges)
-        loss = tuple(chosen[first : first + len(self.regions)])
-        acting = self.load_coefficients(vector) if load is None else load
-        coordinates, output, errors = self._online.solution(self.stiffness_coefficients(vector), acting, loss)
-        strain, displacement, bound = output[:gauges], output[gauges:], errors.tolist()
-        return StaticResponse(
+        inputs = vector.tolist()
+        self.check_validity(inputs)
+        solution = self._solver.solve(
+            self.stiffness_coefficients(vector),
+            self.load_coefficients(vector) if load is None else load,
+            tuple(inputs[self._loss_inputs]),
+        )
+        gauges = len(self.gauges)
+        bounds = solution.bounds.tolist()
+        strain = solution.outputs[:gauges]
+        displacement = solution.outputs[gauges:]
+        return ReducedResponse(
             strain,
             displacement,
-            max(bound[:gauges], default=0.0) + self.rounding_allowance * sqrt(strain @ strain),
-            max(bound[gauges:], default=0.0) + self.rounding_allowance * sqrt(displacement @ displacement),
-            coordinates,
+            self._bound_with_rounding(bounds[:gauges], strain),
+            self._bound_with_rounding(bounds[gauges:], displacement),
+            solution.coordinates,
         )
 
+    def _bound_with_rounding(self, bounds: list[float], outputs: FloatArray) -> float:
+        """Return the largest of the bounds of outputs, with the allowance for rounding."""
+        return max(bounds, default=0.0) + self.rounding_allowance * sqrt(outputs @ outputs)
+
     def static_outputs(self, vectors: FloatArray) -> FloatArray:
-        """Return gauges and displacements (B, O') at many values (B, V) at once.
+        """Return gauges and displacements (B, O') at many inputs (B, V) at once.
 
         Raises
         ------
@@ -308,27 +321,58 @@ class ReducedModel(ReducedArrays):
             If a value lies outside the validity box or is not finite.
         """
         low, high = self.validity_box.T
-        bad = np.flatnonzero(~((vectors >= low) & (vectors <= high)).all(axis=1))
-        if bad.size:
-            self.check_validity(vectors[bad[0]].tolist())
-        stiffness = self.stiffness_coefficients(vectors) @ self._online.stiffness
+        outside = np.flatnonzero(~((vectors >= low) & (vectors <= high)).all(axis=1))
+        if outside.size:
+            self.check_validity(vectors[outside[0]].tolist())
+        stiffness = self.stiffness_coefficients(vectors) @ self._solver.stiffness
         load = self.load_coefficients(vectors) @ self.static_load
-        coordinates = solve(stiffness.reshape(-1, *self._online.square), load[:, :, np.newaxis])[:, :, 0]
+        matrices = stiffness.reshape(-1, *self._solver.square)
+        coordinates = np.squeeze(solve(matrices, load[:, :, np.newaxis]), axis=-1)
         return np.asarray(coordinates @ self.static_output.T)
 
-    def tip_stiffness(self, young_modulus_factor: float, stiffness_loss: GivenLosses = ()) -> float:
-        """Return the tip stiffness of a wing [N/m]: the tip force over the displacement of its point.
+    def tip_stiffness(self, young_modulus_factor: float, stiffness_loss: LossValues = ()) -> float:
+        """Return the tip stiffness of a wing, tip force over displacement of its point [N/m].
 
-        Kapteyn et al. 2021, eq. (14), where it is a straight line in e. Errors as of `static_response`.
+        It is a straight line in the modulus factor e, Kapteyn et al. 2021, eq. (14).
+
+        Parameters
+        ----------
+        young_modulus_factor : float
+            e, the factor on Young's modulus of the skin [1].
+        stiffness_loss : mapping or iterable of float
+            Losses of the damage regions.
+
+        Raises
+        ------
+        OutsideModelError
+            If a value lies outside the validity box or is not finite.
         """
-        vector = self.vector(stiffness_loss=stiffness_loss, young_modulus_factor=young_modulus_factor)
-        tip = np.array((0.0, 1.0))
-        return float(1.0 / (self.static_load[1] @ self.static_response(vector, load=tip).coordinates))
+        vector = self.vector(
+            stiffness_loss=stiffness_loss, young_modulus_factor=young_modulus_factor
+        )
+        unit_force = np.array((0.0, 1.0))
+        response = self.static_response(vector, load=unit_force)
+        return float(1.0 / (self.static_load[TIP_FORCE] @ response.coordinates))
 
-    def modes(self, values: Values | None = None, stiffness_loss: GivenLosses = (), **named: float) -> Modes:
+    # ------------------------------------------------------------ modes
+
+    def modes(
+        self,
+        values: InputValues | None = None,
+        stiffness_loss: LossValues = (),
+        **named: float,
+    ) -> ReducedModes:
         """Return the first undamped modes, Kapteyn et al. 2021, eq. (16).
 
-        Parameters and errors are those of `static_response`.
+        Parameters
+        ----------
+        values, stiffness_loss, **named
+            Values of the inputs, see `vector`.
+
+        Raises
+        ------
+        OutsideModelError
+            If a value is unknown, lies outside the validity box or is not finite.
         """
         vector = self.vector(values, stiffness_loss, **named)
         self.check_validity(vector.tolist())
@@ -336,10 +380,11 @@ class ReducedModel(ReducedArrays):
         mass = dense_sum(self.mass_coefficients(vector), self.modal_mass)
         frequency, shape = lowest_modes(stiffness, mass, self.mode_count)
         shape = shape * np.where(self.modal_output[-1] @ shape < 0.0, -1.0, 1.0)
-        reference = self.followed_shapes @ mass
-        size = np.sum(reference * self.followed_shapes, axis=1)[:, np.newaxis]
-        assurance = (reference @ shape) ** 2 / size
-        return Modes(
+        # modal assurance criterion against the tracked shapes
+        weighted_shapes = self.followed_shapes @ mass
+        squared_norm = np.sum(weighted_shapes * self.followed_shapes, axis=1)[:, np.newaxis]
+        assurance = (weighted_shapes @ shape) ** 2 / squared_norm
+        return ReducedModes(
             frequency=frequency,
             shape=shape,
             output=self.modal_output @ shape,

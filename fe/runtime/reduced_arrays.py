@@ -1,101 +1,111 @@
-"""The arrays of a reduced structure: what they are, their shapes, checked, and the file that keeps them.
+"""The stored arrays of a reduced structure, and its certified static solution.
 
-Last the certified static solution online, of arrays laid out for the fewest operations in an evaluation; the
-equations are in `docs/reduced_model.md`. NumPy and relative imports only: this file is copied into the FMU.
+The equations are in `docs/reduced_model.md`. NumPy and relative imports only: this file is copied
+into the FMU.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
 from math import inf, sqrt
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy import einsum
 from numpy.linalg import solve
 
-from .arrays import FloatArray, IntArray, KeptArrays
+from .arrays import FloatArray, IntArray, StoredArrays
 from .state import Losses
 
 
 @dataclass(frozen=True, repr=False)
-class ReducedArrays(KeptArrays):
-    """Affine dense matrices, outputs, modal data, error bound and ranges of a reduced structure, with names.
+class ReducedArrays(StoredArrays):
+    """The stored arrays of a reduced structure.
 
-    What can be chosen are the parameters, the losses of the damage regions, the free masses [kg] and the
-    controls, in this order; `chosen` names them. Outputs are the gauges [1], the displacements [m] and, of
-    the modes alone, the accelerations [m/s^2].
+    They are its affine matrices, outputs, modal data, error bound and ranges.
 
-    T stiffness terms, of which the last is always times one, 1 + P mass terms (the structure, then 1 kg of
-    each free mass), L loads and O outputs, of which the first O' are static.
+    The inputs of the model are the V values that a caller may choose: the parameters, the losses of
+    the damage regions, the free masses [kg] and the controls, in this order. Outputs are the gauges
+    [1], the displacements [m] and, of the modes alone, the accelerations [m/s^2].
+
+    There are T stiffness terms, of which the last always has the coefficient one; 1 + P mass terms
+    (the structure, then 1 kg of each free mass); L loads; and O outputs, of which the first O' are
+    static.
 
     Attributes
     ----------
     name : str
-        Of the structure.
+        Name of the structure.
     parameters, masses, controls : tuple of str
-        Their names.
+        Names of these inputs.
     control_units : tuple of str
         Unit of each control.
     gauges, displacements, accelerations : tuple of str
         Names of the outputs.
-    nominal : (V,) ndarray
-        Nominal value of all that can be chosen; zero for the losses.
-    damping : (2,) ndarray
+    nominal : (V,) array
+        Nominal value of each input; zero for the losses.
+    damping : (2,) array
         Rayleigh's alpha [1/s] and beta [s].
-    stiffness_factors : (T, 2) ndarray of int64
-        Parameter and damage region that each stiffness term is times, counted from one; zero for none.
-    load_factors : (L, 2) ndarray of int64
-        The control and the free mass that each load is times, counted from one; zero for none.
+    stiffness_factors : (T, 2) array of int64
+        Parameter and damage region whose values multiply each stiffness term, counted from one;
+        zero for none.
+    load_factors : (L, 2) array of int64
+        Control and free mass whose values multiply each load, counted from one; zero for none.
     mode_count : int
-        Number of modes M that `modes` returns.
-    followed_shapes : (F, Nm) ndarray
-        Shapes in the modal basis by which modes are followed, of a wing its first two flapwise bendings.
-    validity_box : (V, 2) ndarray
-        Least and largest value of each quantity that can be chosen, SI units.
-    static_stiffness : (T, N, N) ndarray
+        Number of modes M that `ReducedModel.modes` returns.
+    followed_shapes : (F, Nm) array
+        Shapes in the modal basis by which modes are tracked; of a wing its first two flapwise
+        bendings.
+    validity_box : (V, 2) array
+        Least and largest value of each input, SI units.
+    static_stiffness : (T, N, N) array
         Stiffness terms in the static basis.
-    static_load : (L, N) ndarray
+    static_load : (L, N) array
         Loads in the static basis.
-    static_output : (O', N) ndarray
+    static_output : (O', N) array
         Outputs of the static basis vectors.
-    bound_reference : (T - 1,) ndarray
-        Coefficients of the stiffness terms whose sum is the norm of the error bound; the last is one.
-    residual_load : (R, L) ndarray
-        Loads in an orthonormal basis of the residuals (norm dual to the one of `bound_reference`), without
-        the norm's own images of the static basis, along which a solution leaves nothing.
-    residual_stiffness : (R, T - 1, N) ndarray
-        Stiffness terms times static basis vectors, in the same basis: the residual is that of the loads less
-        the changes of the coefficients from `bound_reference` times these.
+    bound_reference : (T - 1,) array
+        Coefficients of the stiffness terms whose sum is the norm of the error bound; the last is
+        one.
+    residual_load : (R, L) array
+        Loads in an orthonormal basis of the residuals (in the norm dual to that of
+        `bound_reference`), without the norm's own images of the static basis, along which no
+        residual remains.
+    residual_stiffness : (R, T - 1, N) array
+        Stiffness terms times static basis vectors, in the same basis. The residual is that of the
+        loads minus the changes of the coefficients from `bound_reference` times these.
     residual_allowance : float
-        Bound of what that basis leaves out of a residual, per unit length of the reduced coordinates.
+        Bound of the residual outside of that basis, per unit length of the reduced coordinates.
     rounding_allowance : float
-        Part of the norm of the strains, and of displacements, added to the bounds for rounding: a
-        multiple of the difference seen where the reduced model holds the full solution itself.
-    dual_split : (K,) or (0,) ndarray
-        Value of each loss at which the second of two anchors along it takes over; A = 2^K, or one. At each, M
-        dual functions of an output are combined to its approximate dual solution.
-    dual_correction : (A, M, O', R) ndarray
-        Dual functions, applied to the basis of the residuals; the anchors of the last region change first.
-    dual_residual : (A, O', F, 1 + T M) ndarray
-        Factors of the dual residuals: their norm is that of the factor times (1, -theta_1 c, -theta_2 c,
-        ...), with the coefficients theta of the stiffness terms and c (M,) of the functions.
-    dual_stiffness : (A, O', T, M, M) ndarray
+        Fraction of the norm of the strains, and of displacements, that is added to the bounds for
+        rounding: a multiple of the difference seen where the reduced model holds the full solution.
+    dual_split : (K,) or (0,) array
+        Value of each loss at which the second of two anchors along it takes over; A = 2^K anchors,
+        or one. At each, M dual functions of an output are combined to its approximate dual
+        solution.
+    dual_correction : (A, M, O', R) array
+        Dual functions, applied to the basis of the residuals; the anchors of the last region change
+        first.
+    dual_residual : (A, O', F, 1 + T M) array
+        Factors of the dual residuals. Their norm is that of the factor times (1, -theta_1 c,
+        -theta_2 c, ...), with the coefficients theta of the stiffness terms and c (M,) of the
+        functions.
+    dual_stiffness : (A, O', T, M, M) array
         Stiffness terms in the dual functions of each output.
-    dual_output : (A, O', M) ndarray
+    dual_output : (A, O', M) array
         Each output of its dual functions.
-    modal_stiffness : (T, Nm, Nm) ndarray
+    modal_stiffness : (T, Nm, Nm) array
         Stiffness terms in the modal basis.
-    modal_mass : (1 + P, Nm, Nm) ndarray
+    modal_mass : (1 + P, Nm, Nm) array
         Mass terms in the modal basis.
-    modal_load : (L, Nm) ndarray
+    modal_load : (L, Nm) array
         Loads in the modal basis.
-    modal_output : (O, Nm) ndarray
+    modal_output : (O, Nm) array
         Outputs of the modal basis vectors.
-    cross_mass : (1 + P, Nm, N) ndarray
+    cross_mass : (1 + P, Nm, N) array
         Mass terms between the modal and the static basis.
     """
 
-    what = "a reduced model"
+    record_name = "a reduced model"
     version = 7
 
     name: str
@@ -106,13 +116,13 @@ class ReducedArrays(KeptArrays):
     gauges: tuple[str, ...]
     displacements: tuple[str, ...]
     accelerations: tuple[str, ...]
-    nominal: Annotated[FloatArray, "chosen"]
+    nominal: Annotated[FloatArray, "inputs"]
     damping: Annotated[FloatArray, 2]
     stiffness_factors: Annotated[IntArray, "terms", 2]
     load_factors: Annotated[IntArray, "loads", 2]
     mode_count: int
     followed_shapes: Annotated[FloatArray, "followed", "modal"]
-    validity_box: Annotated[FloatArray, "chosen", 2]
+    validity_box: Annotated[FloatArray, "inputs", 2]
     static_stiffness: Annotated[FloatArray, "terms", "static", "static"]
     static_load: Annotated[FloatArray, "loads", "static"]
     static_output: Annotated[FloatArray, "outputs", "static"]
@@ -136,123 +146,224 @@ class ReducedArrays(KeptArrays):
         super().__post_init__()
         modal = self.modal_stiffness.shape[1]
         if not 1 <= self.mode_count <= modal:
-            self.refuse(f"with {modal} modal basis vectors cannot have {self.mode_count} modes")
-        regions, masses = (len(self.parameters), len(self.regions)), (len(self.controls), len(self.masses))
-        for name, known in (("stiffness_factors", regions), ("load_factors", masses)):
-            array = getattr(self, name)
-            if array.min(initial=0) < 0 or np.any(array > known):
-                self.refuse(f"names by its array {name} what is not there")
-        if self.stiffness_factors[-1].any() or len(self.control_units) != len(self.controls):
-            self.refuse("has terms or units that are not those of its names")
+            raise self._error(
+                f"with {modal} modal basis vectors cannot have {self.mode_count} modes"
+            )
+        stiffness_names = (len(self.parameters), len(self.regions))
+        load_names = (len(self.controls), len(self.masses))
+        self._check_factors("stiffness_factors", self.stiffness_factors, stiffness_names)
+        self._check_factors("load_factors", self.load_factors, load_names)
+        has_factor_of_last_term = bool(self.stiffness_factors[-1].any())
+        if has_factor_of_last_term or len(self.control_units) != len(self.controls):
+            raise self._error("has terms or units that are not those of its names")
+
+    def _check_factors(self, name: str, factors: IntArray, counts: tuple[int, int]) -> None:
+        """Raise `ReducedModelFileError` where factors (k, 2) are not numbers of two kinds of names.
+
+        `counts` are the numbers of names of each kind.
+        """
+        if factors.min(initial=0) < 0 or np.any(factors > counts):
+            raise self._error(f"names by its array {name} what is not there")
 
     @cached_property
-    def chosen(self) -> tuple[str, ...]:
-        """Names of all that can be chosen: the rows of `validity_box`."""
+    def input_names(self) -> tuple[str, ...]:
+        """Names of all inputs: the rows of `validity_box`."""
         return (*self.parameters, *self.regions, *self.masses, *self.controls)
 
     @cached_property
-    def static_count(self) -> int:
+    def static_output_count(self) -> int:
         """Number O' of gauges and displacements."""
         return len(self.gauges) + len(self.displacements)
 
-    def _lengths(self) -> dict[str | int, int]:
-        terms, masses = len(self.stiffness_factors), len(self.masses)
+    def _axis_lengths(self) -> dict[str, int]:
+        terms = len(self.stiffness_factors)
         return {
-            "chosen": len(self.chosen),
+            "inputs": len(self.input_names),
             "terms": terms,
             "varied terms": terms - 1,
             "modal": self.modal_stiffness.shape[-1],
-            "outputs": self.static_count,
-            "all outputs": self.static_count + len(self.accelerations),
+            "outputs": self.static_output_count,
+            "all outputs": self.static_output_count + len(self.accelerations),
             "splits": len(self.regions) if self.dual_split.size else 0,
             "anchors": 2**self.dual_split.size,
             "dual columns": 1 + terms * self.dual_output.shape[-1],
-            "masses": 1 + masses,
+            "masses": 1 + len(self.masses),
         }
 
 
-class OnlineArrays:
-    """T stiffness terms, L loads and O outputs in N basis vectors, with the arrays of the error bound.
+class CertifiedSolution(NamedTuple):
+    """A static solution in N basis vectors, with certified bounds of its errors.
+
+    Attributes
+    ----------
+    coordinates : (N,) array
+        Coefficients of the basis vectors.
+    outputs : (O,) array
+        Gauges [1] and displacements [m].
+    bounds : (O,) array
+        Bounds of the errors of the outputs, without rounding.
+    """
+
+    coordinates: FloatArray
+    outputs: FloatArray
+    bounds: FloatArray
+
+
+class _Anchor(NamedTuple):
+    """The dual functions of the O outputs that were made for one combination of losses.
+
+    Attributes
+    ----------
+    stiffness : (T, O M M) array
+        Stiffness terms in the functions of each output.
+    output : (O, M, 1) array
+        Each output of its functions.
+    correction : (O, M, R) array
+        Functions applied to the basis of the residuals.
+    residual_factor : (O, F, 1 + T M) array
+        Factors of the dual residuals, see `ReducedArrays.dual_residual`.
+    """
+
+    stiffness: FloatArray
+    output: FloatArray
+    correction: FloatArray
+    residual_factor: FloatArray
+
+
+class _DualSolution(NamedTuple):
+    """Approximate dual solutions of the outputs.
+
+    Attributes
+    ----------
+    correction : (O, R) array
+        The solutions, applied to the basis of the residuals.
+    residual_norm : (O,) array
+        Norms of their own residuals.
+    """
+
+    correction: FloatArray
+    residual_norm: FloatArray
+
+
+class CertifiedSolver:
+    """The static solver of a reduced model, on arrays that are laid out for few operations.
+
+    There are T stiffness terms, L loads and O outputs in N basis vectors.
 
     Parameters
     ----------
     arrays : ReducedArrays
-        Arrays of the reduced model.
+        The arrays of the reduced model.
 
     Attributes
     ----------
     square : tuple of int
-        (N, N).
-    stiffness : (T, N N) ndarray
+        Shape (N, N) of a matrix.
+    stiffness : (T, N N) array
         Stiffness terms, flat.
     """
 
     def __init__(self, arrays: ReducedArrays) -> None:
-        stiffness, residual = arrays.static_stiffness, arrays.residual_load
+        stiffness = arrays.static_stiffness
+        term_count = len(stiffness)
         self.square = stiffness.shape[1:]
-        self.stiffness = np.ascontiguousarray(stiffness.reshape(len(stiffness), -1))
-        self._load, self._output = arrays.static_load, arrays.static_output
-        # times the loads, then the changes of the coefficients times the coordinates: the residual
-        terms = arrays.residual_stiffness.reshape(len(residual), -1)
-        self._residual = np.concatenate((residual, -terms), axis=1)
+        self.stiffness = np.ascontiguousarray(stiffness.reshape(term_count, -1))
+        self._load = arrays.static_load
+        self._output = arrays.static_output
+        # times (the loads, the changes of the coefficients times the coordinates): the residual
+        residual_terms = arrays.residual_stiffness.reshape(len(arrays.residual_load), -1)
+        self._residual = np.concatenate((arrays.residual_load, -residual_terms), axis=1)
         self._allowance = arrays.residual_allowance
         self._reference = np.append(arrays.bound_reference, 1.0)
+        # the dual functions, one anchor after the other
         self._splits = arrays.dual_split.tolist()
-        of_terms = arrays.dual_stiffness.swapaxes(1, 2).reshape(len(arrays.dual_output), len(stiffness), -1)
-        by_output = np.ascontiguousarray(arrays.dual_correction.swapaxes(1, 2))
+        anchor_count = len(arrays.dual_output)
+        term_first = arrays.dual_stiffness.swapaxes(1, 2)
+        flat_stiffness = term_first.reshape(anchor_count, term_count, -1)
+        output_first = np.ascontiguousarray(arrays.dual_correction.swapaxes(1, 2))
         output = arrays.dual_output[..., np.newaxis]
-        self._anchors = list(zip(of_terms, output, by_output, arrays.dual_residual, strict=True))
-        self._last: tuple[object, tuple[FloatArray, FloatArray]] | None = None
+        self._anchors = [
+            _Anchor(*anchor)
+            for anchor in zip(
+                flat_stiffness, output, output_first, arrays.dual_residual, strict=True
+            )
+        ]
+        self._latest_dual: tuple[tuple[bytes, Losses], _DualSolution] | None = None
 
-    def _dual(self, theta: FloatArray, loss: Losses) -> tuple[FloatArray, FloatArray]:
-        """Return dual solutions applied to the basis of residuals (O, R), and norms (O,) of what they leave.
-
-        They are the Galerkin solutions of the outputs in their functions of the anchor at the losses.
-        """
-        last, key = self._last, (theta.tobytes(), loss)  # a course of loads meets the same health again
-        if last is not None and last[0] == key:
-            return last[1]
-        number = 0
-        for split, value in zip(self._splits, loss, strict=False):
-            number = 2 * number + (value >= split)
-        stiffness, output, corrections, factor = self._anchors[number]
-        outputs, functions, _ = output.shape
-        if functions == 1:  # stacks of single numbers are dear
-            weights = output[:, 0] / (theta @ stiffness)[:, np.newaxis]
-            left = factor[:, :, 0] - weights * (factor[:, :, 1:] @ theta)
-            correction = weights * corrections[:, 0]
-        else:
-            weights = solve((theta @ stiffness).reshape(outputs, functions, functions), output)
-            across = weights.transpose(0, 2, 1)
-            coefficients = (-theta[:, np.newaxis] * across).reshape(outputs, -1, 1)
-            left = factor[:, :, 0] + (factor[:, :, 1:] @ coefficients)[:, :, 0]
-            correction = (across @ corrections)[:, 0]
-        found = correction, np.sqrt(einsum("ij,ij->i", left, left))
-        self._last = key, found
-        return found
-
-    def solution(
-        self, theta: FloatArray, load: FloatArray, loss: Losses
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return coordinates (N,), outputs (O,) and certified bounds (O,) of their errors, rounding left out.
+    def _dual_solution(self, theta: FloatArray, losses: Losses) -> _DualSolution:
+        """Return the Galerkin solutions of the outputs' dual problems, by the nearest anchor.
 
         Parameters
         ----------
-        theta : (T,) ndarray
+        theta : (T,) array
             Coefficients of the stiffness terms.
-        load : (L,) ndarray
+        losses : tuple of float
+            Stiffness losses of the damage regions.
+        """
+        # many loads in turn act on a structure in the same state of health
+        key = (theta.tobytes(), losses)
+        if self._latest_dual is not None and self._latest_dual[0] == key:
+            return self._latest_dual[1]
+        number = 0
+        for split, loss in zip(self._splits, losses, strict=False):
+            number = 2 * number + int(loss >= split)
+        anchor = self._anchors[number]
+        one_function = anchor.output.shape[1] == 1
+        solution = _one_dual_function(anchor, theta) if one_function else _combined(anchor, theta)
+        self._latest_dual = (key, solution)
+        return solution
+
+    def solve(self, theta: FloatArray, load: FloatArray, losses: Losses) -> CertifiedSolution:
+        """Return the static solution with certified error bounds, see `docs/reduced_model.md`.
+
+        |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, with the residual r,
+        the dual solution psi of the output l, and norms dual to that of the reference.
+
+        Parameters
+        ----------
+        theta : (T,) array
+            Coefficients of the stiffness terms.
+        load : (L,) array
             Coefficients of the loads.
-        loss : tuple of float
-            Stiffness losses of the damage regions, by which the anchor is chosen.
+        losses : tuple of float
+            Stiffness losses of the damage regions, by which the anchor of the dual functions is
+            chosen.
         """
         stiffness = (theta @ self.stiffness).reshape(self.square)
         coordinates = np.asarray(solve(stiffness, load @ self._load), dtype=np.float64)
-
-        # |l(u) - l(u_N)| = |psi(r)| <= |psi_N(r)| + |r| |l - K psi_N| / alpha, norms dual to the reference
+        # residual of the solution
         change = (theta - self._reference)[:-1]
-        residual = self._residual @ np.concatenate((load, np.multiply.outer(change, coordinates).ravel()))
-        correction, dual = self._dual(theta, loss)
-        coercivity = min((theta / self._reference).tolist())
+        changes = np.multiply.outer(change, coordinates).ravel()
+        residual = self._residual @ np.concatenate((load, changes))
         outside = self._allowance * sqrt(coordinates @ coordinates)
+        # bounds of the outputs
+        dual = self._dual_solution(theta, losses)
+        coercivity = min((theta / self._reference).tolist())
         remainder = (sqrt(residual @ residual) + outside) / coercivity
-        return coordinates, self._output @ coordinates, remainder * dual + np.abs(correction @ residual)
+        bounds = remainder * dual.residual_norm + np.abs(dual.correction @ residual)
+        return CertifiedSolution(coordinates, self._output @ coordinates, bounds)
+
+
+def _one_dual_function(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
+    """Return the dual solutions in one function for each output, without stacks of matrices."""
+    weights = anchor.output[:, 0] / (theta @ anchor.stiffness)[:, np.newaxis]
+    by_output = anchor.residual_factor[:, :, 0]
+    by_terms = anchor.residual_factor[:, :, 1:]
+    residual = by_output - weights * (by_terms @ theta)
+    correction = weights * anchor.correction[:, 0]
+    return _DualSolution(correction, np.sqrt(einsum("ij,ij->i", residual, residual)))
+
+
+def _combined(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
+    """Return the dual solutions as Galerkin combinations of the functions of each output."""
+    outputs, functions, _ = anchor.output.shape
+    # Galerkin's equations of each output
+    stiffness = (theta @ anchor.stiffness).reshape(outputs, functions, functions)
+    weights = solve(stiffness, anchor.output).transpose(0, 2, 1)
+    # what they leave of the dual equations
+    coefficients = (-theta[:, np.newaxis] * weights).reshape(outputs, -1, 1)
+    by_output = anchor.residual_factor[:, :, 0]
+    by_terms = anchor.residual_factor[:, :, 1:]
+    residual = by_output + np.squeeze(by_terms @ coefficients, axis=-1)
+    correction = np.squeeze(weights @ anchor.correction, axis=1)
+    return _DualSolution(correction, np.sqrt(einsum("ij,ij->i", residual, residual)))

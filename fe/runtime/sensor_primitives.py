@@ -1,49 +1,54 @@
-"""Primitive changes of what is read: what sensors and their recorders may be wrong by, and the record.
+"""Primitives of sensors: faults of sensors and recorders, and the record that they show.
 
-`fe.runtime.sensors` applies them to a response. NumPy and relative imports only: this file is copied into the
-FMU.
+`fe.runtime.sensors` applies them to a response. NumPy and relative imports only: this file is
+copied into the FMU.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import pi, sqrt
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 
 from .arrays import FloatArray
 from .errors import InvalidPatchError
-from .primitive import Primitive, course_of
+from .primitive import Primitive, time_formula
 
 EVERY_CHANNEL = "*"
 """Name that stands for every channel of the primitive's quantity."""
 CHANNEL_UNIT = "channel's unit"
+"""Unit of numbers in the unit of the channel that they act on."""
 PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
-"""Units of numbers that are shown by a channel."""
+"""Unit of amplitudes that are relative to the amplitude of a ring-down."""
 
-# `channel` is a channel's name, or `EVERY_CHANNEL` for all of `quantity` ("" for all quantities).
+# `channel` is a channel's name, or `EVERY_CHANNEL` for all channels of `quantity` ("": any
+# quantity).
 
 
 @dataclass(frozen=True)
 class SensorRecord:
-    """The record that sensors show.
+    """The record of a trial that sensors show.
 
     Attributes
     ----------
     channels : sequence of (str, str)
-        Name and quantity of each column.
+        Name and quantity of each of the C columns.
     kind : str
         "static", "flight", "ringdown", "forced" or "driven".
-    time : (N,) ndarray
-        Dynamic: since the trial's start [s]. Static, flight: since the campaign's start [s].
-    start, release : float
-        Of a dynamic trial since the campaign's start [s]; amplitude of a ring-down [m or the signal's unit].
-    temperature : (N,) ndarray
-        Less the reference temperature [K].
+    time : (N,) array
+        Times of the rows [s]: since the trial's start in a dynamic trial, since the campaign's
+        start in a static trial or a flight.
+    start : float
+        Start of a dynamic trial since the campaign's start [s].
+    temperature : (N,) array
+        Temperature minus the reference temperature [K].
     run : str
         Label of the run.
+    release : float
+        Amplitude of a ring-down [m, or the unit of the signal].
     settled : bool
-        Whether it does not begin in an unknown motion.
+        Whether the structure was at rest at the begin, not in an unknown motion.
     """
 
     channels: Sequence[tuple[str, str]]
@@ -61,51 +66,81 @@ class SensorRecord:
         return self.kind in ("ringdown", "forced", "driven")
 
 
+class SensorError(NamedTuple):
+    """What a sensor adds to its readings, (N,) or one number, and the time derivative of it."""
+
+    value: FloatArray | float
+    rate: FloatArray | float
+
+
+NO_ERROR = SensorError(0.0, 0.0)
+"""The error of a sensor that adds nothing."""
+
+
 class Sensor(Primitive):
-    """A primitive that changes what is read, not what happens."""
+    """A primitive that changes what is read, not what happens.
 
-    of_strain: ClassVar[bool] = False
-    """Whether it is for strain gauges alone."""
+    A subclass says what it adds to its channels (`error`), or else changes their readings in
+    another way (`readings`).
+    """
 
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample of a record, and the rate of that."""
-        return 0.0, 0.0
+    strain_only: ClassVar[bool] = False
+    """Whether the primitive is for strain gauges alone."""
 
-    def reading(
+    def error(self, record: SensorRecord) -> SensorError:
+        """Return what the sensor adds at each sample of a record."""
+        return NO_ERROR
+
+    def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what channels show of values (N, C), and its rates, given the rates (N, C) of the values."""
-        added, rate = self.added(record)
-        return values + np.reshape(added, (-1, 1)), rates + np.reshape(rate, (-1, 1))
+        """Return the readings of a perfect sensor with the fault of this one.
+
+        Parameters
+        ----------
+        record : SensorRecord
+            The record of N samples.
+        values : (N, C) array
+            The readings without the fault, in the units of the channels.
+        rates : (N, C) array
+            Their time derivatives.
+
+        Returns
+        -------
+        values, rates : (N, C) array
+            The readings with the fault, and their time derivatives.
+        """
+        error = self.error(record)
+        return values + np.reshape(error.value, (-1, 1)), rates + np.reshape(error.rate, (-1, 1))
 
 
 class SensorGain(Sensor):
     """A channel shows (1 + `gain`) times what it should."""
 
-    in_windows: ClassVar[bool] = True
+    can_act_in_windows: ClassVar[bool] = True
     channel: str
     gain: Annotated[float, "1"]
     quantity: str = ""
 
-    def reading(
+    def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what channels show of values (N, C), and its rates, given the rates (N, C) of the values."""
+        """Return the readings (N, C) times the gain, and their rates; see `Sensor.readings`."""
         return (1.0 + self.gain) * values, (1.0 + self.gain) * rates
 
 
 class SensorSaturation(Sensor):
-    """A channel shows `limit` tanh(x / `limit`) of x: it saturates softly, alike in both directions."""
+    """A channel shows `limit` tanh(x / `limit`) of x: it saturates softly in both directions."""
 
-    in_windows: ClassVar[bool] = True
+    can_act_in_windows: ClassVar[bool] = True
     channel: str
     limit: Annotated[float, CHANNEL_UNIT]
     quantity: str = ""
 
-    def reading(
+    def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what channels show of values (N, C), and its rates, given the rates (N, C) of the values.
+        """Return the saturated readings (N, C), and their rates; see `Sensor.readings`.
 
         Raises
         ------
@@ -114,56 +149,71 @@ class SensorSaturation(Sensor):
         """
         if self.limit <= 0.0:
             raise InvalidPatchError(
-                f"The limit at which a sensor saturates must be positive, but that of the channel "
+                "The limit at which a sensor saturates must be positive, but that of the channel "
                 f"{self.channel!r} is {self.limit}."
             )
-        share = np.tanh(values / self.limit)
-        return self.limit * share, (1.0 - share**2) * rates
+        saturation = np.tanh(values / self.limit)
+        return self.limit * saturation, (1.0 - saturation**2) * rates
 
 
 class SensorDrift(Sensor):
-    """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t since the campaign's start [s]."""
+    """A channel's zero moves by `amplitude` (t / `time`)^`exponent`, t the campaign's time."""
 
-    in_windows: ClassVar[bool] = True
+    can_act_in_windows: ClassVar[bool] = True
     channel: str
     amplitude: Annotated[float, CHANNEL_UNIT]
     time: Annotated[float, "s"]
     exponent: Annotated[float, "1"] = 1.0
     quantity: str = ""
 
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
+    def error(self, record: SensorRecord) -> SensorError:
+        """Return the drift of the zero at each sample.
+
+        Raises
+        ------
+        InvalidPatchError
+            If the time of the drift is not positive.
+        """
         if self.time <= 0.0:
-            raise InvalidPatchError(f"The time of a sensor's drift must be positive, but is {self.time} s.")
-        since = record.time + (record.start if record.is_dynamic else 0.0)
-        share = np.maximum(since, 0.0) / self.time
+            raise InvalidPatchError(
+                f"The time of a sensor's drift must be positive, but is {self.time} s."
+            )
+        campaign_time = record.time + (record.start if record.is_dynamic else 0.0)
+        ratio = np.maximum(campaign_time, 0.0) / self.time
         if self.exponent == 1.0:
-            return self.amplitude * share, np.full_like(share, self.amplitude / self.time)
-        moving = share > 0.0  # before and at the start there is no drift yet, whatever the exponent
-        safe = np.where(moving, share, 1.0)
-        value = np.where(moving, self.amplitude * safe**self.exponent, 0.0)
-        return value, np.where(moving, self.exponent * value / (safe * self.time), 0.0)
+            return SensorError(
+                self.amplitude * ratio, np.full_like(ratio, self.amplitude / self.time)
+            )
+        drifting = ratio > 0.0  # at and before the start there is no drift, whatever the exponent
+        safe_ratio = np.where(drifting, ratio, 1.0)
+        value = np.where(drifting, self.amplitude * safe_ratio**self.exponent, 0.0)
+        rate = np.where(drifting, self.exponent * value / (safe_ratio * self.time), 0.0)
+        return SensorError(value, rate)
 
 
 class ChannelOffset(Sensor):
-    """A channel shows `offset` more, a formula in `time` [s] of the trial, in the channel's unit."""
+    """A channel shows `offset` more, a formula in the trial's `time` [s]."""
 
-    in_windows: ClassVar[bool] = True
-    courses: ClassVar[tuple[str, ...]] = ("offset",)
+    can_act_in_windows: ClassVar[bool] = True
+    formula_fields: ClassVar[tuple[str, ...]] = ("offset",)
     channel: str
     offset: str
     quantity: str = ""
 
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        course = course_of(self.offset, self.kind).course(record.time, {"pi": pi})
-        return course, np.gradient(course, record.time) if record.is_dynamic else 0.0
+    def error(self, record: SensorRecord) -> SensorError:
+        """Return the offset at each sample; its rate is a difference quotient."""
+        offset = time_formula(self.offset, self.kind).values_over_time(record.time, {"pi": pi})
+        rate = np.gradient(offset, record.time) if record.is_dynamic else 0.0
+        return SensorError(offset, rate)
 
 
 class SensorRotation(Sensor):
-    """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear."""
+    """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear.
 
-    of_strain: ClassVar[bool] = True
+    `fe.runtime.sensors` turns the gauge, because that takes strains which the gauge does not read.
+    """
+
+    strain_only: ClassVar[bool] = True
     channel: str
     angle: Annotated[float, "rad"]
 
@@ -171,18 +221,21 @@ class SensorRotation(Sensor):
 class ThermalStrain(Sensor):
     """Strain channels show `coefficient` [1/K] times (T - T_ref) more."""
 
-    of_strain: ClassVar[bool] = True
-    in_windows: ClassVar[bool] = True
+    strain_only: ClassVar[bool] = True
+    can_act_in_windows: ClassVar[bool] = True
     channel: str
     coefficient: Annotated[float, "1/K"]
 
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        return self.coefficient * record.temperature, 0.0
+    def error(self, record: SensorRecord) -> SensorError:
+        """Return the thermal strain at each sample; the temperature changes slowly."""
+        return SensorError(self.coefficient * record.temperature, 0.0)
 
 
 class HighPass(Sensor):
-    """Channels pass through `order` equal first-order high-pass filters s tau / (1 + s tau), tau [s]."""
+    """Channels pass `order` equal high-pass filters s tau / (1 + s tau), tau the `time_constant`.
+
+    The caller of `fe.runtime.sensors.apply_sensors` supplies the filter.
+    """
 
     channel: str
     time_constant: Annotated[float, "s"]
@@ -191,17 +244,18 @@ class HighPass(Sensor):
 
 
 class Clock(Sensor):
-    """A sample stamped t was taken at (1 + `rate`) t + `zero` [s], t since the record's first stamp."""
+    """A sample stamped t was taken at (1 + `rate`) t + `zero` [s], t since the first stamp."""
 
     rate: Annotated[float, "1"]
     zero: Annotated[float, "s"]
 
 
 class LoggerClock(Sensor):
-    """The clock of a logger: what it stamps t, readings and recorded inputs alike, was at (1 + `rate`) t.
+    """A logger's clock runs wrong: what it stamps t happened at (1 + `rate`) t.
 
-    t counts from the record's first stamp.
-    `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records everything.
+    That holds for readings and for recorded inputs; t is counted from the record's first stamp.
+    `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records
+    everything.
     """
 
     logger: str
@@ -209,31 +263,38 @@ class LoggerClock(Sensor):
 
 
 class Line(Sensor):
-    """A line at `frequency` [Hz] is added: cosine cos + sine sin (2 pi f t), t since the trial's start.
+    """A spectral line is added: cosine cos(2 pi f t) + sine sin(2 pi f t), f the `frequency` [Hz].
 
-    Amplitudes in the channel's unit. It is in the noise record too.
+    t is the time since the trial's start; amplitudes are in the channel's unit. The line is in the
+    noise record too.
     """
 
-    in_windows: ClassVar[bool] = True
+    can_act_in_windows: ClassVar[bool] = True
     channel: str
     frequency: Annotated[float, "Hz"]
     cosine: Annotated[float, CHANNEL_UNIT]
     sine: Annotated[float, CHANNEL_UNIT]
     quantity: str = ""
 
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
+    def error(self, record: SensorRecord) -> SensorError:
+        """Return the line at each sample of a dynamic record."""
         if not record.is_dynamic:
-            return 0.0, 0.0
+            return NO_ERROR
         omega = 2.0 * pi * self.frequency
-        c, s = np.cos(omega * record.time), np.sin(omega * record.time)
-        return self.cosine * c + self.sine * s, omega * (self.sine * c - self.cosine * s)
+        cos = np.cos(omega * record.time)
+        sin = np.sin(omega * record.time)
+        return SensorError(
+            value=self.cosine * cos + self.sine * sin,
+            rate=omega * (self.sine * cos - self.cosine * sin),
+        )
 
 
 class DecayingLine(Sensor):
-    """A mode that the model does not have, e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), in ring-downs.
+    """A mode that the model lacks shows in ring-downs as a decaying oscillation.
 
-    t since the trial's start; amplitudes in the channel's unit per unit of the trial's release amplitude.
+    It is e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), t the time since the trial's start,
+    w = 2 pi `frequency`, zeta the `damping_ratio`, w_d the damped angular frequency. Amplitudes are
+    in the channel's unit per unit of the trial's release amplitude.
     """
 
     channel: str
@@ -243,28 +304,41 @@ class DecayingLine(Sensor):
     sine: Annotated[float, PER_RELEASE]
     quantity: str = ""
 
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
+    def error(self, record: SensorRecord) -> SensorError:
+        """Return the oscillation at each sample of a ring-down.
+
+        Raises
+        ------
+        InvalidPatchError
+            If the damping ratio does not lie between -1 and 1.
+        """
         if record.kind != "ringdown":
-            return 0.0, 0.0
-        omega, zeta = 2.0 * pi * self.frequency, self.damping_ratio
+            return NO_ERROR
+        omega = 2.0 * pi * self.frequency
+        zeta = self.damping_ratio
         if not -1.0 < zeta < 1.0:
-            raise InvalidPatchError(f"The damping ratio of a decaying line must be below one, but is {zeta}.")
-        damped = omega * sqrt(1.0 - zeta**2)
+            raise InvalidPatchError(
+                f"The damping ratio of a decaying line must be below one, but is {zeta}."
+            )
+        damped_omega = omega * sqrt(1.0 - zeta**2)
         envelope = record.release * np.exp(-zeta * omega * record.time)
-        c, s = np.cos(damped * record.time), np.sin(damped * record.time)
-        value = envelope * (self.cosine * c + self.sine * s)
-        return value, -zeta * omega * value + envelope * damped * (self.sine * c - self.cosine * s)
+        cos = np.cos(damped_omega * record.time)
+        sin = np.sin(damped_omega * record.time)
+        value = envelope * (self.cosine * cos + self.sine * sin)
+        quadrature = envelope * damped_omega * (self.sine * cos - self.cosine * sin)
+        return SensorError(value, -zeta * omega * value + quadrature)
 
 
 class RunOffset(Sensor):
-    """Static readings of the trials labelled `run` have this `offset` (channel's unit): seating of a run."""
+    """Static readings of the trials labelled `run` have this `offset`: the seating of a run."""
 
     run: str
     offset: Annotated[float, CHANNEL_UNIT]
     channel: str = EVERY_CHANNEL
     quantity: str = "displacement"
 
-    def added(self, record: SensorRecord) -> tuple[FloatArray | float, FloatArray | float]:
-        """Return what it adds at each sample, and the rate of that."""
-        return self.offset if record.kind == "static" and record.run == self.run else 0.0, 0.0
+    def error(self, record: SensorRecord) -> SensorError:
+        """Return the offset in static trials of the run."""
+        if record.kind == "static" and record.run == self.run:
+            return SensorError(self.offset, 0.0)
+        return NO_ERROR

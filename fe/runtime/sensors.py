@@ -1,15 +1,15 @@
-"""What sensors make of a response: gain, saturation, drift, rotation, thermal strain, high-pass, lines, zero.
+"""Readings of faulty sensors: the primitives of `fe.runtime.patch.SENSORS` applied to a response.
 
-Pure functions on arrays for the primitives of `fe.runtime.patch.SENSORS`; clocks are not here, because they
-say when the response is taken and so belong to whoever computes it. Without sensors the input comes back
-untouched. A high-pass needs the whole record, or of one that is read row after row what it remembers
-(`FilterMemory`).
+Pure functions on arrays. Clocks are not here, because they say when the response is taken and so
+belong to whoever computes it. A high-pass needs the whole record; for a record that is read row
+after row it needs the filter states of the previous row (`FilterMemory`).
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from collections.abc import Callable, Sequence
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,45 +21,72 @@ from .patch import EVERY_CHANNEL, Clock, HighPass, LoggerClock, ModelPatch, Sens
 from .patch import SensorRecord as SensorRecord
 from .primitive import Primitive
 
-Filter = Callable[[HighPass, "SensorRecord", FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+Channels = Sequence[tuple[str, str]]
+"""Name and quantity of each column of a record."""
+
+HighPassFilter = Callable[
+    [HighPass, SensorRecord, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
+]
+"""How columns (N, C) of a dynamic record, and their rates (N, C), pass a high-pass."""
 
 STRAIN = "strain"
 """Quantity of a strain gauge."""
 
+RATES = frozenset({"velocity", "acceleration", "angular_velocity", "angular_acceleration"})
+"""Quantities that are zero at rest."""
+
+LARGEST_ORDER = 4
+"""Largest number of stages of a high-pass that is read row by row."""
+
+
+class ClockError(NamedTuple):
+    """A clock that runs wrong: what it stamps t was taken at (1 + `rate`) t + `zero` [s]."""
+
+    rate: float
+    zero: float
+
 
 def needs_structure(patch: ModelPatch) -> bool:
-    """Return whether a patch needs more than what its sensors make of the readings of the plain structure."""
-    return any(isinstance(item, SensorRotation) or not isinstance(item, Sensor) for item in patch)
+    """Return whether a patch changes more than the readings of the unchanged structure.
+
+    Rotated gauges need strains of the structure that no gauge reads.
+    """
+    return any(
+        isinstance(primitive, SensorRotation) or not isinstance(primitive, Sensor)
+        for primitive in patch
+    )
 
 
-def clock_of(patch: ModelPatch) -> tuple[float, float]:
-    """Return rate [1] and zero [s] of the clock primitives of a patch, added up."""
-    clocks = [item for item in patch if isinstance(item, Clock)]
-    return sum(item.rate for item in clocks), sum(item.zero for item in clocks)
+def clock_of(patch: ModelPatch) -> ClockError:
+    """Return the sum of the clock primitives of a patch."""
+    clocks = [primitive for primitive in patch if isinstance(primitive, Clock)]
+    return ClockError(
+        rate=sum(clock.rate for clock in clocks), zero=sum(clock.zero for clock in clocks)
+    )
 
 
-def check_channels(patch: ModelPatch, channels: Sequence[tuple[str, str]]) -> None:
-    """Check that the channels which sensor primitives name exist and are of the right quantity.
+def check_channels(patch: ModelPatch, channels: Channels) -> None:
+    """Check that the channels which sensor primitives name exist and have the right quantity.
 
     Raises
     ------
     InvalidPatchError
-        If one does not; the sentence names it and what there is.
+        If one does not; the sentence names it and the channels that exist.
     """
     quantities = dict(channels)
-    for item in patch:
-        name = getattr(item, "channel", EVERY_CHANNEL)
+    for primitive in patch:
+        name = _channel_name(primitive)
         if name == EVERY_CHANNEL:
             continue
         if name not in quantities:
             raise InvalidPatchError(
-                f"The primitive {item.kind!r} names the channel {name!r}, which does not exist; there are "
-                f"{', '.join(quantities)}."
+                f"The primitive {primitive.kind!r} names the channel {name!r}, which does not "
+                f"exist; there are {', '.join(quantities)}."
             )
-        if getattr(item, "of_strain", False) and quantities[name] != STRAIN:
+        if _is_for_strain(primitive) and quantities[name] != STRAIN:
             raise InvalidPatchError(
-                f"The primitive {item.kind!r} is for strain gauges, but the channel {name!r} measures "
-                f"{quantities[name]}."
+                f"The primitive {primitive.kind!r} is for strain gauges, but the channel {name!r} "
+                f"measures {quantities[name]}."
             )
 
 
@@ -71,163 +98,224 @@ def apply_sensors(
     transverse: FloatArray | None = None,
     shear: FloatArray | None = None,
     *,
-    filtered: Filter,
+    high_pass: HighPassFilter,
 ) -> tuple[FloatArray, FloatArray | None]:
-    """Return what the channels show and its time derivative.
+    """Return the readings of the channels and their time derivatives, given perfect readings.
 
-    Rotations come first, because a gauge sees the strain of the skin before anything is made of it (several
-    rotations of one gauge add up); the other primitives follow in the order of the patch. A primitive whose
-    channel is not among `record.channels` changes nothing (`check_channels` finds names that exist nowhere).
-    High-pass and lines touch dynamic trials only: static and flight rows are settled readings.
+    Rotations come first, because a gauge senses the strain of the skin before anything else happens
+    to it; several rotations of one gauge add up. The other primitives follow in the order of the
+    patch. A primitive whose channel is not in the record changes nothing; `check_channels` finds
+    names that exist nowhere. High-pass filters and lines act in dynamic trials only: rows of static
+    trials and of flights are settled readings. Without sensors the input is returned as it is.
 
     Parameters
     ----------
     patch : ModelPatch
-        Other primitives than those of sensors are ignored, the clock too.
+        The patch; only its sensors act, without clocks.
     record : SensorRecord
         The record.
-    values : (N, C) ndarray
-        What perfect sensors show, in the channels' units.
-    rates : (N, C) ndarray, optional
-        Its time derivative, for dynamic trials.
-    transverse, shear : (N, C) ndarray, optional
-        Strain across each gauge's direction and engineering shear strain; needed for rotations.
-    filtered : callable
-        How columns (N, C) of a dynamic record and their rates pass a high-pass:
-        `fe.high_pass.filtered_record`, or `FilterMemory.filtered` of one row of a longer one,
-        which has no rates.
+    values : (N, C) array
+        Readings of perfect sensors, in the units of the channels.
+    rates : (N, C) array, optional
+        Their time derivatives, for dynamic trials.
+    transverse, shear : (N, C) array, optional
+        Strain across the direction of each gauge and engineering shear strain, for rotations.
+    high_pass : callable
+        The high-pass filter: `fe.high_pass.filtered_record`, or `FilterMemory.filter_row` for one
+        row of a longer record, which has no rates.
+
+    Returns
+    -------
+    values : (N, C) array
+        The readings.
+    rates : (N, C) array or None
+        Their time derivatives, if those of the perfect readings were given.
 
     Raises
     ------
     InvalidPatchError
-        If a gauge is turned and the components are missing, or a time constant, an order, a drift's time or
-        a limit is not positive.
+        If a gauge is turned and the strains for it are missing, or a time constant, an order, a
+        drift's time or a limit is not positive.
     """
-    active = [
-        item for item in patch if isinstance(item, Sensor) and not isinstance(item, Clock | LoggerClock)
+    sensors = [
+        primitive
+        for primitive in patch
+        if isinstance(primitive, Sensor) and not isinstance(primitive, Clock | LoggerClock)
     ]
-    if not active:
+    if not sensors:
         return values, rates
-    shown = np.array(values, dtype=np.float64)
-    slopes = np.zeros_like(shown) if rates is None else np.array(rates, dtype=np.float64)
-    angles = np.zeros(len(record.channels))
-    for item in active:
-        if isinstance(item, SensorRotation):
-            angles[columns_of(item, record.channels)] += item.angle
-    turned = np.flatnonzero(angles)
-    if turned.size:  # eps' = eps cos^2 + eps_t sin^2 + gamma sin cos (strain in a plane)
-        if transverse is None or shear is None:
-            raise InvalidPatchError(
-                "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
-            )
-        cosine, sine = np.cos(angles[turned]), np.sin(angles[turned])
-        across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
-        shown[:, turned] = shown[:, turned] * cosine**2 + across
-        if len(across) > 1 and record.is_dynamic:
-            # A response has no rates of the components; a central difference of this small share will do.
-            slopes[:, turned] = slopes[:, turned] * cosine**2 + np.gradient(across, record.time, axis=0)
-    for item in active:
-        columns = columns_of(item, record.channels)
-        if not columns.size or isinstance(item, SensorRotation):
+    readings = np.array(values, dtype=np.float64)
+    slopes = np.zeros_like(readings) if rates is None else np.array(rates, dtype=np.float64)
+    _rotate_gauges(sensors, record, readings, slopes, transverse, shear)
+    for sensor in sensors:
+        columns = columns_of(sensor, record.channels)
+        if not columns.size or isinstance(sensor, SensorRotation):
             continue
-        signal, slope = shown[:, columns], slopes[:, columns]
-        if not isinstance(item, HighPass):
-            read = item.reading(record, signal, slope)
+        signal = readings[:, columns]
+        signal_rate = slopes[:, columns]
+        if not isinstance(sensor, HighPass):
+            changed, changed_rate = sensor.readings(record, signal, signal_rate)
         elif record.is_dynamic:
-            read = filtered(item, record, signal, slope)
+            changed, changed_rate = high_pass(sensor, record, signal, signal_rate)
         else:
             continue
-        acting = item.acts(record.time)[:, np.newaxis]
-        shown[:, columns], slopes[:, columns] = (
-            np.where(acting, after, before) for after, before in zip(read, (signal, slope), strict=True)
-        )
-    return shown, None if rates is None else slopes
+        acts = sensor.acts_at(record.time)[:, np.newaxis]
+        readings[:, columns] = np.where(acts, changed, signal)
+        slopes[:, columns] = np.where(acts, changed_rate, signal_rate)
+    return readings, None if rates is None else slopes
 
 
-def columns_of(item: Primitive, channels: Sequence[tuple[str, str]]) -> NDArray[np.intp]:
-    """Return the columns that a primitive acts on; a named channel is meant whatever its quantity."""
-    name = getattr(item, "channel", EVERY_CHANNEL)
-    if name != EVERY_CHANNEL:
-        chosen = [index for index, (channel, _) in enumerate(channels) if channel == name]
-    else:
-        quantity = STRAIN if getattr(item, "of_strain", False) else str(getattr(item, "quantity", ""))
-        chosen = [index for index, (_, own) in enumerate(channels) if quantity in ("", own)]
-    return np.array(chosen, dtype=np.intp)
+def _rotate_gauges(
+    sensors: Sequence[Sensor],
+    record: SensorRecord,
+    readings: FloatArray,
+    slopes: FloatArray,
+    transverse: FloatArray | None,
+    shear: FloatArray | None,
+) -> None:
+    """Turn strain gauges in the plane of the skin; readings and rates (N, C) change in place.
 
-
-RATES = frozenset({"velocity", "acceleration", "angular_velocity", "angular_acceleration"})
-"""Quantities that are zero at rest."""
-
-
-def held_before(item: HighPass, record: SensorRecord, first: FloatArray) -> FloatArray:
-    """Return what the columns (C,) of a filter had been for ever before the `first` row of a record.
-
-    They were at rest there; what moved already had done so about zero.
+    The strain in a direction at the angle a is eps cos^2 a + eps_t sin^2 a + gamma sin a cos a.
     """
-    rates = [record.channels[column][1] in RATES for column in columns_of(item, record.channels)]
-    return np.where(rates, 0.0, first) if record.settled else np.zeros_like(first)
+    angles = np.zeros(len(record.channels))
+    for sensor in sensors:
+        if isinstance(sensor, SensorRotation):
+            angles[columns_of(sensor, record.channels)] += sensor.angle
+    turned = np.flatnonzero(angles)
+    if not turned.size:
+        return
+    if transverse is None or shear is None:
+        raise InvalidPatchError(
+            "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
+        )
+    cosine = np.cos(angles[turned])
+    sine = np.sin(angles[turned])
+    across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
+    readings[:, turned] = readings[:, turned] * cosine**2 + across
+    if len(across) > 1 and record.is_dynamic:
+        # a response has no rates of these strains; central differences will do, as they are small
+        across_rate = np.gradient(across, record.time, axis=0)
+        slopes[:, turned] = slopes[:, turned] * cosine**2 + across_rate
 
 
-LARGEST_ORDER = 4
-"""Most stages of a high-pass."""
+def _channel_name(primitive: Primitive) -> str:
+    """Return the channel of a primitive; a primitive without a channel means all of them."""
+    return str(getattr(primitive, "channel", EVERY_CHANNEL))
+
+
+def _is_for_strain(primitive: Primitive) -> bool:
+    """Return whether a primitive is for strain gauges alone."""
+    return isinstance(primitive, Sensor) and primitive.strain_only
+
+
+def columns_of(primitive: Primitive, channels: Channels) -> NDArray[np.intp]:
+    """Return the columns that a primitive acts on.
+
+    A channel that the primitive names is meant whatever its quantity is.
+    """
+    name = _channel_name(primitive)
+    if name != EVERY_CHANNEL:
+        columns = [column for column, (channel, _) in enumerate(channels) if channel == name]
+        return np.array(columns, dtype=np.intp)
+    quantity = STRAIN if _is_for_strain(primitive) else str(getattr(primitive, "quantity", ""))
+    columns = [
+        column
+        for column, (_, channel_quantity) in enumerate(channels)
+        if quantity in ("", channel_quantity)
+    ]
+    return np.array(columns, dtype=np.intp)
+
+
+def levels_before_record(
+    high_pass: HighPass, record: SensorRecord, first_row: FloatArray
+) -> FloatArray:
+    """Return the constant inputs (C,) of a high-pass before a record, from the record's first row.
+
+    A settled structure had the first reading all the time, and no rates. A structure that moved
+    already had done so about zero.
+    """
+    if not record.settled:
+        return np.zeros_like(first_row)
+    columns = columns_of(high_pass, record.channels)
+    is_rate = [record.channels[column][1] in RATES for column in columns]
+    return np.where(is_rate, 0.0, first_row)
 
 
 class FilterMemory:
-    """What filters remember from one row of a record to the next; the signal is linear between the two.
+    """States of high-pass filters between two rows of a record that is read row by row.
+
+    The signal is taken as linear between the rows.
 
     Parameters
     ----------
-    before : sequence of float or None
-        `after` of the row before; None: the signals had settled for ever, see `held_before`.
+    previous : sequence of float or None
+        `states` of the previous row; None before the first row, see `levels_before_record`.
     duration : float
-        Time since the row before [s].
+        Time since the previous row [s].
 
     Attributes
     ----------
-    after : list of float
-        What is remembered of this row: signal and stages, column after column and filter after filter.
+    states : list of float
+        States after this row: the signal and the output of each stage, column after column and
+        filter after filter.
     """
 
-    def __init__(self, before: Sequence[float] | None, duration: float) -> None:
-        self._before, self._duration = None if before is None else iter(before), duration
-        self.after: list[float] = []
+    def __init__(self, previous: Sequence[float] | None, duration: float) -> None:
+        self._previous = None if previous is None else iter(previous)
+        self._duration = duration
+        self.states: list[float] = []
 
-    def filtered(
-        self, item: HighPass, record: SensorRecord, row: FloatArray, rates: FloatArray
+    def filter_row(
+        self, high_pass: HighPass, record: SensorRecord, row: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return what columns (1, C) show, and no rates; raises `InvalidPatchError`."""
-        if not (item.time_constant > 0.0 and item.order in range(1, LARGEST_ORDER + 1)):
+        """Return one filtered row (1, C), and zeros for its rates, as a `HighPassFilter`.
+
+        Raises
+        ------
+        InvalidPatchError
+            If the time constant is not positive, or there are not 1 to `LARGEST_ORDER` stages.
+        """
+        if not (high_pass.time_constant > 0.0 and high_pass.order in range(1, LARGEST_ORDER + 1)):
             raise InvalidPatchError(
-                f"A high-pass that is read sample by sample needs a positive time constant and 1 to "
-                f"{LARGEST_ORDER} stages, but {item} was given."
+                "A high-pass that is read sample by sample needs a positive time constant and 1 to "
+                f"{LARGEST_ORDER} stages, but {high_pass} was given."
             )
-        shown, order = [], int(item.order)
-        for signal, held in zip(row[0].tolist(), held_before(item, record, row[0]).tolist(), strict=True):
-            states = np.full(order, signal - held)
-            if self._before is not None:
-                last, *kept = islice(self._before, 1 + order)
-                states = high_pass_step(np.array(kept), signal - last, self._duration / item.time_constant)
-            shown.append(states[-1])
-            self.after += [signal, *states.tolist()]
-        return np.array([shown]), np.zeros_like(row)
+        order = int(high_pass.order)
+        signals = row[0].tolist()
+        levels = levels_before_record(high_pass, record, row[0]).tolist()
+        outputs = []
+        for signal, level in zip(signals, levels, strict=True):
+            if self._previous is None:
+                stages = np.full(order, signal - level)
+            else:
+                previous_signal, *previous_stages = islice(self._previous, 1 + order)
+                stages = high_pass_step(
+                    np.array(previous_stages),
+                    signal - previous_signal,
+                    self._duration / high_pass.time_constant,
+                )
+            outputs.append(stages[-1])
+            self.states += [signal, *stages.tolist()]
+        return np.array([outputs]), np.zeros_like(row)
 
 
-def high_pass_step(states: FloatArray, increment: float, ratio: float) -> FloatArray:
-    """Return the outputs of a chain of equal first-order high-pass stages after a linear change of its input.
+def high_pass_step(stages: FloatArray, increment: float, ratio: float) -> FloatArray:
+    """Return the outputs of a chain of equal first-order high-pass stages after one time step.
 
-    The outputs obey y_i' = x' - (y_1 + ... + y_i) / tau.
+    The outputs obey y_i' = x' - (y_1 + ... + y_i) / tau; the input x changes linearly.
 
     Parameters
     ----------
-    states : (n,) ndarray
-        Outputs of the stages before.
+    stages : (n,) array
+        Outputs of the stages before the step.
     increment : float
         Change of the input.
     ratio : float
-        Duration of the change over tau.
+        Duration of the step over tau.
     """
-    count = len(states)
-    matrix = np.zeros((count + 1, count + 1))  # of the outputs, and the increment as one more that stays
+    count = len(stages)
+    # the increment is one more state, which stays constant
+    matrix = np.zeros((count + 1, count + 1))
     matrix[:count, :count] = -ratio * np.tri(count)
     matrix[:count, count] = increment
-    return np.asarray(exponential(matrix)[:count] @ np.append(states, 1.0))
+    return np.asarray(exponential(matrix)[:count] @ np.append(stages, 1.0))

@@ -1,4 +1,4 @@
-"""The digital state of the wing: Kapteyn et al. 2021, eq. (5).
+"""The digital state of a wing: Kapteyn et al. 2021, eq. (5), and the names of a wing's inputs.
 
 Standard library only, relative imports only: this file is copied into the FMU.
 """
@@ -10,48 +10,56 @@ from dataclasses import dataclass, field
 from .errors import InvalidStateError
 
 Losses = tuple[float, ...]
-"""Stiffness losses of the damage regions, in their order."""
+"""Stiffness losses of the damage regions, in the order of the design."""
 
-GivenLosses = Mapping[str, float] | Iterable[float]
-"""The same by name, or in their order."""
+LossValues = Mapping[str, float] | Iterable[float]
+"""Stiffness losses as a caller may give them: by region name, or in the order of the regions."""
+
 MOST_REGIONS = 8
 """Largest number of damage regions of a structure."""
 
-
-def region_names(count: int) -> tuple[str, ...]:
-    """Return the names of damage regions that bear none of their own: z1, z2 and so on."""
-    return tuple(f"z{number}" for number in range(1, count + 1))
-
-
-WING = "uav_wing"
+WING_MODEL_NAME = "uav_wing"
 """Name of the reduced model of a wing."""
 
 TIP_FORCE = 1
-"""Number of the load near the tip among those of a wing; the first is the lift."""
+"""Number of the load near the tip among the loads of a wing; load 0 is the lift."""
+
 STANDARD_GRAVITY = 9.80665
 """[m/s^2]."""
 
 
-def wing_names(regions: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of all that can be chosen of a wing, in the order of `ReducedArrays.chosen`."""
-    return ("young_modulus_factor", *regions, "servo_mass", "pitot_mass", "load_factor", "tip_force")
+def default_region_names(count: int) -> tuple[str, ...]:
+    """Return names for damage regions that the design does not name: z1, z2 and so on."""
+    return tuple(f"z{number}" for number in range(1, count + 1))
 
 
-def losses_of(stiffness_loss: GivenLosses, regions: tuple[str, ...]) -> Losses:
-    """Return one stiffness loss for each region, in their order.
+def wing_input_names(regions: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of all inputs of a wing, in the order of `ReducedArrays.input_names`."""
+    return (
+        "young_modulus_factor",
+        *regions,
+        "servo_mass",
+        "pitot_mass",
+        "load_factor",
+        "tip_force",
+    )
+
+
+def losses_of(stiffness_loss: LossValues, regions: tuple[str, ...]) -> Losses:
+    """Return one stiffness loss for each region, in the order of the regions.
 
     Parameters
     ----------
     stiffness_loss : mapping of str to float, or iterable of float
-        Fractions by name, where regions that are left out are healthy; or in the order of the regions, where
-        none at all means that all are healthy.
+        Lost fractions of stiffness [1]. By name, a region that is left out is healthy; in the
+        order of the regions, an empty sequence means that all regions are healthy.
     regions : tuple of str
         Names of the regions.
 
     Raises
     ------
     InvalidStateError
-        If a name is none of a region, or there are more or fewer values than regions.
+        If a name is not that of a region, or the number of values is not that of the regions.
     """
     if isinstance(stiffness_loss, Mapping):
         for name in stiffness_loss:
@@ -60,19 +68,31 @@ def losses_of(stiffness_loss: GivenLosses, regions: tuple[str, ...]) -> Losses:
                     f"There is no damage region {name!r}; the regions are {', '.join(regions)}."
                 )
         return tuple(float(stiffness_loss.get(name, 0.0)) for name in regions)
-    loss = tuple(stiffness_loss) or (0.0,) * len(regions)
-    if len(loss) != len(regions):
+    losses = tuple(stiffness_loss)
+    if not losses:
+        return (0.0,) * len(regions)
+    if len(losses) != len(regions):
         raise InvalidStateError(
-            f"stiffness_loss must hold {len(regions)} fractions, one for each of {', '.join(regions)}, but "
-            f"{len(loss)} were given."
+            f"stiffness_loss must hold {len(regions)} fractions, one for each of "
+            f"{', '.join(regions)}, but {len(losses)} were given."
         )
-    return loss
+    return losses
 
 
-def _require(name: str, value: float, *, positive: bool) -> None:
-    if not (math.isfinite(value) and (value > 0.0 if positive else value >= 0.0)):
-        wanted = "a positive finite number" if positive else "zero or a positive finite number"
-        raise InvalidStateError(f"{name} must be {wanted}, but {value!r} was given.")
+def _require_positive(name: str, value: float) -> None:
+    """Raise `InvalidStateError` unless a value is positive and finite."""
+    if not (math.isfinite(value) and value > 0.0):
+        raise InvalidStateError(
+            f"{name} must be a positive finite number, but {value!r} was given."
+        )
+
+
+def _require_not_negative(name: str, value: float) -> None:
+    """Raise `InvalidStateError` unless a value is zero or positive, and finite."""
+    if not (math.isfinite(value) and value >= 0.0):
+        raise InvalidStateError(
+            f"{name} must be zero or a positive finite number, but {value!r} was given."
+        )
 
 
 @dataclass(frozen=True)
@@ -98,7 +118,7 @@ class Geometry:
 
     def __post_init__(self) -> None:
         for name in ("semi_span", "root_chord", "tip_chord"):
-            _require(f"geometry.{name}", getattr(self, name), positive=True)
+            _require_positive(f"geometry.{name}", getattr(self, name))
 
 
 @dataclass(frozen=True)
@@ -120,13 +140,14 @@ class DigitalState:
     damping_beta : float
         Stiffness-proportional Rayleigh coefficient, eq. (17) [s].
     stiffness_loss : tuple of float
-        z, the fractions of stiffness that the damage regions have lost, in the order of the design [1]; 0 is
-        healthy, 1 would be no stiffness at all and is refused. Empty: all regions are healthy.
+        z, the fractions of stiffness that the damage regions have lost, in the order of the design
+        [1]. A healthy region has 0; 1 would be no stiffness at all and is refused. Empty: all
+        regions are healthy.
 
     Raises
     ------
     InvalidStateError
-        If a value is not finite or lies where no wing can be.
+        If a value is not finite or outside its physical range.
     """
 
     geometry: Geometry = field(default_factory=Geometry)
@@ -139,18 +160,18 @@ class DigitalState:
 
     @property
     def values(self) -> dict[str, float]:
-        """Factor and masses by the names of `wing_names`."""
+        """The modulus factor and the masses, by their names among a wing's inputs."""
         names = ("young_modulus_factor", "servo_mass", "pitot_mass")
         return {name: getattr(self, name) for name in names}
 
     def __post_init__(self) -> None:
-        _require("young_modulus_factor", self.young_modulus_factor, positive=True)
+        _require_positive("young_modulus_factor", self.young_modulus_factor)
         for name in ("servo_mass", "pitot_mass", "damping_alpha", "damping_beta"):
-            _require(name, getattr(self, name), positive=False)
+            _require_not_negative(name, getattr(self, name))
         if len(self.stiffness_loss) > MOST_REGIONS:
             raise InvalidStateError(
-                f"stiffness_loss must hold at most {MOST_REGIONS} fractions, one for each damage region, but "
-                f"{len(self.stiffness_loss)} were given."
+                f"stiffness_loss must hold at most {MOST_REGIONS} fractions, one for each damage "
+                f"region, but {len(self.stiffness_loss)} were given."
             )
         for number, loss in enumerate(self.stiffness_loss, start=1):
             if not (math.isfinite(loss) and 0.0 <= loss < 1.0):

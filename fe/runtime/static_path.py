@@ -1,166 +1,347 @@
-"""Where ports with laws rest, load level after load level: x + C F(x) = x_linear; or one in motion.
+"""Positions of ports with laws: at rest, load level after load level, or of one port in motion.
 
-Written in the subset of Python that numba compiles too. NumPy and relative imports only: this file is copied
-into the FMU.
+At rest x + C F(x) = x_linear. Written in the subset of Python that numba compiles too. NumPy and
+relative imports only: this file is copied into the FMU.
 """
 
 import numpy as np
 
 from . import laws
-from .arrays import FADING, FORCE, LAGGED, PLACE
-from .motion_arrays import FloatArray, Ports, Unnamed
-
-
-def static_forces(x: FloatArray, ports: Ports, memory: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return forces and slopes (J,) at positions `x` (J,) reached from `memory`, which stays as it is.
-
-    Laws of speed are zero at rest.
-    """
-    forces, slopes = np.zeros(len(x)), np.zeros(len(x))
-    for j in range(len(x)):
-        if ports.of_speed[j] == 0:
-            forces[j], slopes[j] = laws.pull(ports.numbers[j], ports.values[j], memory[j], x[j], 1.0)
-    return forces, slopes
+from .arrays import FADING_POSITION, FORCE, LAGGED_FORCE, POSITION
+from .laws import speed
+from .motion_arrays import FloatArray, PortArrays, RecordFields
 
 
 def static_path(
-    linear: FloatArray, compliance: FloatArray, at_ports: Unnamed, memory: FloatArray, start: FloatArray,
-    positions: FloatArray, forces: FloatArray,
-) -> int:  # fmt: skip
-    """Solve x + C F(x) = x_linear for load levels one after the other; `memory` is advanced in place.
+    linear: FloatArray,
+    compliance: FloatArray,
+    port_fields: RecordFields,
+    memory: FloatArray,
+    start: FloatArray,
+    positions: FloatArray,
+    forces: FloatArray,
+) -> int:
+    """Solve x + C F(x) = x_linear for load levels that follow one another.
 
-    Newton's method with halved steps; a level that it does not reach is approached in up to 256 parts.
+    A level that Newton's method does not reach in one step is approached in up to 256 parts.
 
     Parameters
     ----------
-    linear : (L, J) ndarray
-        Positions of the ports without internal forces.
-    compliance : (J, J) ndarray
-        C, positions of the ports under unit forces at them.
-    at_ports : tuple
-        The fields of `Ports`; what they do to modes is not used.
-    memory : (J, 5 + E) ndarray
-        State at the start.
-    start : (J,) ndarray
+    linear : (L, J) array
+        x_linear, positions of the laws' ports without internal forces, at each level.
+    compliance : (J, J) array
+        C, positions of the ports (rows) under unit forces at them (columns).
+    port_fields : tuple
+        Fields of `PortArrays`; those of modes are not used.
+    memory : (J, 5 + E) array
+        Memory of the laws at the start; changed in place to that of the last level.
+    start : (J,) array
         Linear positions at the start; zero at rest without load.
-    positions, forces : (L, J) ndarray
-        Results.
+    positions, forces : (L, J) array
+        Results, in place: positions of the ports and forces of the laws.
 
     Returns
     -------
     int
         -1, or the number of the level that has no solution.
     """
-    ports, count = Ports(*at_ports), len(start)
-    old, x = start.copy(), memory[:, PLACE].copy()
-    own, unit = np.zeros(count), np.eye(count)
+    ports = PortArrays(*port_fields)
+    count = len(start)
+    previous = start.copy()
+    x = memory[:, POSITION].copy()
+    x_forces = np.zeros(count)
     for level in range(len(linear)):
-        done, step = 0.0, 1.0
+        # from the previous level in parts, as large as Newton's method takes them
+        done = 0.0
+        part = 1.0
         while done < 1.0:
-            goal = old + (linear[level] - old) * min(done + step, 1.0)
-            guess = x.copy()
-            own, slopes = static_forces(guess, ports, memory)
-            yielded = compliance @ own  # what a law that pulls without a load moves
-            scale = np.max(np.abs(goal)) + np.max(np.abs(x)) + np.max(np.abs(yielded)) + 1e-300
-            residual = guess + yielded - goal
-            size = np.max(np.abs(residual))
-            for _ in range(60):
-                if size <= 1e-12 * scale:
-                    break
-                # A singular matrix is moved off its zero. Compiled, `solve` takes five seconds longer.
-                move = np.linalg.inv(unit + compliance * slopes + 1e-14 * unit) @ residual
-                fraction, before = 1.0, size
-                while size == before and fraction > 4e-4:
-                    candidate = guess - fraction * move
-                    trial, trial_slopes = static_forces(candidate, ports, memory)
-                    rest = candidate + compliance @ trial - goal
-                    if np.max(np.abs(rest)) < size:
-                        guess, own, slopes, residual = candidate, trial, trial_slopes, rest
-                        size = np.max(np.abs(rest))
-                    fraction *= 0.5
-                if size == before:
-                    break
-            # What is left may be rounding, or a kink met exactly. A solution that is not stable lies on
-            # another branch, beyond a snap.
-            if size <= 1e-9 * scale and np.linalg.det(unit + compliance * slopes) > -1e-9:
-                x = guess
-                for j in range(count):
-                    if ports.of_speed[j] == 0:
-                        laws.advance(ports.numbers[j], ports.values[j], memory[j], x[j])
-                    memory[j, PLACE], memory[j, FADING] = x[j], 0.0
-                    memory[j, LAGGED] = memory[j, FORCE] = own[j]
-                done = min(done + step, 1.0)
-                step *= 2.0
+            goal = previous + (linear[level] - previous) * min(done + part, 1.0)
+            solved, solution, x_forces = solve_static_position(goal, x, ports, memory, compliance)
+            if solved:
+                x = solution
+                update_memory(ports, memory, x, x_forces)
+                done = min(done + part, 1.0)
+                part *= 2.0
             else:
-                step *= 0.5
-                if step < 1.0 / 256.0:
+                part *= 0.5
+                if part < 1.0 / 256.0:
                     return level
-        old = linear[level]
+        previous = linear[level]
         for j in range(count):  # numba takes two seconds to compile `positions[level] = x`
             positions[level, j] = x[j]
-            forces[level, j] = own[j]
+            forces[level, j] = x_forces[j]
     return -1
 
 
-def settle_port(port: int, ports: Ports, memory: FloatArray, y: float, r: float, h: float) -> float:
-    """Return the position x of a port with laws, x + r sum F(x) = y; their forces go to the memory.
+def solve_static_position(
+    goal: FloatArray,
+    start: FloatArray,
+    ports: PortArrays,
+    memory: FloatArray,
+    compliance: FloatArray,
+) -> tuple[bool, FloatArray, FloatArray]:
+    """Solve x + C F(x) = goal by Newton's method, with halved steps where a full one overshoots.
 
-    The laws are those whose leader is `port`; of those of position, the memory has the forces at the last
-    position. Dry friction first: where it can hold the port, it does. Without a duration `h` forces of speed
-    stay what they are. Nothing else of the memory changes.
+    Parameters
+    ----------
+    goal, start : (J,) array
+        Linear positions of the ports, and the positions from which to begin.
+    ports : PortArrays
+        The laws.
+    memory : (J, 5 + E) array
+        Their memory; not changed.
+    compliance : (J, J) array
+        C.
+
+    Returns
+    -------
+    solved : bool
+        Whether this is a solution, and a stable one.
+    x, forces : (J,) array
+        Positions of the ports and forces of the laws.
     """
-    count = len(ports.numbers)
-    last = memory[port, PLACE]
-    start, level, tolerance = 0.0, 0.0, 1e-12
-    for j in range(count):
+    unit = np.eye(len(goal))
+    x = start.copy()
+    forces, slopes = static_forces(x, ports, memory)
+    displaced = compliance @ forces  # not zero without a load where a law has a preload
+    scale = np.max(np.abs(goal)) + np.max(np.abs(start)) + np.max(np.abs(displaced)) + 1e-300
+    residual = x + displaced - goal
+    size = np.max(np.abs(residual))
+    for _ in range(60):
+        if size <= 1e-12 * scale:
+            break
+        # a singular matrix is moved off its zero; compiled, `solve` takes five seconds longer
+        step = np.linalg.inv(unit + compliance * slopes + 1e-14 * unit) @ residual
+        fraction = 1.0
+        previous_size = size
+        while size == previous_size and fraction > 4e-4:
+            candidate = x - fraction * step
+            candidate_forces, candidate_slopes = static_forces(candidate, ports, memory)
+            candidate_residual = candidate + compliance @ candidate_forces - goal
+            candidate_size = np.max(np.abs(candidate_residual))
+            if candidate_size < size:
+                x = candidate
+                forces = candidate_forces
+                slopes = candidate_slopes
+                residual = candidate_residual
+                size = candidate_size
+            fraction *= 0.5
+        if size == previous_size:
+            break
+    # The remaining residual may be rounding, or a kink met exactly. A solution that is not stable
+    # lies on another branch, beyond a snap.
+    solved = size <= 1e-9 * scale and np.linalg.det(unit + compliance * slopes) > -1e-9
+    return solved, x, forces
+
+
+def static_forces(
+    x: FloatArray, ports: PortArrays, memory: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return forces of the laws and their slopes (J,) at rest, at positions `x` (J,) of the ports.
+
+    Laws of speed are zero at rest. The memory, from which the positions are reached, is not
+    changed.
+    """
+    forces = np.zeros(len(x))
+    slopes = np.zeros(len(x))
+    for j in range(len(x)):
+        if ports.depends_on_speed[j] == 0:
+            forces[j], slopes[j] = laws.force_and_slope(
+                ports.law_number[j], ports.parameters[j], memory[j], x[j], 1.0
+            )
+    return forces, slopes
+
+
+def update_memory(ports: PortArrays, memory: FloatArray, x: FloatArray, forces: FloatArray) -> None:
+    """Carry the memory of the laws to positions `x` (J,) at rest under `forces` (J,), in place."""
+    for j in range(len(x)):
+        if ports.depends_on_speed[j] == 0:
+            laws.advance(ports.law_number[j], ports.parameters[j], memory[j], x[j])
+        memory[j, POSITION] = x[j]
+        memory[j, FADING_POSITION] = 0.0
+        memory[j, FORCE] = forces[j]
+        memory[j, LAGGED_FORCE] = forces[j]
+
+
+def solve_port_position(
+    port: int, ports: PortArrays, memory: FloatArray, y: float, r: float, h: float
+) -> float:
+    """Return the position x of a port in motion, where x + r sum F(x) = y.
+
+    Newton's method inside of a bracket. Where dry friction can hold the port, the position does not
+    change at all.
+
+    Parameters
+    ----------
+    port : int
+        Leader of the laws that act there.
+    ports : PortArrays
+        The laws.
+    memory : (J, 5 + E) array
+        Their memory, with the forces at the last position for laws of position. The new forces of
+        the port's laws are written to it, and nothing else.
+    y : float
+        Position of the port without these forces.
+    r : float
+        Flexibility of the port with which it follows a force within the step.
+    h : float
+        Duration of the step [s]; without one, forces of speed stay what they are.
+    """
+    last = memory[port, POSITION]
+    start, friction, tolerance = forces_at_last_position(port, ports, memory, h)
+    displacement = y - last - r * start
+    if friction > 0.0 and abs(displacement) <= r * friction:
+        share_friction(port, ports, memory, displacement / r, friction, h)
+        return float(last)
+    # the root lies in this direction from the last position, if the structure is stable
+    sign = 1.0 if displacement > 0.0 else -1.0
+    low = last
+    high = last + sign * 1e300
+    x = last + sign * max(abs(displacement) - r * friction, 0.0)
+    evaluated = x
+    residual = 0.0
+    steepest = port
+    for _ in range(80):
+        total, slope, steepest = port_forces(port, ports, memory, x, r, h, sign, steepest)
+        residual = x + r * total - y
+        evaluated = x
+        if abs(residual) <= 1e-13 * abs(displacement) + tolerance * (abs(x) + abs(y)):
+            return float(x)
+        # the bracket
+        if sign * residual > 0.0:
+            high = x
+        else:
+            low = x
+        if abs(high - low) <= 1e-15 * abs(x):
+            break
+        # Newton's step where it stays inside of the bracket
+        newton = x - residual / slope if slope > 1e-6 else high
+        if sign * (newton - low) > 0.0 and sign * (high - newton) > 0.0:
+            x = newton
+        elif abs(high) < 1e299:  # near to the low end, where a force of speed may rise steeply
+            x = low + 0.1 * (high - low)
+        else:
+            x += sign * abs(residual)
+    # the steepest force rises within rounding: it gives what is missing
+    if r > 0.0:
+        memory[steepest, FORCE] -= residual / r
+    return float(evaluated)
+
+
+def forces_at_last_position(
+    port: int, ports: PortArrays, memory: FloatArray, h: float
+) -> tuple[float, float, float]:
+    """Return what the laws of a port can do at its last position, before it moves.
+
+    Forces of speed are set to zero in the memory, but without a duration `h` they stay.
+
+    Returns
+    -------
+    force : float
+        Sum of the forces in the memory that stay.
+    friction : float
+        Largest force of dry friction.
+    tolerance : float
+        Relative accuracy to which the position must be solved.
+    """
+    last = memory[port, POSITION]
+    force = 0.0
+    friction = 0.0
+    tolerance = 1e-12
+    for j in range(len(ports.law_number)):
         if ports.leader[j] != port:
             continue
-        if ports.of_speed[j] == 0 or h == 0.0:
-            start += memory[j, FORCE]
+        if ports.depends_on_speed[j] == 0 or h == 0.0:
+            force += memory[j, FORCE]
             continue
         tolerance = 1e-15  # a speed is a small difference of positions
         memory[j, FORCE] = 0.0
-        if ports.values[j, 1] == 0.0:
-            level += laws.pull(ports.numbers[j], ports.values[j], memory[j], last, h)[0]
-    push = y - last - r * start
-    if level > 0.0 and abs(push) <= r * level:
-        for j in range(count):
-            if ports.leader[j] == port and ports.of_speed[j] == 1 and ports.values[j, 1] == 0.0:
-                own, _ = laws.pull(ports.numbers[j], ports.values[j], memory[j], last, h)
-                memory[j, FORCE] = push / r * own / level
-        return float(last)
-    sign = 1.0 if push > 0.0 else -1.0
-    # the root lies that way from the last position, if the structure is stable
-    low, high = last, last + sign * 1e300
-    x, rest, steep = last + sign * max(abs(push) - r * level, 0.0), 0.0, port
-    at = x
-    for _ in range(80):
-        total, slope, steepest = 0.0, 1.0, -1.0
-        for j in range(count):
-            if ports.leader[j] != port:
-                continue
-            if ports.of_speed[j] == 0 or h > 0.0:
-                own, change = laws.pull(ports.numbers[j], ports.values[j], memory[j], x, h)
-                if ports.of_speed[j] == 1 and ports.values[j, 1] == 0.0:
-                    own, change = sign * own, sign * change
-                memory[j, FORCE] = own
-                slope += r * change
-                if change > steepest:
-                    steep, steepest = j, change
-            total += memory[j, FORCE]
-        rest, at = x + r * total - y, x
-        if abs(rest) <= 1e-13 * abs(push) + tolerance * (abs(x) + abs(y)):
-            return float(x)
-        low, high = (low, x) if sign * rest > 0.0 else (x, high)
-        if abs(high - low) <= 1e-15 * abs(x):
-            break
-        step = x - rest / slope if slope > 1e-6 else high
-        if sign * (step - low) > 0.0 and sign * (high - step) > 0.0:
-            x = step
-        elif abs(high) < 1e299:  # nearer to where the way begins: a force of speed may rise steeply there
-            x = low + 0.1 * (high - low)
-        else:
-            x += sign * abs(rest)
-    if r > 0.0:  # a force that rises within rounding gives what is missing
-        memory[steep, FORCE] -= rest / r
-    return float(at)
+        if speed.is_dry_friction(ports.parameters[j]):
+            largest, _ = laws.force_and_slope(
+                ports.law_number[j], ports.parameters[j], memory[j], last, h
+            )
+            friction += largest
+    return force, friction, tolerance
+
+
+def share_friction(
+    port: int,
+    ports: PortArrays,
+    memory: FloatArray,
+    force: float,
+    friction: float,
+    h: float,
+) -> None:
+    """Share a force among the laws of dry friction of a port, by their largest forces.
+
+    Parameters
+    ----------
+    port, ports, memory, h
+        The port, its laws, their memory and the duration of the step, see `solve_port_position`.
+    force : float
+        The force that holds the port.
+    friction : float
+        Sum of the largest forces.
+    """
+    last = memory[port, POSITION]
+    for j in range(len(ports.law_number)):
+        is_of_port = ports.leader[j] == port and ports.depends_on_speed[j] == 1
+        if is_of_port and speed.is_dry_friction(ports.parameters[j]):
+            largest, _ = laws.force_and_slope(
+                ports.law_number[j], ports.parameters[j], memory[j], last, h
+            )
+            memory[j, FORCE] = force * largest / friction
+
+
+def port_forces(
+    port: int,
+    ports: PortArrays,
+    memory: FloatArray,
+    x: float,
+    r: float,
+    h: float,
+    sign: float,
+    steepest: int,
+) -> tuple[float, float, int]:
+    """Return the forces of a port's laws at position `x`; each force is written to the memory.
+
+    Parameters
+    ----------
+    port, ports, memory, r, h
+        The port, its laws, their memory, its flexibility and the duration of the step, see
+        `solve_port_position`.
+    x : float
+        Position of the port.
+    sign : float
+        Sign of the motion, for dry friction.
+    steepest : int
+        A law of the port, in case that no force rises.
+
+    Returns
+    -------
+    total : float
+        Sum of the forces.
+    slope : float
+        1 + r times the sum of their derivatives by `x`.
+    steepest : int
+        The law whose force rises most steeply.
+    """
+    total = 0.0
+    slope = 1.0
+    largest_slope = -1.0
+    for j in range(len(ports.law_number)):
+        if ports.leader[j] != port:
+            continue
+        if ports.depends_on_speed[j] == 0 or h > 0.0:
+            law = ports.parameters[j]
+            force, force_slope = laws.force_and_slope(ports.law_number[j], law, memory[j], x, h)
+            if ports.depends_on_speed[j] == 1 and speed.is_dry_friction(law):
+                force = sign * force
+                force_slope = sign * force_slope
+            memory[j, FORCE] = force
+            slope += r * force_slope
+            if force_slope > largest_slope:
+                steepest = j
+                largest_slope = force_slope
+        total += memory[j, FORCE]
+    return total, slope, steepest

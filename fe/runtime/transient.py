@@ -1,229 +1,207 @@
-"""A structure in time: at rest, or its first modes moving, with or without forces of laws at its ports.
+"""A structure in time: at rest, or its first modes moving, with or without laws at its ports.
 
-Kapteyn et al. 2021, eq. (12), in modal coordinates: q'' + 2 zeta omega q' + omega^2 q = shape^T f, one
-equation for each mode, because Rayleigh damping (17) leaves the modes uncoupled; exact for loads that are
-held. Modes that are not kept follow the load without delay (static correction). Laws at ports couple the
-modes: `fe.runtime.motion` steps them, and omitted modes follow their forces with the lag of the damping.
+Kapteyn et al. 2021, eq. (12), in modal coordinates: q'' + 2 zeta omega q' + omega^2 q = shape^T f,
+one equation for each mode, because Rayleigh damping (17) does not couple the modes. It is exact for
+loads that are held. The modes that are left out follow the loads without delay (static correction).
+Laws at ports couple the modes: `fe.runtime.motion` makes the steps then, and the modes that are
+left out follow the forces of the laws with the lag of the damping.
 
-NumPy and relative imports only: this file is copied into the FMU. Laws are imported where there are any.
+NumPy and relative imports only: this file is copied into the FMU. The modules of laws are imported
+only where there are laws.
 """
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from math import exp, isfinite
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from .arrays import FADING, HEAD, LAGGED, FloatArray
+from .arrays import FADING_POSITION, FIRST_ELEMENT, LAGGED_FORCE, FloatArray
 from .errors import InvalidStateError
-from .modal_system import ModalSystem, rayleigh_damping_ratio
+from .structure_in_motion import StructureInMotion
+from .unit_responses import UnitResponses
 
 if TYPE_CHECKING:
     from .motion_arrays import ModalMotion
-    from .patched_wing import PatchedWing
-    from .reduced import ReducedModel
+    from .port_laws import PortLaws
 
 
 INSTANT = 1e-6
-"""Duration of a step of which only the begin is looked at [s]."""
+"""Duration of a step of which only the begin matters [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class TransientState:
-    """All that a structure remembers between two steps.
+    """All that a structure remembers between two time steps.
 
     Attributes
     ----------
-    displacement : (M,) ndarray
-        Modal coordinates q [m kg^1/2]; none of a structure at rest, which has no motion to remember.
-    velocity : (M,) ndarray
-        Their rates [m kg^1/2 / s].
-    load : (L,) ndarray
-        Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force [N].
-    memory : (J, 5 + E) ndarray
-        What the laws remember; in a column the forces as omitted modes follow them.
+    displacement : (M,) array
+        Modal coordinates q [m kg^1/2]; empty for a structure at rest, which has no motion.
+    velocity : (M,) array
+        Modal velocities [m kg^1/2 / s].
+    load : (L,) array
+        Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force
+        [N].
+    memory : (J, 5 + E) array
+        Memory of the laws; a column has the forces as the modes that are left out follow them.
     """
 
     displacement: FloatArray
     velocity: FloatArray
     load: FloatArray
-    memory: FloatArray = field(default_factory=lambda: np.zeros((0, HEAD)))
+    memory: FloatArray = field(default_factory=lambda: np.zeros((0, FIRST_ELEMENT)))
+
+    @property
+    def moves(self) -> bool:
+        """Whether the state has a motion, even one of zero speed."""
+        return len(self.displacement) > 0
 
 
 class ModalIntegrator:
-    """Response of a structure in time, at one state of health, parameters and masses.
+    """The response of a structure in time, at fixed health, parameters and masses.
 
-    The integrator itself never changes; what changes is the `TransientState` that its methods take and give.
-    When health changes, make another integrator and let it take over the state (`take_over`).
+    The integrator never changes; its methods take a `TransientState` and return a new one. When the
+    health changes, make another integrator and let it take over the state (`take_over`).
 
     Parameters
     ----------
-    model : ReducedModel or PatchedWing
-        The structure.
-    vector : (V,) ndarray
-        Values of all that can be chosen; those of the controls do not matter.
+    structure : StructureInMotion
+        The structure, from `structure_at` of a `ReducedModel` or a `PatchedWing`.
     damping_alpha, damping_beta : float
         Rayleigh damping [1/s], [s].
-    *changes
-        Further arguments of the model's `at`: of a wing for patches its patch and temperature.
 
     Attributes
     ----------
-    structure : ReducedState or PatchedState
-        The structure in this state, in n coordinates of its own: its `laws`, J forces at its ports, or None;
-        `loads` (n, L + J), unit loads, then those at the ports of the laws, also what their points move by,
-        and `answers` (n, L + J), displacements at rest under them; M `modes`, their `shapes` (n, M),
-        mass-normalised, and `to_modes` (M, n), modal coordinates of a displacement; rows of `outputs` (O, n),
-        the last of them where a release is measured, and `accelerations` (A, n); rows `components` (2, G, n)
-        of the strains across the gauges and in shear, none where no sensor asks for them; `holding`, the
-        number of the load that acts before a release alone, and whose end omitted modes follow as they do
-        forces of laws, None where they follow at once; `on_modes`, ports whose position is that of the modes
-        alone; `acting`, the coefficients (L,) of the loads at values (V,) of all that can be chosen.
-    modes : object
+    structure : StructureInMotion
+        The structure.
+    modes : ModeSet
         Its modes.
-    damping_ratio : (M,) ndarray
-        Damping ratios of its modes, eq. (18).
+    damping_ratio : (M,) array
+        Damping ratios of the modes, eq. (18).
 
     Raises
     ------
-    OutsideModelError
-        If a value lies outside the model's validity box.
-    InvalidPatchError
-        If the structure cannot carry the patch.
     InvalidStateError
         If a Rayleigh coefficient is negative or not finite.
     """
 
     def __init__(
-        self, model: "ReducedModel | PatchedWing", vector: FloatArray, damping_alpha: float,
-        damping_beta: float, *changes: Any,
-    ) -> None:  # fmt: skip
+        self, structure: StructureInMotion, damping_alpha: float, damping_beta: float
+    ) -> None:
         for name, value in (("damping_alpha", damping_alpha), ("damping_beta", damping_beta)):
             if not (isfinite(value) and value >= 0.0):
-                raise InvalidStateError(f"{name} must be zero or a positive finite number, but is {value!r}.")
-        self.structure = model.at(vector, *changes)
-        self._rayleigh = damping_alpha, damping_beta
-        self.modes, self._laws = self.structure.modes, self.structure.laws
-        self._count = 0 if self._laws is None else len(self._laws)
-        self._loads = self.structure.loads.shape[1] - self._count
+                raise InvalidStateError(
+                    f"{name} must be zero or a positive finite number, but is {value!r}."
+                )
+        self.structure = structure
+        self.modes = structure.modes
+        self._responses = UnitResponses(structure, damping_alpha, damping_beta)
+        self._laws = structure.laws
+        self._law_count = 0 if self._laws is None else len(self._laws)
 
-    @cached_property
+    @property
     def damping_ratio(self) -> FloatArray:
         """Damping ratios (M,) of the modes."""
-        return rayleigh_damping_ratio(*self._rayleigh, self.modes.frequency)
+        return self._responses.damping_ratio
 
-    @cached_property
-    def _omega(self) -> FloatArray:
-        return np.asarray(2.0 * np.pi * self.modes.frequency)
+    # ------------------------------------------------------------ states at rest
 
-    @cached_property
-    def _participation(self) -> FloatArray:
-        """Modal forces (M, L + J) of the unit loads."""
-        return np.asarray(self.structure.shapes.T @ self.structure.loads)
+    def equilibrium(
+        self, load: npt.ArrayLike, previous: TransientState | None = None
+    ) -> TransientState:
+        """Return the equilibrium under loads, as a state without motion.
 
-    @cached_property
-    def _modal_static(self) -> FloatArray:
-        return np.asarray(self._participation / self._omega[:, np.newaxis] ** 2)
-
-    @cached_property
-    def _left_out(self) -> FloatArray:
-        """What the modes that are not kept add to the displacements (n, L + J) under the unit loads."""
-        return np.asarray(self.structure.answers - self.structure.shapes @ self._modal_static)
-
-    @cached_property
-    def _seen(self) -> tuple[FloatArray, FloatArray]:
-        """Outputs (O, M) by modal coordinates, and (O, L + J) by what is beyond the modes."""
-        return self.structure.outputs @ self.structure.shapes, self.structure.outputs @ self._left_out
-
-    @cached_property
-    def _port_answers(self) -> FloatArray:
-        """Motion (J, L + J) of the ports of the laws at rest under the unit loads."""
-        return np.asarray(self.structure.loads[:, self._loads :].T @ self.structure.answers)
-
-    @cached_property
-    def _system(self) -> ModalSystem:
-        """The modes with the ports of the laws."""
-        alpha, beta = self._rayleigh
-        damping = np.diag(alpha + beta * self._omega**2)
-        if self._laws is None:
-            return ModalSystem(self._omega, damping)
-        rows, names = self._participation[:, self._loads :].T, self._laws.ports
-        whole = np.diag(self._port_answers[:, self._loads :])
-        left_out = whole - np.sum((rows / self._omega) ** 2, axis=1)
-        flexible = np.array([name not in self.structure.on_modes for name in names], dtype=bool)
-        left_out = np.where((left_out > 1e-9 * whole) & flexible, left_out, 0.0)  # less is rounding
-        ports, beyond = (dict(zip(names, item, strict=True)) for item in (rows, left_out.tolist()))
-        return ModalSystem(self._omega, damping, ports, np.array(list(beyond.values())), beta)
-
-    def _moved(
-        self, state: TransientState, acting: FloatArray, duration: float, time: float
-    ) -> "ModalMotion":
-        """Return the motion under laws and loads (L,) that are held, at the begin and the end."""
-        from .motion import Begin, advance, steps_under, substeps
-
-        assert self._laws is not None
-        boundaries = substeps(self._system, self._laws, np.array([0.0, duration]))
-        held = np.tile(self._participation[:, : self._loads] @ acting, (len(boundaries.lengths), 1))
-        beyond = self.structure.loads[:, self._loads :].T @ (self._left_out[:, : self._loads] @ acting)
-        feed = np.tile(beyond, (len(boundaries.time), 1))
-        steps = steps_under(self._system, boundaries, held, held, feed)
-        begin = Begin(state.displacement, state.velocity, state.memory)
-        return advance(self._system, self._laws, steps._replace(time=time + steps.time), begin)
-
-    def settled(self, load: npt.ArrayLike, before: TransientState | None = None) -> TransientState:
-        """Return the equilibrium, without motion, under loads (L,) that are reached from those `before`.
+        Parameters
+        ----------
+        load : (L,) array_like
+            Coefficients of the loads.
+        previous : TransientState, optional
+            The equilibrium from which the loads are reached, by default that without loads.
 
         Raises
         ------
         SolutionError
             If laws have no equilibrium on the way.
         """
-        acting, none = np.array(load, dtype=np.float64), np.zeros(0)
-        if not self._count:
-            return TransientState(none, none, acting)
+        loads = np.array(load, dtype=np.float64)
+        no_motion = np.zeros(0)
+        if not self._law_count:
+            return TransientState(no_motion, no_motion, loads)
         assert self._laws is not None
-        linear, compliance = np.split(self._port_answers, [self._loads], axis=1)
-        before = before or TransientState(none, none, np.zeros(self._loads), self._laws.memory())
-        _, memory = self._loaded(linear @ acting, compliance, before.memory, linear @ before.load)
-        return TransientState(none, none, acting, memory)
+        if previous is None:
+            unloaded = np.zeros(self._responses.load_count)
+            memory = self._laws.unloaded_memory()
+            previous = TransientState(no_motion, no_motion, unloaded, memory)
+        _, memory = self._law_forces_at_rest(
+            linear=self._responses.port_positions_by_loads @ loads,
+            compliance=self._responses.port_compliance,
+            memory=previous.memory,
+            start=self._responses.port_positions_by_loads @ previous.load,
+        )
+        return TransientState(no_motion, no_motion, loads, memory)
 
-    def _loaded(
+    def _law_forces_at_rest(
         self, linear: FloatArray, compliance: FloatArray, memory: FloatArray, start: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return forces (J,) and memory of the laws at linear positions (J,), see `static_solution`."""
+        """Return the forces (J,) of the laws at rest, and their memory (J, 5 + E).
+
+        Parameters
+        ----------
+        linear, start : (J,) array
+            Positions of the laws' ports without internal forces, now and before.
+        compliance : (J, J) array
+            Positions of the ports under unit forces at them.
+        memory : (J, 5 + E) array
+            Memory of the laws before.
+        """
         from .motion import static_solution
 
         assert self._laws is not None
-        found = static_solution(self._laws, linear[np.newaxis], compliance, memory=memory, start=start)
-        return found.forces[0], found.memory
+        solution = static_solution(
+            self._laws, linear[np.newaxis], compliance, memory=memory, start=start
+        )
+        return solution.forces[0], solution.memory
 
-    def at_rest(self, load: npt.ArrayLike) -> TransientState:
-        """Return the state of equilibrium under loads (L,); raises `SolutionError` as `settled`."""
-        return self._moving(self.settled(load))
+    def state_at_rest(self, load: npt.ArrayLike) -> TransientState:
+        """Return the state of a structure that can move and is at rest under loads (L,).
 
-    def _moving(self, rest: TransientState, held: FloatArray | float = 0.0) -> TransientState:
-        """Return a state at rest in its modes, which a force moves by `held`."""
-        place = self._modal_static @ self._still(rest) + held
-        return replace(rest, displacement=place, velocity=np.zeros_like(place))
+        Raises
+        ------
+        SolutionError
+            If laws have no equilibrium.
+        """
+        return self._with_still_modes(self.equilibrium(load))
+
+    def _with_still_modes(
+        self, equilibrium: TransientState, holding: FloatArray | float = 0.0
+    ) -> TransientState:
+        """Return an equilibrium with its modes at rest, moved aside by `holding` (M,)."""
+        q = self._responses.modal_coordinates @ self._static_loads(equilibrium) + holding
+        return replace(equilibrium, displacement=q, velocity=np.zeros_like(q))
 
     @staticmethod
-    def _still(state: TransientState) -> FloatArray:
-        return np.concatenate((state.load, -state.memory[:, LAGGED]))
+    def _static_loads(state: TransientState) -> FloatArray:
+        """Return the coefficients (L + J,) of the unit loads: loads and lagged forces of laws."""
+        return np.concatenate((state.load, -state.memory[:, LAGGED_FORCE]))
 
-    def released(self, aside: float, load: npt.ArrayLike, point: int) -> TransientState:
+    # ------------------------------------------------------------ motion
+
+    def state_after_release(
+        self, offset: float, load: npt.ArrayLike, holding_load: int
+    ) -> TransientState:
         """Return the state just after a structure that was held aside is let go.
 
         Parameters
         ----------
-        aside : float
+        offset : float
             How far the holding force had moved the last static output, of a wing its tip, from its
-            equilibrium under the other loads, but for what laws add: the held point is where it would be
-            without them [m].
+            equilibrium under the other loads [m]. It does not count what laws add: the held point
+            is where it would be without them.
         load : (L,) array_like
-            The loads that stay.
-        point : int
+            Coefficients of the loads that stay.
+        holding_load : int
             Number of the load that held it.
 
         Raises
@@ -231,131 +209,234 @@ class ModalIntegrator:
         SolutionError
             If laws have no equilibrium on the way.
         """
-        rest, answers = self.settled(load), self.structure.answers[:, point]
-        held = aside / float(self.structure.outputs[-1] @ answers) if aside else 0.0
-        if held and self._count:
-            # with the point held where it is moved to: x = x_linear - (C - a a^T / a_0) F
-            along, resting = self._port_answers[:, point], self._port_answers[:, : self._loads] @ rest.load
-            compliance, forces = self.structure.loads[:, point] @ answers, rest.memory[:, LAGGED]
-            start = resting - along / compliance * (along @ forces)
-            moved, memory = self._loaded(
-                start + held * along,
-                self._port_answers[:, self._loads :] - np.outer(along, along) / compliance,
-                rest.memory,
-                start,
-            )
-            held += float(along @ (moved - forces) / compliance)
-            # of the ports' positions; fades after the release
-            memory[:, FADING] = held * (self.structure.loads[:, self._loads :].T @ self._left_out[:, point])
-            rest = replace(rest, memory=memory)
-        state = self._moving(rest, self._modal_static[:, point] * held)
-        if self.structure.holding is not None and self._rayleigh[1] > 0.0:
-            state = replace(state, load=state.load + held * np.eye(self._loads)[self.structure.holding])
-        if self._count:
+        rest = self.equilibrium(load)
+        response = self.structure.unit_responses[:, holding_load]
+        force = offset / float(self.structure.output_rows[-1] @ response) if offset else 0.0
+        if force and self._law_count:
+            rest, force = self._held_by_force(rest, force, holding_load)
+        state = self._with_still_modes(
+            rest, self._responses.modal_coordinates[:, holding_load] * force
+        )
+        if self.structure.holding_load is not None and self._responses.beta > 0.0:
+            removed_load = force * np.eye(self._responses.load_count)[self.structure.holding_load]
+            state = replace(state, load=state.load + removed_load)
+        if self._law_count:
             memory = rest.memory.copy()
-            memory[:, LAGGED] = self._moved(state, rest.load, INSTANT, 0.0).lagged[0]
+            motion = self._motion_with_laws(state, rest.load, INSTANT, 0.0)
+            memory[:, LAGGED_FORCE] = motion.lagged_forces[0]
             state = replace(state, memory=memory)
         return state
+
+    def _held_by_force(
+        self, rest: TransientState, force: float, holding_load: int
+    ) -> tuple[TransientState, float]:
+        """Return the equilibrium of a structure with laws that is held aside, and the force.
+
+        The held point stays where the force moves it without laws, so that the laws change the
+        force: with a, the response of the ports to a unit force there, and a_0, that of the point
+        itself, the positions of the ports are x = x_linear - (C - a a^T / a_0) F.
+
+        Parameters
+        ----------
+        rest : TransientState
+            The equilibrium before.
+        force : float
+            The holding force without laws [N].
+        holding_load : int
+            Number of the load that holds the structure.
+        """
+        response = self.structure.unit_responses[:, holding_load]
+        ports = self._responses.port_positions[:, holding_load]
+        point = self.structure.unit_loads[:, holding_load] @ response
+        at_rest = self._responses.port_positions_by_loads @ rest.load
+        forces_before = rest.memory[:, LAGGED_FORCE]
+        start = at_rest - ports / point * (ports @ forces_before)
+        forces, memory = self._law_forces_at_rest(
+            linear=start + force * ports,
+            compliance=self._responses.port_compliance - np.outer(ports, ports) / point,
+            memory=rest.memory,
+            start=start,
+        )
+        force += float(ports @ (forces - forces_before) / point)
+        # the part of the ports' positions that fades after the release
+        residual = self._responses.residual_displacements[:, holding_load]
+        memory[:, FADING_POSITION] = force * (self._responses.law_loads.T @ residual)
+        return replace(rest, memory=memory), force
 
     def advance(
         self, state: TransientState, duration: float, load: npt.ArrayLike, time: float = 0.0
     ) -> TransientState:
-        """Return the state after loads that are held; exact for the kept modes where there are no laws.
+        """Return the state after a time step under loads that are held.
 
-        If the loads differ from those of `state`, they jump at once, and the structure overshoots.
+        The step is exact for the kept modes where there are no laws. If the loads differ from those
+        of the state, they jump at once, and the structure overshoots.
 
         Parameters
         ----------
         state : TransientState
-            The state before.
+            The state at the begin.
         duration : float
-            Time [s], positive.
+            Duration of the step [s], positive.
         load : (L,) array_like
             Coefficients of the loads.
         time : float
-            Of the begin of the step since the start, for a stiffness that drifts [s].
+            Begin of the step since the start [s], for a stiffness that drifts.
 
         Raises
         ------
         InvalidStateError
             If the duration is not positive or a load is not finite.
         """
-        acting = np.array(load, dtype=np.float64)
-        if not (isfinite(duration) and duration > 0.0 and np.isfinite(acting).all()):
+        loads = np.array(load, dtype=np.float64)
+        if not (isfinite(duration) and duration > 0.0 and np.isfinite(loads).all()):
             raise InvalidStateError(
-                f"A transient step needs a positive duration and a finite load, but got {duration!r} s and "
-                f"{load!r}."
+                "A transient step needs a positive duration and a finite load, but got "
+                f"{duration!r} s and {load!r}."
             )
         if self._laws is None or self._laws.linear:
-            (transition,), *_ = self._system.exact_steps(np.array([duration]))
-            static = self._modal_static[:, : self._loads] @ acting
-            free = transition @ np.concatenate((state.displacement - static, state.velocity))
-            # plus zero: a structure at rest has the velocity 0, not -0
-            place, velocity = free[: len(static)] + static, free[len(static) :] + 0.0
+            q, v = self._linear_step(state, loads, duration)
             memory = state.memory
         else:
-            moved = self._moved(state, acting, duration, time)
-            place, velocity, memory = moved.q[-1], moved.v[-1], moved.memory
-        holding, (_, beta) = self.structure.holding, self._rayleigh
+            motion = self._motion_with_laws(state, loads, duration, time)
+            q = motion.q[-1]
+            v = motion.v[-1]
+            memory = motion.memory
+        # the residual position still follows the end of the holding force
+        holding = self.structure.holding_load
         if holding is not None and state.load[holding] != 0.0:
-            acting[holding] = state.load[holding] * exp(-duration / beta)
-        return TransientState(place, velocity, acting, memory)
+            loads[holding] = state.load[holding] * exp(-duration / self._responses.beta)
+        return TransientState(q, v, loads, memory)
+
+    def _linear_step(
+        self, state: TransientState, loads: FloatArray, duration: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return modal coordinates and velocities (M,) after a step without laws, exactly.
+
+        They move freely about the equilibrium under the loads (L,).
+        """
+        transition = self._responses.system.exact_steps(np.array([duration])).transition[0]
+        equilibrium = self._responses.modal_coordinates[:, : self._responses.load_count] @ loads
+        begin = np.concatenate((state.displacement - equilibrium, state.velocity))
+        end = transition @ begin
+        count = len(equilibrium)
+        # plus zero: a structure at rest has the velocity 0, not -0
+        return end[:count] + equilibrium, end[count:] + 0.0
+
+    def _motion_with_laws(
+        self, state: TransientState, loads: FloatArray, duration: float, time: float
+    ) -> "ModalMotion":
+        """Return the motion of the modes with laws, at the begin and the end of a time step.
+
+        Parameters
+        ----------
+        state : TransientState
+            The state at the begin.
+        loads : (L,) array
+            Coefficients of the loads, which are held.
+        duration, time : float
+            Duration of the step, and its begin since the start [s].
+        """
+        from .motion import InitialMotion, integrate_motion
+        from .time_steps import loaded_steps, step_boundaries
+
+        assert self._laws is not None
+        boundaries = step_boundaries(self._responses.system, self._laws, np.array([0.0, duration]))
+        modal_force = self._responses.participation[:, : self._responses.load_count] @ loads
+        held = np.tile(modal_force, (len(boundaries.lengths), 1))
+        residual = self._responses.residual_displacements[:, : self._responses.load_count] @ loads
+        port_residual = self._responses.law_loads.T @ residual
+        steps = loaded_steps(
+            self._responses.system,
+            boundaries,
+            begin_force=held,
+            end_force=held,
+            residual_position=np.tile(port_residual, (len(boundaries.time), 1)),
+        )
+        return integrate_motion(
+            self._responses.system,
+            self._laws,
+            steps._replace(time=time + steps.time),
+            InitialMotion(state.displacement, state.velocity, state.memory),
+        )
+
+    # ------------------------------------------------------------ outputs
 
     def displacement(self, state: TransientState) -> FloatArray:
         """Return the displacement (n,) at a state, in the coordinates of the structure.
 
-        The modes that are not kept follow the loads at once.
+        The modes that are left out follow the loads at once.
         """
-        still = self._still(state)
-        if not len(state.displacement):
-            return np.asarray(self.structure.answers @ still)
-        return np.asarray(self.structure.shapes @ state.displacement + self._left_out @ still)
+        static_loads = self._static_loads(state)
+        if not state.moves:
+            return np.asarray(self.structure.unit_responses @ static_loads)
+        return np.asarray(
+            self.structure.mode_shapes @ state.displacement
+            + self._responses.residual_displacements @ static_loads
+        )
 
     def outputs(self, state: TransientState) -> FloatArray:
-        """Return gauges, displacements and accelerations (O + A,) at a state.
+        """Return gauges [1], displacements [m] and accelerations [m/s^2] (O + A,) at a state.
 
-        An acceleration is that of the kept modes, since the others follow loads that are held without
-        inertia; `settled` states have none.
+        An acceleration is that of the kept modes, because the others follow loads that are held
+        without inertia. A state without motion has no accelerations.
         """
-        if not len(state.displacement):
-            return np.asarray(self.structure.outputs @ self.displacement(state))
-        by_modes, beyond = self._seen
-        seen, rows = by_modes @ state.displacement + beyond @ self._still(state), self.structure.accelerations
+        if not state.moves:
+            return np.asarray(self.structure.output_rows @ self.displacement(state))
+        static_loads = self._static_loads(state)
+        outputs = (
+            self._responses.modal_outputs @ state.displacement
+            + self._responses.residual_outputs @ static_loads
+        )
+        rows = self.structure.acceleration_rows
         if not len(rows):
-            return np.asarray(seen)
-        omega = self._omega
+            return np.asarray(outputs)
+        omega = self._responses.omega
         acceleration = (
-            self._participation @ self._still(state)
+            self._responses.participation @ static_loads
             - 2.0 * self.damping_ratio * omega * state.velocity
             - omega**2 * state.displacement
         )
-        return np.concatenate((seen, rows @ (self.structure.shapes @ acceleration)))
+        return np.concatenate((outputs, rows @ (self.structure.mode_shapes @ acceleration)))
 
-    def point_displacement(self, state: TransientState, point: int) -> float:
-        """Return the displacement along the load of a number at its point [m]."""
-        return float(self.structure.loads[:, point] @ self.displacement(state))
+    def point_displacement(self, state: TransientState, load_number: int) -> float:
+        """Return the displacement of the point of a load, along the load [m]."""
+        return float(self.structure.unit_loads[:, load_number] @ self.displacement(state))
 
-    def take_over(self, state: TransientState, before: "ModalIntegrator") -> TransientState:
-        """Return a state of another integrator in the modes of this one, after a change of health or mass.
+    # ------------------------------------------------------------ change of health
 
-        Displacement and velocity of the structure stay what they were; they are projected on the new modes
-        with the new mass matrix (exactly, in reduced coordinates). The part that the new modes cannot hold
-        follows the load without delay, as always. The memory of laws stays where these are the same at the
-        same ports; others have been loaded from zero to where they are.
+    def take_over(self, state: TransientState, previous: "ModalIntegrator") -> TransientState:
+        """Return a state of another integrator in the modes of this one, after a change of health.
 
-        `state` is in the modes of `before`, the integrator of the same model that it belongs to.
+        Displacement and velocity of the structure stay what they were; they are projected on the
+        new modes with the new mass matrix, exactly in reduced coordinates. What the new modes
+        cannot hold follows the load without delay, as always. The memory of laws stays where they
+        are the same at the same ports; other laws have been loaded from zero to where they are.
+
+        Parameters
+        ----------
+        state : TransientState
+            A state of the other integrator.
+        previous : ModalIntegrator
+            The other integrator, of the same model.
         """
-        load, memory = state.load, state.memory
-        if self._laws is not None and not (before._laws is not None and self._laws.alike(before._laws)):
-            memory = self._laws.memory()
-            if not len(state.displacement):  # at rest: reached from no load
+        load = state.load
+        memory = state.memory
+        if self._laws is not None and not _has_same_laws(self._laws, previous._laws):
+            memory = self._laws.unloaded_memory()
+            if not state.moves:  # the equilibrium is reached from no load
                 load = np.zeros_like(load)
-        if not len(state.displacement):
+        if not state.moves:
             return replace(state, load=load, memory=memory)
-        if self.structure.holding is not None:
+        if self.structure.holding_load is not None:
             load = load.copy()
-            load[self.structure.holding] = 0.0
-        place = before.structure.shapes @ state.displacement + before._left_out[:, : len(load)] @ load
-        to_modes = self.structure.to_modes
-        velocity = to_modes @ (before.structure.shapes @ state.velocity)
-        return TransientState(to_modes @ place, velocity, load, memory)
+            load[self.structure.holding_load] = 0.0
+        residual = previous._responses.residual_displacements[:, : len(load)] @ load
+        displacement = previous.structure.mode_shapes @ state.displacement + residual
+        velocity = previous.structure.mode_shapes @ state.velocity
+        projection = self.structure.modal_projection
+        return TransientState(projection @ displacement, projection @ velocity, load, memory)
+
+
+def _has_same_laws(laws: "PortLaws", others: "PortLaws | None") -> bool:
+    """Return whether two structures have the same laws at the same ports."""
+    return others is not None and laws.has_same_laws(others)

@@ -1,241 +1,82 @@
-"""The wing for patches: its arrays, checked, and its rows: displacements, loads, ports, outputs.
+"""Rows of a wing for patches: its displacements, loads, ports and outputs.
 
-First the arrays and their file, then local losses of the skin: what strips of the wing keep of its stiffness,
-what gauges among them read. NumPy and relative imports only: this file is copied into the FMU. The equations
-are in `docs/patches.md`.
+NumPy and relative imports only: this file is copied into the FMU. The equations are in
+`docs/patches.md`.
 """
 
 import re
-from dataclasses import dataclass
 from functools import cached_property
-from math import inf
-from sys import float_info
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from . import patch as primitives
-from .arrays import FloatArray, IntArray, KeptArrays
+from .arrays import FloatArray
 from .errors import InvalidPatchError
-from .motion import STATION_COUNT, STATION_PORTS, at_stations
-from .state import STANDARD_GRAVITY, wing_names
+from .patch import INTERNAL_FORCES, InertiaRelief, LoadPlace, ModelPatch, PointMass, Washout
+from .patch_arrays import PatchArrays
+from .port_laws import STATION_COUNT, STATION_PORTS, spread_over_stations
+from .skin_losses import remaining_skin
+from .state import STANDARD_GRAVITY
 
-Positive = Annotated[float, float_info.min, inf]
+LoadLocation = str | tuple[float, float]
+"""A point where a force acts: "tip_load", or distance from the root [m] and chord fraction."""
 
-
-@dataclass(frozen=True, repr=False)
-class PatchArrays(KeptArrays):
-    """Dense matrices and rows of a wing in a basis of n vectors, made for changes of `fe.runtime.patch`.
-
-    Attributes
-    ----------
-    validity_box : (K + 5, 2) ndarray
-        Least and largest value of each of `fe.runtime.state.wing_names`, SI units.
-    largest_loss, largest_compliance, largest_mass : float
-        Stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] up to which the basis
-        was made; the accuracy falls slowly beyond.
-    stiffness : (K + 2, n, n) ndarray
-        Stiffness terms: skin, the K damage regions, the rest.
-    mass : (3, n, n) ndarray
-        Mass terms: structure, 1 kg in each servo, 1 kg in the pitot.
-    strip_lines : (S + 1,) ndarray
-        Edges of the strips of the skin [m from the root].
-    strip_stiffness : (T, n (n + 1) / 2) ndarray of float32
-        Lower triangles, row by row, of the parts of the stiffness terms of the skin that lie in strips.
-    strip_of, term_of : (T,) ndarray of int64
-        Strip, and stiffness term, of each part.
-    flap_row : (n,) ndarray
-        Flapping rotation of the root [rad].
-    flap_spring : float
-        Spring at the root [N m/rad].
-    semi_span, root_chord, tip_chord : float
-        L and the chords [m].
-    straight_chord_line : float
-        Chord fraction of the line that runs straight along the span.
-    load_place : float
-        Distance of the static test's load from the root [m].
-    stations : (P,) ndarray
-        Sections: mesh lines and the middles between them [m from the root], P odd.
-    line_chord : (L,) ndarray
-        Chord fractions of the elastic line and of the other lines, ascending; L at least 2.
-    line_rows : (L + 2, P, n) ndarray
-        Displacement of the elastic line along x, y and z and of the other lines along z.
-    station_weights : (P,) ndarray
-        Share of the planform's area; sums to one.
-    load_tip : (n,) ndarray
-        Load of 1 N at the place of the static test; as a row, the displacement there.
-    load_lift : (n,) ndarray
-        Load of load factor 1 [N].
-    lift_rows : (P, n) ndarray
-        The same without the weight, by stations.
-    weight : (n,) ndarray
-        Weight, downwards [N].
-    strain_rows : (3, G, n) ndarray
-        Strain of the gauges along the span, across it, and engineering shear strain, positive as measured.
-    gauge_stations : (G,) ndarray
-        Middles of the gauges [m from the root].
-    gauge_length : float
-        Length along the span over which they average [m].
-    tip_row : (n,) ndarray
-        Displacement of the tip.
-    start_shapes : (n, r) ndarray
-        Modes of the wing as it was, from which the modes of a patched one are iterated.
-    """
-
-    what = "a wing for patches"
-    version = 4
-
-    validity_box: Annotated[FloatArray, "chosen", 2]
-    largest_loss: Positive
-    largest_compliance: Positive
-    largest_mass: Positive
-    stiffness: Annotated[FloatArray, "terms", "basis", "basis"]
-    mass: Annotated[FloatArray, 3, "basis", "basis"]
-    strip_lines: Annotated[FloatArray, "lines"]
-    strip_stiffness: Annotated[npt.NDArray[np.float32], "parts", "triangle"]
-    strip_of: Annotated[IntArray, "parts"]
-    term_of: Annotated[IntArray, "parts"]
-    flap_row: Annotated[FloatArray, "basis"]
-    flap_spring: Positive
-    semi_span: Positive
-    root_chord: Positive
-    tip_chord: Positive
-    straight_chord_line: Annotated[float, 0.0, 1.0]
-    load_place: Positive
-    stations: Annotated[FloatArray, "stations"]
-    line_chord: Annotated[FloatArray, "chords"]
-    line_rows: Annotated[FloatArray, "directions", "stations", "basis"]
-    station_weights: Annotated[FloatArray, "stations"]
-    load_tip: Annotated[FloatArray, "basis"]
-    load_lift: Annotated[FloatArray, "basis"]
-    lift_rows: Annotated[FloatArray, "stations", "basis"]
-    weight: Annotated[FloatArray, "basis"]
-    strain_rows: Annotated[FloatArray, 3, "gauges", "basis"]
-    gauge_stations: Annotated[FloatArray, "gauges"]
-    gauge_length: Annotated[float, 0.0, inf]
-    tip_row: Annotated[FloatArray, "basis"]
-    start_shapes: Annotated[FloatArray, "basis", "started"]
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        places = ((self.strip_of, len(self.strip_lines) - 1), (self.term_of, len(self.regions) + 1))
-        if any(not set(numbers) <= set(range(count)) for numbers, count in places):
-            self.refuse("has strips that do not fit its strip lines")
-        if np.any(np.diff(self.stations) <= 0.0) or np.any(np.diff(self.strip_lines) <= 0.0):
-            self.refuse("must have stations that rise from the root to the tip")
-
-    def _lengths(self) -> dict[str | int, int]:
-        size, chords = self.stiffness.shape[-1], len(self.line_chord)
-        return {
-            "chosen": len(wing_names(self.regions)),
-            "terms": len(self.regions) + 2,
-            "triangle": size * (size + 1) // 2,
-            "chords": max(chords, 2),
-            "directions": chords + 2,
-        }
-
-
-TIP_OFFSET = 1.02
-"""Where the weight of a part of the skin would vanish, in semi-spans."""
-LEAST_GAUGE_LENGTH = 1e-3
-"""A gauge without a length averages over this [m]."""
-
-
-class RemainingSkin(NamedTuple):
-    """What the skin keeps of its stiffness along the span.
-
-    Attributes
-    ----------
-    breaks : (m + 1,) ndarray
-        Edges of strips and boxes [m from the root].
-    exact : (m,) ndarray
-        What it keeps between them.
-    strip : (m,) ndarray of int
-        The strip that each piece lies in.
-    of_strips : (S,) ndarray
-        What each strip as a whole keeps, so that the tip moves as much as with the boxes as they are.
-    """
-
-    breaks: FloatArray
-    exact: FloatArray
-    strip: IntArray
-    of_strips: FloatArray
-
-
-def remaining_skin(patch: primitives.ModelPatch, lines: FloatArray) -> RemainingSkin | None:
-    """Return what the skin keeps under the local losses of a patch; None where there are none.
-
-    Losses multiply where they overlap. A strip keeps the harmonic mean of its pieces, since they bend one
-    after the other, weighed by the square of the distance from the tip: the moment of a force there, and the
-    way on which the tip follows the bending.
-
-    Parameters
-    ----------
-    patch : ModelPatch
-        The losses.
-    lines : (S + 1,) ndarray
-        Edges of the strips [m from the root].
-
-    Raises
-    ------
-    InvalidPatchError
-        If nothing is left somewhere.
-    """
-    boxes = [item for item in patch if isinstance(item, primitives.LocalStiffnessLoss) and item.loss != 0.0]
-    if not boxes:
-        return None
-    edges = [edge for box in boxes for edge in (box.start, box.start + box.length)]
-    breaks = np.unique(np.concatenate((lines, np.clip(edges, lines[0], lines[-1]))))
-    middles = 0.5 * (breaks[1:] + breaks[:-1])
-    exact = np.ones(len(middles))
-    for box in boxes:
-        exact *= 1.0 - box.loss * ((middles > box.start) & (middles < box.start + box.length))
-    if exact.min() <= 0.0:
-        raise InvalidPatchError(
-            f"A local stiffness loss must leave some stiffness, but leaves {exact.min():g} of it."
-        )
-    strip = np.maximum(np.searchsorted(lines, middles) - 1, 0)  # one may begin next to nothing above zero
-    weights = -np.diff((TIP_OFFSET * lines[-1] - breaks) ** 3)
-    count = len(lines) - 1
-    of_strips = np.bincount(strip, weights, count) / np.bincount(strip, weights / exact, count)
-    return RemainingSkin(breaks, exact, strip.astype(np.int64), of_strips)
-
-
-Place = str | tuple[float, float]
-
-LOAD_PLACE = "tip_load"
-"""Name of the place of the static test."""
+STATIC_TEST_LOAD = "tip_load"
+"""Name of the point of the static test's load."""
 OVERHANG = 0.15
-"""How far beyond the tip a place may lie, as a share of the semi-span."""
+"""How far beyond the tip a force may act, as a fraction of the semi-span."""
 PORTS = ("root", "tip", "span")
-"""Ports where internal forces act on the motion of one place, or of the mean."""
-_STRAIN = re.compile(r"strain\[(\d+)\](\.transverse|\.shear)?")
+"""Ports of the wing where a law acts on one motion."""
+LEAST_GAUGE_LENGTH = 1e-3
+"""Length over which a gauge without a length averages [m]."""
+NO_PATCH = ModelPatch()
+
+_STRAIN = re.compile(r"strain\[(?P<gauge>\d+)\](?P<component>\.transverse|\.shear)?")
 _NUMBER = r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*"
 _DISPLACEMENT = re.compile(rf"displacement\[{_NUMBER},{_NUMBER}\]")
-
-EMPTY = primitives.ModelPatch()
+_STRAIN_COMPONENTS = (None, ".transverse", ".shear")
 
 
 def strain_gauge(output: str) -> int:
-    """Return the row k - 1 of an output strain[k] and the like, k from 1; -1 for other outputs."""
-    strain = _STRAIN.fullmatch(output)
-    return -1 if strain is None else int(strain.group(1)) - 1
+    """Return the number of the gauge of an output, from 0, or -1 for outputs that are no strains.
 
-
-def planform_stations(semi_span: float, root_chord: float, tip_chord: float) -> tuple[FloatArray, FloatArray]:
-    """Return the stations (S,) [m from the root] of the integral over the planform, and their shares (S,).
-
-    The chord is linear along the span; the shares are of the area and sum to one.
+    In the names strain[k], strain[k].transverse and strain[k].shear k counts from 1.
     """
-    place, weight = np.polynomial.legendre.leggauss(STATION_COUNT)
-    eta = 0.5 * (1.0 + place)
+    strain = _STRAIN.fullmatch(output)
+    return -1 if strain is None else int(strain["gauge"]) - 1
+
+
+class PlanformStations(NamedTuple):
+    """The stations of an integral over the planform.
+
+    Attributes
+    ----------
+    distance : (S,) array
+        Distances from the root [m].
+    area_fraction : (S,) array
+        Fraction of the planform's area of each station; sums to one.
+    """
+
+    distance: FloatArray
+    area_fraction: FloatArray
+
+
+def planform_stations(semi_span: float, root_chord: float, tip_chord: float) -> PlanformStations:
+    """Return the stations of Gauss and Legendre of a planform whose chord is linear along the span.
+
+    Parameters
+    ----------
+    semi_span, root_chord, tip_chord : float
+        Semi-span and chords [m].
+    """
+    abscissa, weight = np.polynomial.legendre.leggauss(STATION_COUNT)
+    eta = 0.5 * (1.0 + abscissa)
     area = weight * (root_chord + (tip_chord - root_chord) * eta)
-    return semi_span * eta, area / area.sum()
+    return PlanformStations(semi_span * eta, area / area.sum())
 
 
 class WingRows:
-    """Rows of the wing in the basis of its arrays.
+    """Rows of displacements, loads, ports and outputs of a wing, in the basis of its arrays.
 
     Parameters
     ----------
@@ -244,29 +85,53 @@ class WingRows:
     """
 
     def __init__(self, arrays: PatchArrays) -> None:
-        self.arrays, self.size, self.span = arrays, len(arrays.load_tip), arrays.semi_span
+        self.arrays = arrays
+        self.size = len(arrays.load_tip)
+        self.span = arrays.semi_span
 
-    def _along(self, y: float) -> FloatArray:
-        """Weights (P,) of the stations at `y` m from the root: the parabola of the mesh cell."""
-        stations, span = self.arrays.stations, self.span
-        if not 0.0 <= y <= (1.0 + OVERHANG) * span:
+    def _station_weights(self, y: float) -> FloatArray:
+        """Return weights (P,) that interpolate values at the stations to `y` [m from the root].
+
+        Within a cell of the mesh a value is a parabola; beyond the tip a force hangs on a rigid
+        arm.
+
+        Raises
+        ------
+        InvalidPatchError
+            If `y` lies off the wing.
+        """
+        stations = self.arrays.stations
+        if not 0.0 <= y <= (1.0 + OVERHANG) * self.span:
             raise InvalidPatchError(
-                f"A place must lie on the wing, 0 to {span:g} m from the root, but is {y:g} m."
+                f"A place must lie on the wing, 0 to {self.span:g} m from the root, but is {y:g} m."
             )
-        if y > span:  # a force beyond the tip hangs on a stiff arm
-            inboard = 0.97 * span
-            arm = (y - inboard) / (span - inboard)
-            return np.asarray(arm * self._along(span) + (1.0 - arm) * self._along(inboard))
-        cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), (len(stations) - 3) // 2)
-        first, last = stations[2 * cell], stations[2 * cell + 2]
-        t = (y - first) / (last - first)
-        weights, parabola = np.zeros(len(stations)), np.array((1.0 - t, 4.0 * t * (1.0 - t), t))
+        if y > self.span:
+            inboard = 0.97 * self.span
+            arm = (y - inboard) / (self.span - inboard)
+            at_tip = self._station_weights(self.span)
+            return np.asarray(arm * at_tip + (1.0 - arm) * self._station_weights(inboard))
+        last_cell = (len(stations) - 3) // 2
+        cell = min(max(int(np.searchsorted(stations[2::2], y)), 0), last_cell)
+        begin = stations[2 * cell]
+        end = stations[2 * cell + 2]
+        t = (y - begin) / (end - begin)
+        parabola = np.array((1.0 - t, 4.0 * t * (1.0 - t), t))
         parabola[::2] *= (1.0 - 2.0 * t, 2.0 * t - 1.0)
+        weights = np.zeros(len(stations))
         weights[2 * cell : 2 * cell + 3] = parabola
         return weights
 
-    def displacement_row(self, y: float, chord: float, beside: float | None = None) -> FloatArray:
+    @property
+    def _upward_rows(self) -> FloatArray:
+        """Upward displacement (P, n) of the elastic line at the stations."""
+        return np.asarray(self.arrays.line_rows[2])
+
+    def displacement_row(
+        self, y: float, chord: float, between_lines_at: float | None = None
+    ) -> FloatArray:
         """Return the row (n,) of the upward displacement of a section at a chord fraction.
+
+        A section is taken as straight through two neighbouring lines.
 
         Parameters
         ----------
@@ -274,107 +139,139 @@ class WingRows:
             Distance from the root [m].
         chord : float
             Chord fraction.
-        beside : float, optional
-            The section is straight through the two lines beside this chord fraction; `chord` by default.
+        between_lines_at : float, optional
+            The chord fraction whose neighbouring lines are taken; `chord` by default.
 
         Raises
         ------
         InvalidPatchError
             If `y` lies off the wing.
         """
-        along, chords = self._along(y), self.arrays.line_chord
-        order = np.argsort(chords)  # from the leading edge to the trailing edge
-        within = chord if beside is None else beside
-        behind = min(max(int(np.searchsorted(chords[order], within, side="right")), 1), len(order) - 1)
-        first, last = order[behind - 1 : behind + 1]
-        share = (chord - chords[first]) / (chords[last] - chords[first])
+        weights = self._station_weights(y)
+        # the two lines, from the leading edge to the trailing edge
+        chords = self.arrays.line_chord
+        order = np.argsort(chords)
+        within = chord if between_lines_at is None else between_lines_at
+        number = int(np.searchsorted(chords[order], within, side="right"))
+        number = min(max(number, 1), len(order) - 1)
+        fore, aft = order[number - 1 : number + 1]
+        # straight through both
+        fraction = (chord - chords[fore]) / (chords[aft] - chords[fore])
         rows = self.arrays.line_rows[2:]
-        return np.asarray(along @ ((1.0 - share) * rows[first] + share * rows[last]))
+        return np.asarray(weights @ ((1.0 - fraction) * rows[fore] + fraction * rows[aft]))
 
-    def force_row(self, place: Place, patch: primitives.ModelPatch = EMPTY) -> FloatArray:
-        """Return the load (n,) of 1 N at a place; as a row, the displacement there.
+    def force_row(self, location: LoadLocation, patch: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the load (n,) of 1 N at a location; as a row, the displacement there.
 
         Parameters
         ----------
-        place : str or tuple of float
+        location : str or tuple of float
             "tip_load", or distance from the root [m] and chord fraction.
         patch : ModelPatch
-            Its load places act.
+            The patch whose load places move the force.
 
         Raises
         ------
         InvalidPatchError
-            If the place is not known or lies off the wing.
+            If the location is not known or lies off the wing.
         """
         arrays = self.arrays
-        if isinstance(place, str):
-            if place != LOAD_PLACE:
+        if isinstance(location, str):
+            if location != STATIC_TEST_LOAD:
                 raise InvalidPatchError(
-                    f"The place {place!r} is not known; give {LOAD_PLACE!r} or the distance from the root "
-                    "in metres and the chord fraction."
+                    f"The place {location!r} is not known; give {STATIC_TEST_LOAD!r} or the "
+                    "distance from the root in metres and the chord fraction."
                 )
-            y, chord, row = arrays.load_place, float(arrays.line_chord[0]), arrays.load_tip
+            y = arrays.load_place
+            chord = float(arrays.line_chord[0])
+            row = arrays.load_tip
         else:
-            y, chord = place
+            y, chord = location
             row = self.displacement_row(y, chord)
         moves = [
-            (item.along_span, item.along_chord) for item in patch if isinstance(item, primitives.LoadPlace)
+            (primitive.along_span, primitive.along_chord)
+            for primitive in patch
+            if isinstance(primitive, LoadPlace)
         ]
         along_span, along_chord = np.sum([(0.0, 0.0), *moves], axis=0).tolist()
         if along_span == 0.0 and along_chord == 0.0:
             return row
+        # outboard is along the straight chord line; the force keeps its distance aft of it
+        distance_aft = (chord - arrays.straight_chord_line) * self._chord_at(y) + along_chord
+        moved_y = y + along_span
+        moved_chord = arrays.straight_chord_line + distance_aft / self._chord_at(moved_y)
+        # the clamp grips the same two lines wherever it pulls, or the response had a kink at each
+        # web
+        moved_row = self.displacement_row(moved_y, moved_chord, between_lines_at=chord)
+        return row + moved_row - self.displacement_row(y, chord)
 
-        def chord_at(distance: float) -> float:
-            return arrays.root_chord + (arrays.tip_chord - arrays.root_chord) * distance / arrays.semi_span
+    def _chord_at(self, y: float) -> float:
+        """Return the chord of the wing at `y` [m from the root]."""
+        arrays = self.arrays
+        taper = arrays.tip_chord - arrays.root_chord
+        return arrays.root_chord + taper * y / arrays.semi_span
 
-        # how far aft of the straight chord line; outboard is along that line
-        aft = (chord - arrays.straight_chord_line) * chord_at(y) + along_chord
-        moved = y + along_span
-        moved_chord = arrays.straight_chord_line + aft / chord_at(moved)
-        # the clamp grips the same two lines wherever it pulls, else the response had a kink at each web
-        return row + self.displacement_row(moved, moved_chord, chord) - self.displacement_row(y, chord)
+    def manoeuvre_loads(self, patch: ModelPatch = NO_PATCH) -> FloatArray:
+        """Return the loads (2, n) in a turn that go with the load factor and with its square [N].
 
-    def load_parts(self, patch: primitives.ModelPatch = EMPTY) -> FloatArray:
-        """Return the loads (2, n) of a turn that go with the load factor and with its square [N].
+        Parameters
+        ----------
+        patch : ModelPatch
+            The patch whose washout, relief by weight and point masses act.
 
-        Washout, relief by weight and point masses of the patch act.
+        Raises
+        ------
+        InvalidPatchError
+            If the exponent of a washout is negative, or a point mass lies off the wing.
         """
         arrays = self.arrays
-        parts = np.stack((arrays.load_lift, np.zeros(self.size)))
-        for item in patch:
-            if isinstance(item, primitives.Washout):
-                if item.exponent < 0.0:
+        linear = arrays.load_lift.copy()
+        quadratic = np.zeros(self.size)
+        for primitive in patch:
+            if isinstance(primitive, Washout):
+                if primitive.exponent < 0.0:
                     raise InvalidPatchError(
-                        f"The exponent of a washout must not be negative, but is {item.exponent:g}."
+                        "The exponent of a washout must not be negative, but is "
+                        f"{primitive.exponent:g}."
                     )
-                eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0) ** item.exponent
-                parts[1] -= item.coefficient * (eta @ arrays.lift_rows)
-            elif isinstance(item, primitives.InertiaRelief):
-                parts[0] += item.fraction * arrays.weight
-            elif isinstance(item, primitives.PointMass):
-                parts[0] -= STANDARD_GRAVITY * item.mass * (self._along(item.station) @ arrays.line_rows[2])
-        return parts
+                eta = np.clip(arrays.stations / arrays.semi_span, 0.0, 1.0)
+                quadratic -= primitive.coefficient * (eta**primitive.exponent @ arrays.lift_rows)
+            elif isinstance(primitive, InertiaRelief):
+                linear += primitive.fraction * arrays.weight
+            elif isinstance(primitive, PointMass):
+                row = self._station_weights(primitive.station) @ self._upward_rows
+                linear -= STANDARD_GRAVITY * primitive.mass * row
+        return np.stack((linear, quadratic))
 
     @cached_property
-    def planform(self) -> tuple[FloatArray, FloatArray]:
-        """Stations of forces that are spread over the planform, and their shares."""
+    def planform_stations(self) -> PlanformStations:
+        """The stations of forces that are spread over the planform."""
         return planform_stations(self.span, self.arrays.root_chord, self.arrays.tip_chord)
 
-    def internal_forces(self, patch: primitives.ModelPatch) -> primitives.ModelPatch:
-        """Return the internal forces of a patch by ports of `port_rows`, of the planform by station."""
-        return at_stations(patch.of(*primitives.INTERNAL_FORCES), self.planform[1])
+    def internal_forces(self, patch: ModelPatch) -> ModelPatch:
+        """Return the internal forces of a patch at ports of `port_rows`.
+
+        A force over the planform becomes one at every station.
+        """
+        forces = patch.of(*INTERNAL_FORCES)
+        return spread_over_stations(forces, self.planform_stations.area_fraction)
 
     @cached_property
     def port_rows(self) -> dict[str, FloatArray]:
-        """Rows (n,) of `PORTS`, "root" in rad and the others in m, then of the planform's stations."""
-        upwards = self.arrays.line_rows[2]
-        stations = [self._along(distance) @ upwards for distance in self.planform[0].tolist()]
-        places = (self.arrays.flap_row, self.arrays.load_tip, self.arrays.station_weights @ upwards)
-        return dict(zip((*PORTS, *STATION_PORTS), (*places, *stations), strict=True))
+        """Rows (n,) of `PORTS` ("root" in rad, others in m), then of the planform's stations."""
+        rows = {
+            "root": self.arrays.flap_row,
+            "tip": self.arrays.load_tip,
+            "span": self.arrays.station_weights @ self._upward_rows,
+        }
+        distances = self.planform_stations.distance.tolist()
+        for name, distance in zip(STATION_PORTS, distances, strict=True):
+            rows[name] = self._station_weights(distance) @ self._upward_rows
+        return rows
 
     @cached_property
-    def held(self) -> FloatArray:
-        """Rows (s, n) of the load point and of `PORTS`, whose static shapes a motion holds."""
+    def static_shape_rows(self) -> FloatArray:
+        """Rows (s, n) of the load point and of `PORTS`; a basis of motion holds their shapes."""
         return np.vstack((self.arrays.load_tip, *(self.port_rows[name] for name in PORTS)))
 
     def output_row(self, name: str) -> FloatArray | None:
@@ -383,55 +280,89 @@ class WingRows:
         Parameters
         ----------
         name : str
-            strain[k] (gauges count from 1, as in the FMU), strain[k].transverse across it, strain[k].shear
-            (engineering strain), tip_displacement, load_point_displacement, displacement[y, x].
+            strain[k] (gauges count from 1, as in the FMU), strain[k].transverse for the strain
+            across it, strain[k].shear for engineering strain, tip_displacement,
+            load_point_displacement, or displacement[y, x] with the distance from the root [m] and
+            the chord fraction.
         """
+        if name == "tip_displacement":
+            return self.arrays.tip_row
+        if name == "load_point_displacement":
+            return self.arrays.load_tip
         strain = _STRAIN.fullmatch(name)
         if strain is not None:
-            strains = self.arrays.strain_rows[(None, ".transverse", ".shear").index(strain[2])]
-            return strains[int(strain[1]) - 1] if 0 < int(strain[1]) <= len(strains) else None
-        known = {"tip_displacement": self.arrays.tip_row, "load_point_displacement": self.arrays.load_tip}
-        row = known.get(name)
-        place = _DISPLACEMENT.fullmatch(name)
-        if place is not None and 0.0 <= float(place.group(1)) <= self.span:
-            row = self.displacement_row(float(place.group(1)), float(place.group(2)))
-        return row
+            component = _STRAIN_COMPONENTS.index(strain["component"])
+            rows = self.arrays.strain_rows[component]
+            gauge = int(strain["gauge"])
+            return rows[gauge - 1] if 0 < gauge <= len(rows) else None
+        displacement = _DISPLACEMENT.fullmatch(name)
+        if displacement is not None:
+            y, chord = map(float, displacement.groups())
+            if 0.0 <= y <= self.span:
+                return self.displacement_row(y, chord)
+        return None
 
     @cached_property
-    def _skin_share(self) -> FloatArray:
-        """Share (G,) of the bending stiffness at each gauge that the skin has, as the strain shows it."""
+    def _skin_fraction(self) -> FloatArray:
+        """The skin's fraction (G,) of the bending stiffness at each gauge, as the strain shows it.
+
+        A softer skin raises the strain under lift by that fraction of its own loss.
+        """
         terms = len(self.arrays.stiffness)
-        softer = np.append(np.full(terms - 1, 0.7), 1.0)
-        whole, less = (
-            self.arrays.strain_rows[0]
-            @ np.linalg.solve(np.tensordot(theta, self.arrays.stiffness, 1), self.arrays.load_lift)
-            for theta in (np.ones(terms), softer)
-        )
-        return np.asarray((1.0 - whole / less) / (1.0 - softer[0]))
+        all_healthy = np.ones(terms)
+        soft_skin = np.append(np.full(terms - 1, 0.7), 1.0)
+        ratio = self._strain_under_lift(all_healthy) / self._strain_under_lift(soft_skin)
+        return np.asarray((1.0 - ratio) / (1.0 - soft_skin[0]))
 
-    def strain_factors(self, patch: primitives.ModelPatch) -> FloatArray | None:
-        """Return factors (G,) on the strain rows, by where the edges of local losses lie in their strips.
+    def _strain_under_lift(self, theta: FloatArray) -> FloatArray:
+        """Return gauge strains (G,) under lift, for coefficients (K + 2,) of the stiffness."""
+        stiffness = np.tensordot(theta, self.arrays.stiffness, 1)
+        displacement = np.linalg.solve(stiffness, self.arrays.load_lift)
+        return np.asarray(self.arrays.strain_rows[0] @ displacement)
 
-        The structure has a loss smeared over the strip that the edge of its box parts; what a gauge there
-        reads is the curvature of its own section. At a given bending moment the strain of a section whose
-        skin keeps r of its stiffness goes as 1 / (1 - s (1 - r)), s the skin's share of the bending
-        stiffness; the factor is the mean of that over the gauge with the boxes as they are, over the same
-        with the strips' means. It is one where boxes end at edges of strips.
+    def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
+        """Return factors on the strains of the gauges where local losses end within a strip.
+
+        The structure has a loss smeared over the strip; a gauge reads the curvature of its own
+        section. At a given bending moment the strain of a section whose skin keeps the fraction r
+        of its stiffness goes as 1 / (1 - s (1 - r)), s the skin's fraction of the bending
+        stiffness. The factor is the mean of that over the gauge with the losses where they are,
+        over the same with smeared losses. It is one where losses end at edges of strips.
+
+        Parameters
+        ----------
+        patch : ModelPatch
+            The patch with the losses.
 
         Returns
         -------
-        (G,) ndarray or None
-            None: there is no local loss.
+        (G,) array or None
+            The factors; None where the patch has no local loss.
         """
         skin = remaining_skin(patch, self.arrays.strip_lines)
         if skin is None:
             return None
-        half = 0.5 * max(self.arrays.gauge_length, LEAST_GAUGE_LENGTH)
-        middle, share = self.arrays.gauge_stations[:, None], self._skin_share[:, None]
-        begin, end = skin.breaks[:-1], skin.breaks[1:]
-        covered = np.maximum(np.minimum(end, middle + half) - np.maximum(begin, middle - half), 0.0)
-        exact, smeared = (
-            (covered / (1.0 - share * (1.0 - remaining))).sum(axis=1)
-            for remaining in (skin.exact, skin.of_strips[skin.strip])
-        )
+        # length of each piece under each gauge
+        half_length = 0.5 * max(self.arrays.gauge_length, LEAST_GAUGE_LENGTH)
+        gauge_begin = self.arrays.gauge_stations[:, None] - half_length
+        gauge_end = self.arrays.gauge_stations[:, None] + half_length
+        begin = np.maximum(skin.breaks[:-1], gauge_begin)
+        end = np.minimum(skin.breaks[1:], gauge_end)
+        covered = np.maximum(end - begin, 0.0)
+        # mean strains
+        exact = self._mean_strain(covered, skin.by_piece)
+        smeared = self._mean_strain(covered, skin.by_strip[skin.strip_of_piece])
         return np.asarray(exact / smeared)
+
+    def _mean_strain(self, covered: FloatArray, remaining: FloatArray) -> FloatArray:
+        """Return relative strains (G,) of gauges over pieces of the skin.
+
+        Parameters
+        ----------
+        covered : (G, m) array
+            Length of each piece under each gauge [m].
+        remaining : (m,) array
+            Fraction of its stiffness that each piece keeps.
+        """
+        relative_stiffness = 1.0 - self._skin_fraction[:, None] * (1.0 - remaining)
+        return np.asarray((covered / relative_stiffness).sum(axis=1))

@@ -392,12 +392,27 @@ def _static_response(structure: AffineStructure, displacement: FloatArray) -> Af
     )
 
 
+class NaturalModes(NamedTuple):
+    """Lowest undamped modes of a structure.
+
+    Attributes
+    ----------
+    frequency : (count,) array
+        Natural frequencies [Hz], ascending.
+    shape : (n, count) array
+        Mass-normalised shapes of the free unknowns.
+    """
+
+    frequency: FloatArray
+    shape: FloatArray
+
+
 def natural_frequencies(
     structure: AffineStructure,
     count: int,
     values: Mapping[str, float] | None = None,
     factors: Factorisation | None = None,
-) -> tuple[FloatArray, FloatArray]:
+) -> NaturalModes:
     """Return the lowest natural frequencies and mode shapes, undamped.
 
     Parameters
@@ -410,13 +425,6 @@ def natural_frequencies(
         Parameters, losses and free masses; the others are nominal, and healthy.
     factors : Factorisation, optional
         The factorised stiffness at these values, if it is at hand.
-
-    Returns
-    -------
-    frequencies : (count,) array
-        Natural frequencies [Hz], ascending.
-    shapes : (n, count) array
-        Mass-normalised shapes.
 
     Raises
     ------
@@ -436,4 +444,6 @@ def natural_frequencies(
         )
     squares, shapes = lowest_eigenpairs(factors or system.stiffness, system.mass, count)
     modal_masses = np.einsum("im,im->m", shapes, system.mass @ shapes)
-    return np.sqrt(squares) / (2.0 * np.pi), shapes / np.sqrt(modal_masses)
+    return NaturalModes(
+        frequency=np.sqrt(squares) / (2.0 * np.pi), shape=shapes / np.sqrt(modal_masses)
+    )

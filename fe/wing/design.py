@@ -15,7 +15,7 @@ from typing import Any
 from pydantic import Field
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
-from fe.runtime.state import MOST_REGIONS, Geometry, region_names, wing_names
+from fe.runtime.state import MOST_REGIONS, Geometry, default_region_names, wing_input_names
 from fe.structure.tables import DesignSection, StructureDesign
 from reporting.toml_file import Fault, read_toml, validate
 from reporting.words import brief
@@ -46,7 +46,7 @@ def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
     )
 
 
-RESERVED_NAMES = frozenset((*wing_names(()), "skin", "webs", "ribs"))
+RESERVED_NAMES = frozenset((*wing_input_names(()), "skin", "webs", "ribs"))
 """Names that damage regions cannot have, because they mean something else beside these."""
 
 
@@ -99,7 +99,7 @@ class WingDesign(DesignSection):
     @property
     def regions(self) -> tuple[str, ...]:
         """Names of the damage regions, those of `defects`, in their order."""
-        numbered = region_names(len(self.defects))
+        numbered = default_region_names(len(self.defects))
         return tuple(
             defect.name or name for defect, name in zip(self.defects, numbered, strict=True)
         )
@@ -114,7 +114,7 @@ class WingDesign(DesignSection):
     def hash(self) -> str:
         """SHA-256 of the content, 64 hexadecimal digits; comments and key order do not count."""
         content = self.model_dump(mode="json")
-        default_names = region_names(len(self.defects))
+        default_names = default_region_names(len(self.defects))
         for defect, default_name in zip(content["defects"], default_names, strict=True):
             if defect["name"] in (None, default_name):  # a default name does not count
                 del defect["name"]

@@ -10,7 +10,8 @@ flap [rad] and yaw [rad]. Gauge strains are weights of nodal displacements, Kapt
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import overload
 
 import numpy as np
 from scipy import sparse
@@ -20,14 +21,10 @@ from fe.elements.kinds import gauss_points
 from fe.full.factorisation import most_compliant_modes
 from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE, Losses, losses_of
-from fe.structure.affine import (
-    AffineResponse,
-    AffineStructure,
-    natural_frequencies,
-    static_response,
-)
+from fe.structure.affine import AffineStructure, NaturalModes
 from fe.structure.affine_fields import OutputRows
 from fe.structure.body import Body, MassAtPoints
+from fe.structure.operators import assemble_structure
 from fe.structure.supports import RigidSet, Supports, supports
 
 from .design import WingDesign, wing_structure
@@ -248,8 +245,44 @@ def turn_load(body: Body[WingMesh]) -> FloatArray:
     return load
 
 
-def assemble(design: WingDesign) -> AffineOperators:
-    """Mesh a design and assemble its affine operators.
+@overload
+def assemble(source: WingDesign) -> AffineOperators: ...
+
+
+@overload
+def assemble(source: Path | str, memory_limit: float | None = None) -> AffineStructure: ...
+
+
+def assemble(source: WingDesign | Path | str, memory_limit: float | None = None) -> AffineStructure:
+    """Return the full finite element model of a wing, or of a structure file.
+
+    Parameters
+    ----------
+    source : WingDesign, Path or str
+        The design of a wing, or the path of a structure file beside its mesh or matrices.
+    memory_limit : float, optional
+        Bytes that assembly and factorisation of a structure may take; by default what the machine
+        has free.
+
+    Returns
+    -------
+    AffineStructure
+        The affine operators; those of a wing are `AffineOperators`.
+
+    Raises
+    ------
+    DesignFileError, InvalidDesignError
+        If the structure file cannot be read, or does not describe a structure.
+    MeshError
+        If lines of a wing's design nearly coincide, or the mesh of a structure is faulty.
+    """
+    if isinstance(source, WingDesign):
+        return _assemble_wing(source)
+    return assemble_structure(source, memory_limit)
+
+
+def _assemble_wing(design: WingDesign) -> AffineOperators:
+    """Mesh a wing design and assemble its affine operators.
 
     Parameters
     ----------
@@ -300,93 +333,22 @@ def wing_values(
     return {"young_modulus_factor": young_modulus_factor, **losses, **others}
 
 
-def solve_static(
-    operators: AffineWing,
-    young_modulus_factor: float = 1.0,
-    stiffness_loss: Losses = (),
-    load_factor: float = 1.0,
-    tip_force: float = 0.0,
-) -> AffineResponse:
-    """Solve K(e, z) u = f, Kapteyn et al. 2021, eq. (13), and return the gauge strains, eq. (15).
+def flapwise_bending_modes(wing: AffineWing, modes: NaturalModes) -> IntArray:
+    """Return the numbers of the first and the second flapwise bending among modes of a wing.
+
+    These are the two modes that contribute most to the compliance under a force near the tip; a lag
+    mode may lie between them.
 
     Parameters
     ----------
-    operators : AffineWing
-        The model.
-    young_modulus_factor, stiffness_loss
-        As in `fe.runtime.state.DigitalState`.
-    load_factor : float
-        Load factor of the turn [1].
-    tip_force : float
-        Upward force at the point of the static test [N].
+    wing : AffineWing
+        The wing.
+    modes : NaturalModes
+        At least three modes, from `natural_frequencies`.
 
     Returns
     -------
-    AffineResponse
-        The response. Strains are positive in compression; the output is the upward displacement at
-        the tip [m].
-
-    Raises
-    ------
-    SolutionError
-        If the solution is not accurate.
+    (2,) array of int
+        The numbers, counted from 0.
     """
-    values = wing_values(
-        operators,
-        young_modulus_factor,
-        stiffness_loss,
-        load_factor=load_factor,
-        tip_force=tip_force,
-    )
-    return static_response(operators, values)
-
-
-class Eigenmodes(NamedTuple):
-    """Undamped modes in the order of their frequencies.
-
-    Attributes
-    ----------
-    frequency : (m,) array
-        Natural frequencies [Hz].
-    shape : (n, m) array
-        Mass-normalised shapes of the free unknowns, in which the tip moves up.
-    flapwise_bending : (2,) array of int
-        Numbers of the first and the second flapwise bending mode: those that contribute most to the
-        compliance under a force near the tip.
-    """
-
-    frequency: FloatArray
-    shape: FloatArray
-    flapwise_bending: IntArray
-
-
-def eigenmodes(
-    operators: AffineWing,
-    young_modulus_factor: float,
-    stiffness_loss: Losses,
-    servo_mass: float,
-    pitot_mass: float,
-    count: int = 6,
-) -> Eigenmodes:
-    """Return the lowest modes of K(e, z) phi = omega^2 M(m) phi, Kapteyn et al. 2021, eq. (16).
-
-    Parameters
-    ----------
-    operators : AffineWing
-        The model.
-    young_modulus_factor, stiffness_loss, servo_mass, pitot_mass
-        As in `fe.runtime.state.DigitalState`.
-    count : int
-        Number of modes, at least 3.
-
-    Raises
-    ------
-    SolutionError
-        If the iteration did not converge to `MODE_RESIDUAL_LIMIT`.
-    """
-    masses = point_masses(servo_mass, pitot_mass)
-    values = wing_values(operators, young_modulus_factor, stiffness_loss, **masses)
-    frequency, shapes = natural_frequencies(operators, count, values)
-    shapes = shapes * np.where(operators.tip_row @ shapes < 0.0, -1.0, 1.0)
-    bending = most_compliant_modes(operators.load_tip, frequency**2, shapes)
-    return Eigenmodes(frequency, shapes, bending)
+    return most_compliant_modes(wing.load_tip, modes.frequency**2, modes.shape)

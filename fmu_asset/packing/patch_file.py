@@ -269,7 +269,7 @@ def _read_effect(row: Mapping[str, Any], number: int, file_label: str) -> PatchF
     with PatchFileError.instead_of(InvalidPatchError):
         patch = ModelPatch.from_list(primitives, f"{file_label}, effect {effect_id}")
         for primitive in patch:
-            if primitive.windows or primitive.courses:
+            if primitive.windows or primitive.formula_fields:
                 raise PatchFileError(
                     f"{file_label}: the effect {effect_id!r} is bound to the time of trials "
                     f"({primitive.kind}), which means nothing in an FMU: leave it out."

@@ -16,12 +16,11 @@ from typing import Any, Literal, TypedDict, Unpack, get_args
 from fe.reduction.model_cache import patch_arrays, reduced_model
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import LocalStiffnessLoss, ModelPatch
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.sensors import needs_structure
 from fe.runtime.state import DigitalState
-from fe.runtime.transient import ModalIntegrator
-from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
 from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
@@ -262,9 +261,7 @@ def _patched_members(
         )
     # The modes of the patched wing show whether the wing can carry the patch.
     with PatchFileError.instead_of(FiniteElementError, before="The wing cannot carry the patch: "):
-        alpha, beta = model.damping.tolist()
-        integrator = ModalIntegrator(PatchedWing(arrays), model.nominal, alpha, beta, patch)
-        integrator.modes  # noqa: B018
+        _ = PatchedWing(arrays).structure_at(model.nominal, patch).modes
     # Strips are most of the bytes, and local losses of stiffness alone need them.
     if not len(patch.of(LocalStiffnessLoss)):
         arrays = dataclass_copy(

@@ -18,7 +18,8 @@ import numpy as np
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.modal_system import rayleigh_damping_ratio
-from fe.runtime.reduced import ReducedModel, StaticResponse
+from fe.runtime.reduced import ReducedModel
+from fe.runtime.reduced_results import ReducedResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
 from .base import Contents, UnacceptableValuesError
@@ -66,7 +67,7 @@ class StructureBehaviour:
         self._model, self._roles, self._effects = model, roles, effects
         self._inputs = [row.name for row in table if row.causality == "input"]
         self._resting = [0.0] * len(model.accelerations)
-        self._own = len(model.chosen) - len(model.controls)  # what modes depend on
+        self._own = len(model.input_names) - len(model.controls)  # what modes depend on
         self._parameters: Mapping[str, float] = {}
         self._tuned: tuple[Mapping[str, float], float] = ({}, 0.0)
         self._moves, self._begun = False, 0.0
@@ -74,7 +75,7 @@ class StructureBehaviour:
         self._vector: FloatArray | None = None
         self._integrator: ModalIntegrator | None = None
         self._state: TransientState | None = None  # without an integrator, the model itself is at rest
-        self._static: StaticResponse | None = None
+        self._static: ReducedResponse | None = None
         self._filters: list[float] | None = None
         self._shown: list[float] = []
 
@@ -193,22 +194,24 @@ class StructureBehaviour:
                 integrator = self._made(vector)
                 if self._integrator is not None and state is not None:
                     state = integrator.take_over(state, self._integrator)
-            load = integrator.structure.acting(vector)
+            load = integrator.structure.load_coefficients(vector)
             if not self._moves:
-                state = integrator.settled(load, state)
+                state = integrator.equilibrium(load, state)
             elif state is not None:
                 state = integrator.advance(state, duration, load, time - self._begun)
             elif self._roles.release is None:
-                state = integrator.at_rest(load)
+                state = integrator.state_at_rest(load)
             else:
-                state = integrator.released(parameters[self._roles.release], load, self._held(integrator))
+                state = integrator.state_after_release(
+                    parameters[self._roles.release], load, self._held(integrator)
+                )
             outputs = integrator.outputs(state).tolist()
         self._vector, self._integrator, self._state, self._static = vector, integrator, state, static
         return outputs if self._acting is None else self._show(outputs, duration, time + duration)
 
     def _held(self, integrator: ModalIntegrator) -> int:
         """Return the number of the load that holds the structure aside."""
-        holding = integrator.structure.holding
+        holding = integrator.structure.holding_load
         return self._roles.point_load if holding is None else holding
 
     def _take_effects(self, effects: Effects) -> bool:
@@ -231,7 +234,9 @@ class StructureBehaviour:
             return values
         across = None
         if self._integrator is not None and self._state is not None and self._acting.changes_structure:
-            seen = self._integrator.structure.components @ self._integrator.displacement(self._state)
+            seen = self._integrator.structure.strain_component_rows @ self._integrator.displacement(
+                self._state
+            )
             across = np.pad(seen, ((0, 0), (0, len(values) + 1 - seen.shape[1])))
         release = self._parameters.get(self._roles.release or "", 0.0)
         kind = "flight" if not self._moves else "ringdown" if release else "forced"
@@ -245,7 +250,7 @@ class StructureBehaviour:
     def _made(self, vector: FloatArray) -> ModalIntegrator:
         """Return the structure in time; that of a wing with effects in its basis for patches."""
         if self._effects is None or self._effects.wing is None:
-            return ModalIntegrator(self._model, vector, *self._damping)
+            return ModalIntegrator(self._model.structure_at(vector), *self._damping)
         assert self._acting is not None
         return self._effects.integrator(vector, self._damping, self._acting)
 
@@ -260,7 +265,7 @@ def load_contents(resources: Path) -> Contents:
     if not (resources / "effects.json").is_file():
         return Contents(table, behaviour, later)
     # a plain structure needs nothing of these
-    from fe.runtime.wing_rows import PatchArrays
+    from fe.runtime.patch_arrays import PatchArrays
 
     from .effects import Effects, effect_rows
 

@@ -16,10 +16,10 @@ import numpy as np
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.patch import CHANNEL_UNIT, PER_RELEASE, PRIMITIVES, HighPass, ModelPatch
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
 from fe.runtime.transient import ModalIntegrator
-from fe.runtime.wing_rows import PatchArrays
 
 from .base import UnacceptableValuesError
 from .variables import FmuVariable, Table
@@ -234,17 +234,17 @@ class Effects:
         transverse, shear = (None, None) if across is None else across[:, np.newaxis]
         filters = FilterMemory(memory, duration)
         (shown,), _ = apply_sensors(
-            acting.patch, row, values[np.newaxis], None, transverse, shear, filtered=filters.filtered
+            acting.patch, row, values[np.newaxis], None, transverse, shear, high_pass=filters.filter_row
         )
         if not math.isfinite(float(shown.sum())):
             raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
-        return shown.tolist(), filters.after
+        return shown.tolist(), filters.states
 
     def integrator(self, vector: FloatArray, damping: tuple[float, float], acting: Acting) -> ModalIntegrator:
         """Return the wing for patches in time, the last one where nothing changed."""
         assert self.wing is not None
         key = (vector[:-2].tobytes(), damping, acting.values)
         if self._last is None or self._last[0] != key:
-            made = ModalIntegrator(self.wing, vector, *damping, acting.patch, acting.temperature)
-            self._last = key, made
+            structure = self.wing.structure_at(vector, acting.patch, acting.temperature)
+            self._last = key, ModalIntegrator(structure, *damping)
         return self._last[1]

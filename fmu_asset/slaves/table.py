@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import TIP_FORCE, WING
+from fe.runtime.state import TIP_FORCE, WING_MODEL_NAME
 
 from .variables import QUASI_STATIC, TRANSIENT, Causality, FmuVariable, Table
 
@@ -64,7 +64,7 @@ class Roles:
 
 def is_wing(model: ReducedModel) -> bool:
     """Return whether a model is that of a wing, and no structure that only bears its name."""
-    return model.name == WING and len(model.followed_shapes) > 0
+    return model.name == WING_MODEL_NAME and len(model.followed_shapes) > 0
 
 
 def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tuple[FmuVariable, ...], Roles]:
@@ -87,7 +87,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
             raise ValueError(f"a structure with an FMU can have no control or parameter named {name!r}")
     table, wing = Table(start), is_wing(model)
     texts = _OF_THE_WING if wing else {}
-    nominal = dict(zip(model.chosen, model.nominal.tolist(), strict=True))
+    nominal = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
     control_unit = dict(zip(model.controls, model.control_units, strict=True))
     variables: dict[str, str] = {}
 
@@ -157,7 +157,7 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
         table.add(f"frequency[{mode}]", "output", f"Natural frequency of mode {mode}", unit="Hz")
     for mode in modes:
         table.add(f"damping_ratio[{mode}]", "output", f"Damping ratio of mode {mode}", unit="1", display="%")
-    chosen = tuple(variables[name] for name in model.chosen)
+    chosen = tuple(variables[name] for name in model.input_names)
     if wing:
         names = ("initial_tip_displacement", "load_point_displacement")
         return table.rows(), Roles(chosen, None, TIP_FORCE, *names)

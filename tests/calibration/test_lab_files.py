@@ -187,7 +187,10 @@ def test_the_release_is_the_integrators(wing):
         wing, young_modulus_factor=1.0073, stiffness_loss=(0.0, 0.0), damping_alpha=1.03,
         damping_beta=7.66e-4, **MASSES,
     )  # fmt: skip
-    gauge, states = virtual_wing.RECORDED_GAUGE - 1, [integrator.released(0.03, (0.0, 0.0), TIP_FORCE)]
+    gauge, states = (
+        virtual_wing.RECORDED_GAUGE - 1,
+        [integrator.state_after_release(0.03, (0.0, 0.0), TIP_FORCE)],
+    )
     for _ in time[1:]:
         states.append(integrator.advance(states[-1], 1e-3, (0.0, 0.0)))
     strain = np.array([integrator.outputs(state)[gauge] for state in states])

@@ -320,7 +320,7 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings():
     problem = problem_of(campaign, patched)
     count = problem.counts.sum()
     assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count
-    assert search(problem, chosen("load_cell")).none.chi_square < 1.2 * count
+    assert search(problem, chosen("load_cell")).no_effect.chi_square < 1.2 * count
 
 
 # ---------------------------------------------------------------- models by name or file

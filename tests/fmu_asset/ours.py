@@ -10,9 +10,9 @@ from threadpoolctl import threadpool_limits
 
 from fe.reduction.model_cache import build_patch_arrays
 from fe.reduction.reduced_basis import reduce_structure
+from fe.runtime.patch_arrays import PatchArrays
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import DigitalState
-from fe.runtime.wing_rows import PatchArrays
 from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from fmu_asset.companions import COMPANION_NAMES

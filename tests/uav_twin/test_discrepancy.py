@@ -381,7 +381,7 @@ def test_an_interrupted_search_keeps_what_it_has_found(campaign, tmp_path):
     out = tmp_path / "verdict"
     run = ("discrepancy", "run", str(campaign), *RIG, "--out", str(out), "--no-report")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Search, "sets", interrupt)
+        patch.setattr(Search, "search_sets", interrupt)
         words = refused(*run, code=130)
     kept = out / "verdict_so_far.json"
     assert f"Interrupted; the hypotheses fitted until then are in {kept}." in words

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
-from fe.runtime.state import wing_names
+from fe.runtime.state import wing_input_names
 from fe.structure.tables import StructureDesign
 from fe.wing.design import WingDesign, load_design, wing_structure
 from fmu_asset.door.binding import Binding
@@ -38,8 +38,8 @@ from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, BeliefSection
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
+    from fe.runtime.patch_arrays import PatchArrays
     from fe.runtime.reduced import ReducedModel
-    from fe.runtime.wing_rows import PatchArrays
     from fmu_asset.packing.patch_file import PatchFile
 
 DESIGN_COPY, FLOWN_DESIGN_COPY = "asset/design.toml", "asset/flown_design.toml"
@@ -220,7 +220,7 @@ class _Wing(NamedStructure):
         from fe.reduction.model_cache import wing_fields, write_wing_vtu
 
         name, asset = "young_modulus_factor", self._scenario.asset
-        if not {*state, *control} <= {*wing_names(self.wing_design.regions)}:
+        if not {*state, *control} <= {*wing_input_names(self.wing_design.regions)}:
             return False
         wing = wing_fields(self.wing_design)
         e = asset.true_parameters.get(name, self._means.get(name, 1.0))

@@ -86,9 +86,9 @@ class NamedStructure(AssetSource):
 
     def reduced(self, progress: Progress) -> "ReducedModel":
         """Return the reduced model, from the cache if it is there."""
-        from fe.reduction.model_cache import reduced_structure
+        from fe.reduction.model_cache import reduced_model
 
-        return reduced_structure(self.file, progress=progress)
+        return reduced_model(self.file, progress=progress)
 
     def check_model(self) -> None:
         """Look at what the reduced model is made of, as far as that takes no time."""
@@ -277,7 +277,9 @@ class ReducedModelSource(NamedStructure):
         shape = (len(draws.values), len(states), len(controls))
         draw, state, control = (index.ravel() for index in np.indices(shape))
         beside = {**scenario.asset.constant_load, **{n: values[draw] for n, values in draws.others.items()}}
-        columns: dict[str, Float | float] = {n: value for n, value in beside.items() if n in reduced.chosen}
+        columns: dict[str, Float | float] = {
+            n: value for n, value in beside.items() if n in reduced.input_names
+        }
         columns[draws.name] = draws.values[draw]
         columns |= zip(scenario.state_names, states[state].T, strict=True)
         for name in controls[0].values:
@@ -302,7 +304,7 @@ class ReducedModelSource(NamedStructure):
         model, observation, outputs = self.wing, self._scenario.observation, self._outputs
         asset, means = self._scenario.asset, calibrated_means(self._scenario.calibration)
         given = {**means, **asset.true_parameters, **asset.constant_load}
-        known = {name: value for name, value in given.items() if name in model.chosen}
+        known = {name: value for name, value in given.items() if name in model.input_names}
 
         def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
             values = {**known, **health, **control}
@@ -338,7 +340,7 @@ def modal_values(
     modes = model.modes(vector)
     alpha, beta = model.damping.tolist() if damping is None else damping
     frequency = modes.frequency[section.places]
-    rows = [model.static_count + model.accelerations.index(name) for name in section.accelerometers]
+    rows = [model.static_output_count + model.accelerations.index(name) for name in section.accelerometers]
     shape = modes.output[rows][:, section.places]
     return np.column_stack(
         [frequency, rayleigh_damping_ratio(alpha, beta, frequency), *(shape[1:] / shape[0])]
@@ -415,7 +417,7 @@ class RecordedStructure(Asset):
         found = identify_modes(acceleration, record.sampling_rate, section.bands, record.kind)
         self._turn += 1
         given = {**self._parameters, **control, **health}
-        vector = model.vector({name: value for name, value in given.items() if name in model.chosen})
+        vector = model.vector({name: value for name, value in given.items() if name in model.input_names})
         alpha, beta = model.damping.tolist()
         damping = given.get("damping_alpha", alpha), given.get("damping_beta", beta)
         errors = section.observed(found.standard_error).tolist()

@@ -1,8 +1,8 @@
 """Laws of internal forces at ports; `fe.runtime.laws.interface` says what a law is.
 
-Every law of a file of this folder is known by its number, its place in `LAWS`. `advance` and `pull` are here
-once, with that number before what they are given: they call those of the law.
-`fe.compilation` has the same compiled.
+Every law of a file of this folder has a number, its index in `LAWS`. `advance` and
+`force_and_slope` of this module take that number first, and then call the function of the law.
+`fe.compilation` compiles them.
 
 NumPy and relative imports only: this folder is copied into the FMU.
 """
@@ -14,24 +14,27 @@ from typing import Any
 
 from .interface import PortForce
 
-MODULES = tuple(import_module(f"{__name__}.{item.name}") for item in iter_modules(__path__))
+MODULES = tuple(import_module(f"{__name__}.{module.name}") for module in iter_modules(__path__))
+"""The modules of this folder."""
 LAWS = tuple(sorted(PortForce.__subclasses__(), key=lambda law: law.kind))
-"""The laws' primitives, by number."""
+"""The classes of the laws, by number."""
 
 
-def answers(name: str) -> tuple[Callable[..., Any], ...]:
-    """Return a function of the interface as each law answers it."""
+def functions_by_law(name: str) -> tuple[Callable[..., Any], ...]:
+    """Return one function of the interface for each law, by the number of the law."""
     return tuple(getattr(law, name) for law in LAWS)
 
 
-def _chosen(name: str) -> Callable[..., Any]:
-    table = answers(name)
+def _function_of_numbered_law(name: str) -> Callable[..., Any]:
+    """Return a function that takes the number of a law, and calls that law's function."""
+    functions = functions_by_law(name)
 
-    def chosen(number: int, *given: Any) -> Any:
-        return table[number](*given)
+    def call(number: int, *arguments: Any) -> Any:
+        return functions[number](*arguments)
 
-    chosen.__name__ = name
-    return chosen
+    call.__name__ = name
+    return call
 
 
-advance, pull = map(_chosen, ("advance", "pull"))
+advance = _function_of_numbered_law("advance")
+force_and_slope = _function_of_numbered_law("force_and_slope")

@@ -1,21 +1,23 @@
-"""What a law of a port is: a force F(x, x', memory) that acts against the motion x of a port, -F on x.
+"""The interface of a law: a force F(x, x', memory) against the motion x of a port, -F on x.
 
-A law is a subclass of `PortForce` in a file of this folder, with its numbers and their units. A law of
-position answers `pull`, and `advance` if it is hysteretic; a law of speed is one of the power laws of
-`fe.runtime.laws.speed`.
+A law is a subclass of `PortForce` in a file of this folder, with its numbers and their units. A law
+of position defines `force_and_slope`, and `advance` if it is hysteretic; a law of speed is one of
+the power laws of `fe.runtime.laws.speed`.
 
-`advance` and `pull` are called at every step, in the subset of Python that numba compiles too, with:
+`advance` and `force_and_slope` are called at every step, in the subset of Python that numba
+compiles too, with:
 
-law : (`PARAMETERS` + E,) ndarray
-    The law's parameters, then those of its hysteretic elements, `PortForce.row`.
-memory : (`HEAD` + E,) ndarray
-    1 if friction holds the port (`HELD`); its last position (`PLACE`); the law's force after the lag of
-    omitted modes (`LAGGED`); what loads that are gone still add to the position (`FADING`); the law's force
-    (`FORCE`); then the states of the elements.
+law : (`PARAMETERS` + E,) array
+    The law's parameters, then those of its hysteretic elements: `PortForce.parameter_row`.
+memory : (`FIRST_ELEMENT` + E,) array
+    What the law remembers: 1 if dry friction holds the port (`STUCK`); the port's last position
+    (`POSITION`); the force as the residual position follows it (`LAGGED_FORCE`); what loads that
+    were removed still add to the position (`FADING_POSITION`); the law's force (`FORCE`); then the
+    states of the elements.
 x : float
     Position of the port [m or rad].
-h : float
-    Duration of the way from the last position to x [s].
+duration : float
+    Time since the last position [s].
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -30,64 +32,79 @@ from ..errors import InvalidPatchError
 from ..primitive import Primitive
 
 PARAMETERS = 5
-"""Most parameters of a law."""
+"""Largest number of parameters of a law."""
 POSITIVE, NOT_NEGATIVE = "be positive", "not be negative"
-"""What a number must, said after its unit."""
+"""Requirement on a number; it stands after the unit in the annotation of the number."""
 
 
 class PortForce(Primitive):
-    """A primitive that acts at a port."""
+    """A primitive that is a force at a port: a law, by its numbers."""
 
-    in_windows: ClassVar[bool] = True
-    of_speed: ClassVar[bool] = False
+    can_act_in_windows: ClassVar[bool] = True
+    depends_on_speed: ClassVar[bool] = False
     """Whether the force is one of speed, which is zero at rest."""
     hysteretic: ClassVar[bool] = False
-    """Whether the force depends on what happened before."""
+    """Whether the force depends on the history of the motion."""
 
     port: str
 
     @property
     def proportional(self) -> tuple[str, ...]:
-        """The numbers that the force is in proportion to; without the first there is none."""
-        return (next(iter(self.units)),)
+        """Names of the numbers that the force is in proportion to; it vanishes with the first."""
+        first_number = next(iter(self.units))
+        return (first_number,)
 
     @property
-    def row(self) -> FloatArray:
-        """Parameters for the functions of the law: its numbers, in their order, and zeros after fewer."""
-        numbers = [float(getattr(self, name)) for name, kind in self.values().items() if kind is not str]
+    def parameter_row(self) -> FloatArray:
+        """The parameters for `force_and_slope`: the numbers in their order, then zeros."""
+        numbers = [
+            float(getattr(self, name))
+            for name, value_type in self.value_types().items()
+            if value_type is not str
+        ]
         return np.pad(numbers, (0, PARAMETERS - len(numbers)))
 
     @property
     def magnitude(self) -> float:
-        """Zero where the law gives no force at all."""
+        """A number that is zero where the law gives no force at all."""
         return float(getattr(self, self.proportional[0]))
 
     def check(self) -> None:
-        """Raise `InvalidPatchError` where a number cannot be."""
-        for name, hint in get_annotations(type(self)).items():
-            for must in getattr(hint, "__metadata__", ())[1:]:
-                self.require(name, getattr(self, name), must)
+        """Check that each number meets its requirement.
 
-    def require(self, name: str, value: float, must: str) -> None:
-        """Raise `InvalidPatchError` for a number that is not `POSITIVE` or `NOT_NEGATIVE`, as it must."""
-        if value < 0.0 or (must == POSITIVE and value == 0.0):
-            raise InvalidPatchError(f"{name} of {self.kind!r} must {must}, but is {value:g}.")
+        Raises
+        ------
+        InvalidPatchError
+            If one does not.
+        """
+        for name, hint in get_annotations(type(self)).items():
+            for requirement in getattr(hint, "__metadata__", ())[1:]:
+                self.require(name, getattr(self, name), requirement)
+
+    def require(self, name: str, value: float, requirement: str) -> None:
+        """Raise `InvalidPatchError` unless a number is `POSITIVE` or `NOT_NEGATIVE`."""
+        if value < 0.0 or (requirement == POSITIVE and value == 0.0):
+            raise InvalidPatchError(
+                f"{name} of {self.kind!r} must {requirement}, but is {value:g}."
+            )
 
     @staticmethod
     def advance(law: FloatArray, memory: FloatArray, x: float) -> None:
-        """Carry the states of the elements from the last position to `x`."""
+        """Carry the states of the hysteretic elements from the last position to `x`, in place."""
 
     @staticmethod
-    def pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
-        """Return force and slope at `x`; the memory, of where the way begins, is left as it is.
+    def force_and_slope(
+        law: FloatArray, memory: FloatArray, x: float, duration: float
+    ) -> tuple[float, float]:
+        """Return the force at `x` and its derivative by `x`; the memory is not changed.
 
-        Of dry friction the largest force, as if it moved forwards.
+        Of dry friction: the largest force, as if the port moved forwards.
         """
         return 0.0, 0.0
 
 
 def power(base: float, exponent: float) -> float:
-    """Return base^exponent of a base that is not negative; 0^0 is 1."""
+    """Return base^exponent for a base that is not negative; 0^0 is 1."""
     if exponent == 0.0:
         return 1.0
     if exponent == 1.0:

@@ -1,19 +1,22 @@
-"""Laws of position, without memory and with. NumPy and relative imports only: copied into the FMU."""
+"""Laws of position, without memory and hysteretic: F = F(x, memory).
+
+NumPy and relative imports only: this file is copied into the FMU.
+"""
 
 from typing import Annotated, ClassVar
 
 import numpy as np
 
-from ..arrays import HEAD, PLACE
+from ..arrays import FIRST_ELEMENT, POSITION
 from ..errors import InvalidPatchError
 from .interface import NOT_NEGATIVE, PARAMETERS, POSITIVE, FloatArray, PortForce, power
 
 
 class PowerStiffness(PortForce):
-    """F = coefficient |x / x0|^exponent sgn x; `side` 0: both signs of x, +1 or -1: that sign only.
+    """F = coefficient |x / x0|^exponent sgn x; `side` 0: both signs of x, +1 or -1: one sign only.
 
-    A cubic spring has exponent 3 and side 0; a breathing crack exponent 1, side -1, coefficient negative.
-    `coefficient` [N or N m] is the force at x0 = `reference_displacement`.
+    A cubic spring has exponent 3 and side 0; a breathing crack has exponent 1, side -1 and a
+    negative coefficient. `coefficient` [N or N m] is the force at x0 = `reference_displacement`.
     """
 
     coefficient: Annotated[float, "N or N m"]
@@ -22,24 +25,33 @@ class PowerStiffness(PortForce):
     reference_displacement: Annotated[float, "m or rad", POSITIVE]
 
     def check(self) -> None:
-        """Raise `InvalidPatchError` where a number cannot be."""
+        """Raise `InvalidPatchError` where a number is not possible."""
         super().check()
         if abs(self.side) > 1:
-            raise InvalidPatchError(f"side of {self.kind!r} must lie from -1 to 1, but is {self.side:g}.")
+            raise InvalidPatchError(
+                f"side of {self.kind!r} must lie from -1 to 1, but is {self.side:g}."
+            )
 
     @staticmethod
-    def pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
-        """Return force and slope at `x`."""
-        if law[2] * x < 0.0 or x == 0.0:
-            return 0.0, (law[0] / law[3] if law[1] == 1.0 and law[2] == 0.0 else 0.0)
-        size = law[0] * power(abs(x / law[3]), law[1])
-        return (size if x > 0.0 else -size), law[1] * size / abs(x)
+    def force_and_slope(
+        law: FloatArray, memory: FloatArray, x: float, duration: float
+    ) -> tuple[float, float]:
+        """Return the force at `x` and its derivative by `x`."""
+        coefficient = law[0]
+        exponent = law[1]
+        side = law[2]
+        reference = law[3]
+        if side * x < 0.0 or x == 0.0:
+            slope = coefficient / reference if exponent == 1.0 and side == 0.0 else 0.0
+            return 0.0, slope
+        size = coefficient * power(abs(x / reference), exponent)
+        return (size if x > 0.0 else -size), exponent * size / abs(x)
 
 
 class FreePlay(PortForce):
-    """F = -stiffness clip(x, -half_width, half_width): the port's spring is absent inside the gap.
+    """F = -stiffness clip(x, -half_width, half_width): a gap in which the port's spring is absent.
 
-    `stiffness` [N/m or N m/rad] is the part of the stiffness that the gap removes.
+    `stiffness` [N/m or N m/rad] is the part of the port's stiffness that the gap removes.
     """
 
     stiffness: Annotated[float, "N/m or N m/rad"]
@@ -47,17 +59,23 @@ class FreePlay(PortForce):
 
     @property
     def magnitude(self) -> float:
-        """Largest force."""
+        """The largest force [N or N m]."""
         return self.stiffness * self.half_width
 
     @staticmethod
-    def pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
-        """Return force and slope at `x`."""
-        return -law[0] * min(max(x, -law[1]), law[1]), (-law[0] if abs(x) < law[1] else 0.0)
+    def force_and_slope(
+        law: FloatArray, memory: FloatArray, x: float, duration: float
+    ) -> tuple[float, float]:
+        """Return the force at `x` and its derivative by `x`."""
+        stiffness = law[0]
+        half_width = law[1]
+        force = -stiffness * min(max(x, -half_width), half_width)
+        slope = -stiffness if abs(x) < half_width else 0.0
+        return force, slope
 
 
 class SineForce(PortForce):
-    """F = coefficient sin(wave_number x + phase), against x: weight of a pendulum, cogging of a motor.
+    """F = coefficient sin(wave_number x + phase): weight of a pendulum, cogging of a motor.
 
     m g l sin x brings a pendulum back to x = 0.
     """
@@ -67,24 +85,29 @@ class SineForce(PortForce):
     phase: Annotated[float, "rad"]
 
     @staticmethod
-    def pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
-        """Return force and slope at `x`."""
-        angle = law[1] * x + law[2]
-        return law[0] * np.sin(angle), law[0] * law[1] * np.cos(angle)
+    def force_and_slope(
+        law: FloatArray, memory: FloatArray, x: float, duration: float
+    ) -> tuple[float, float]:
+        """Return the force at `x` and its derivative by `x`."""
+        coefficient = law[0]
+        wave_number = law[1]
+        phase = law[2]
+        angle = wave_number * x + phase
+        return coefficient * np.sin(angle), coefficient * wave_number * np.cos(angle)
 
 
-STEP = 0.3
-"""Longest way in one step of a Bouc-Wen path, in yield displacements over an order above one."""
+LONGEST_STEP = 0.3
+"""Longest step along a Bouc-Wen path, in yield displacements; divided by the order above order
+one."""
 MOST_ELEMENTS = 10_000
-"""Far more than the curve of a joint can show."""
+"""Largest number of elements of a joint, far more than its curve can show."""
 
 
 class BoucWen(PortForce):
     """Bouc-Wen hysteresis: F = stiffness (z - x), z' = v (1 - (1 + sgn(v z)) / 2 |z / z_y|^order).
 
-    z_y is `yield_displacement` [m or rad].
-
-    `stiffness` is the part of the port's stiffness that is hysteretic ((1 - alpha) k); below yield F is zero.
+    z_y is `yield_displacement` [m or rad]. `stiffness` is the part of the port's stiffness that is
+    hysteretic, (1 - alpha) k; below yield F is zero.
     """
 
     hysteretic: ClassVar[bool] = True
@@ -94,49 +117,62 @@ class BoucWen(PortForce):
 
     @staticmethod
     def advance(law: FloatArray, memory: FloatArray, x: float) -> None:
-        """Follow z to `x`."""
-        memory[HEAD] = followed(law, memory, x)
+        """Carry z from the last position to `x`, in place."""
+        memory[FIRST_ELEMENT] = hysteretic_displacement(law, memory, x)
 
     @staticmethod
-    def pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
-        """Return force and slope at `x`."""
-        z = followed(law, memory, x)
-        loading = z * (x - memory[PLACE]) > 0.0
-        gradient = -law[0] * power(min(abs(z) / law[1], 1.0), law[2]) if loading else 0.0
-        return law[0] * (z - x), gradient
+    def force_and_slope(
+        law: FloatArray, memory: FloatArray, x: float, duration: float
+    ) -> tuple[float, float]:
+        """Return the force at `x` and its derivative by `x`."""
+        stiffness = law[0]
+        yield_displacement = law[1]
+        order = law[2]
+        z = hysteretic_displacement(law, memory, x)
+        is_loading = z * (x - memory[POSITION]) > 0.0
+        slope = (
+            -stiffness * power(min(abs(z) / yield_displacement, 1.0), order) if is_loading else 0.0
+        )
+        return stiffness * (z - x), slope
 
 
-def followed(law: FloatArray, memory: FloatArray, x: float) -> float:
-    """Return z of a Bouc-Wen law at `x`."""
-    width, order = law[1], law[2]
-    z, rest = memory[HEAD] / width, (x - memory[PLACE]) / width
-    if z * rest < 0.0:  # unloading: dz = dx until z is zero
-        part = rest if abs(rest) <= abs(z) else -z
-        z += part
-        rest -= part
-    if rest != 0.0:  # loading: dz/dx = 1 - |z|^order by Runge and Kutta, in steps of which the last is short
-        size, way = abs(z), min(abs(rest), 2.0 + 40.0 / order)  # by then it yields to the last bit
-        while way > 0.0:
-            h = min(way, STEP / max(order, 1.0))
-            way -= h
-            first = 1.0 - power(size, order)
-            second = 1.0 - power(size + 0.5 * h * first, order)
-            third = 1.0 - power(size + 0.5 * h * second, order)
-            last = 1.0 - power(size + h * third, order)
-            size = min(size + h / 6.0 * (first + 2.0 * (second + third) + last), 1.0)
-        z = size if rest > 0.0 else -size
-    return float(z * width)
+def hysteretic_displacement(law: FloatArray, memory: FloatArray, x: float) -> float:
+    """Return z of a Bouc-Wen law at `x`, along the straight path from the last position."""
+    yield_displacement = law[1]
+    order = law[2]
+    # all in yield displacements
+    z = memory[FIRST_ELEMENT] / yield_displacement
+    remaining = (x - memory[POSITION]) / yield_displacement
+    # unloading: dz = dx until z is zero
+    if z * remaining < 0.0:
+        unloaded = remaining if abs(remaining) <= abs(z) else -z
+        z += unloaded
+        remaining -= unloaded
+    # loading: dz/dx = 1 - |z|^order by the method of Runge and Kutta; the last step is short
+    if remaining != 0.0:
+        size = abs(z)
+        distance = min(abs(remaining), 2.0 + 40.0 / order)  # by then it yields to the last bit
+        while distance > 0.0:
+            step = min(distance, LONGEST_STEP / max(order, 1.0))
+            distance -= step
+            slope_1 = 1.0 - power(size, order)
+            slope_2 = 1.0 - power(size + 0.5 * step * slope_1, order)
+            slope_3 = 1.0 - power(size + 0.5 * step * slope_2, order)
+            slope_4 = 1.0 - power(size + step * slope_3, order)
+            size = min(size + step / 6.0 * (slope_1 + 2.0 * (slope_2 + slope_3) + slope_4), 1.0)
+        z = size if remaining > 0.0 else -size
+    return float(z * yield_displacement)
 
 
 class MicroSlip(PortForce):
-    """Iwan's joint: `element_count` Jenkins elements in parallel in place of a spring of `stiffness`.
+    """Iwan's joint: `element_count` parallel Jenkins elements in place of a spring `stiffness`.
 
-    F = k (mean z_i - x), dz_i = dx while |z_i| < d_i (Iwan 1966): at rest the elements carry their share of
-    the stiffness that the linear model already has, so F is the hysteretic force less `stiffness` x, what
-    slip takes away. The elements slip as by a density of slip displacements phi ~ d^`chi` on
-    0 < d <= `slip_force` (2 + chi) / ((1 + chi) stiffness) (Segalman 2005 without the macro-slip impulse),
-    -1 < chi <= 0; chi = 0 is the uniform Iwan joint, and a single Jenkins element has `element_count` 1 and
-    slips at `slip_force`.
+    F = k (mean z_i - x), dz_i = dx while |z_i| < d_i (Iwan 1966). At rest the elements together
+    have the stiffness that the linear model already has, so F is the hysteretic force minus
+    `stiffness` x: what slip takes away. The slip displacements have the density phi ~ d^`chi` on 0
+    < d <= `slip_force` (2 + chi) / ((1 + chi) stiffness) (Segalman 2005 without the impulse of
+    macro-slip), -1 < chi <= 0. chi = 0 is the uniform Iwan joint; a single Jenkins element has
+    `element_count` 1 and slips at `slip_force`.
     """
 
     hysteretic: ClassVar[bool] = True
@@ -147,21 +183,23 @@ class MicroSlip(PortForce):
     element_count: int = 12
 
     @property
-    def row(self) -> FloatArray:
-        """k, n, and the slip displacements of the elements."""
-        return np.array((self.stiffness, self.element_count, *[0.0] * (PARAMETERS - 2), *self.elements()))
+    def parameter_row(self) -> FloatArray:
+        """k, the number of elements, zeros, and the slip displacements of the elements."""
+        unused = [0.0] * (PARAMETERS - 2)
+        return np.array([self.stiffness, self.element_count, *unused, *self.slip_displacements()])
 
-    def elements(self) -> FloatArray:
-        """Return the slip displacements (n,) of the elements.
+    def slip_displacements(self) -> FloatArray:
+        """Return the slip displacements (n,) of the elements [m or rad].
 
-        Quantile midpoints of phi ~ d^chi, scaled so that the joint as a whole slips at `slip_force` exactly.
+        They are quantile midpoints of phi ~ d^chi, scaled so that the joint as a whole slips at
+        `slip_force` exactly.
         """
-        part = (np.arange(self.element_count) + 0.5) / self.element_count
-        slips = part ** (1.0 / (1.0 + self.chi))
+        quantile = (np.arange(self.element_count) + 0.5) / self.element_count
+        slips = quantile ** (1.0 / (1.0 + self.chi))
         return np.asarray(slips * (self.slip_force / self.stiffness / slips.mean()))
 
     def check(self) -> None:
-        """Raise `InvalidPatchError` where a number cannot be."""
+        """Raise `InvalidPatchError` where a number is not possible."""
         super().check()
         self.require("element_count", self.element_count, POSITIVE)
         self.require("1 + chi", 1.0 + self.chi, POSITIVE)
@@ -174,18 +212,25 @@ class MicroSlip(PortForce):
 
     @staticmethod
     def advance(law: FloatArray, memory: FloatArray, x: float) -> None:
-        """Stretch the elements to `x`, each up to its slip."""
+        """Stretch the elements from the last position to `x`, each up to its slip, in place."""
         for i in range(int(law[1])):
             slip = law[PARAMETERS + i]
-            memory[HEAD + i] = min(max(memory[HEAD + i] + (x - memory[PLACE]), -slip), slip)
+            stretch = memory[FIRST_ELEMENT + i] + (x - memory[POSITION])
+            memory[FIRST_ELEMENT + i] = min(max(stretch, -slip), slip)
 
     @staticmethod
-    def pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
-        """Return force and slope at `x`."""
-        count, total, moving = int(law[1]), 0.0, 0
+    def force_and_slope(
+        law: FloatArray, memory: FloatArray, x: float, duration: float
+    ) -> tuple[float, float]:
+        """Return the force at `x` and its derivative by `x`."""
+        stiffness = law[0]
+        count = int(law[1])
+        total = 0.0
+        slipping = 0
         for i in range(count):
-            stretch, slip = memory[HEAD + i] + (x - memory[PLACE]), law[PARAMETERS + i]
+            stretch = memory[FIRST_ELEMENT + i] + (x - memory[POSITION])
+            slip = law[PARAMETERS + i]
             total += min(max(stretch, -slip), slip)
             if abs(stretch) >= slip:
-                moving += 1
-        return law[0] * (total / count - x), -law[0] * moving / count
+                slipping += 1
+        return stiffness * (total / count - x), -stiffness * slipping / count

@@ -1,160 +1,203 @@
-"""Laws of speed, powers of it: F = k |x|^a |v - l|^p sgn(v - l), on both sides of the level l or above it.
+"""Laws of speed: F = k |x|^a |v - l|^p sgn(v - l), on both sides of the level l or above it.
 
-Their row: k, p, a, l, and 1 where there is none below the level. Alone at a port of speed s a law takes
-s' = -strength |s - l|^p sgn(s - l), strength = w k |x|^a, w the speed by a unit impulse, in closed form.
-NumPy and relative imports only: this file is copied into the FMU.
+Alone at a port of speed s a law gives s' = -strength |s - l|^p sgn(s - l) with the strength w k
+|x|^a, w the inverse mass of the port: its speed after a unit impulse. The functions below solve
+that in closed form. NumPy and relative imports only: this file is copied into the FMU.
 """
 
 from typing import Annotated, ClassVar
 
 import numpy as np
 
-from ..arrays import PLACE
+from ..arrays import POSITION
 from .interface import NOT_NEGATIVE, POSITIVE, FloatArray, PortForce, power
 
+COEFFICIENT, EXPONENT, POSITION_EXPONENT, LEVEL, ONE_SIDED = range(5)
+"""Columns of a law's parameters: k, p, a, l, and 1 where there is no force below the level."""
 
-def way_pull(law: FloatArray, memory: FloatArray, x: float, h: float) -> tuple[float, float]:
-    """Return force and slope at `x`, the speed being that of the way; of dry friction the largest force."""
-    size, exponent = law[0] * power(abs(x), law[2]), law[1]
-    above = (x - memory[PLACE]) / h - law[3]
-    if law[4] == 1.0 and above <= 0.0:
+
+def force_of_mean_speed(
+    law: FloatArray, memory: FloatArray, x: float, duration: float
+) -> tuple[float, float]:
+    """Return the force of a law of speed at `x`, and its derivative by `x`.
+
+    The speed is the mean speed since the last position. Of dry friction: the largest force.
+    """
+    exponent = law[EXPONENT]
+    size = law[COEFFICIENT] * power(abs(x), law[POSITION_EXPONENT])
+    above_level = (x - memory[POSITION]) / duration - law[LEVEL]
+    if law[ONE_SIDED] == 1.0 and above_level <= 0.0:
         return 0.0, 0.0
     if exponent == 0.0:
-        return size, (size * law[2] / x if x != 0.0 else 0.0)
-    if above == 0.0:
-        return 0.0, (size / h if exponent == 1.0 else 1e300 if exponent < 1.0 else 0.0)
-    size *= power(abs(above), exponent)
-    slope = size * exponent / (h * abs(above))
-    if above < 0.0:
+        return size, (size * law[POSITION_EXPONENT] / x if x != 0.0 else 0.0)
+    if above_level == 0.0:
+        if exponent == 1.0:
+            return 0.0, size / duration
+        return 0.0, (1e300 if exponent < 1.0 else 0.0)  # the force rises vertically, or not at all
+    size *= power(abs(above_level), exponent)
+    slope = size * exponent / (duration * abs(above_level))
+    if above_level < 0.0:
         size = -size
-    return size, (slope + size * law[2] / x if x != 0.0 else slope)
+    return size, (slope + size * law[POSITION_EXPONENT] / x if x != 0.0 else slope)
 
 
 class PowerDamping(PortForce):
     """F = coefficient |v / v0|^velocity_exponent |x / x0|^displacement_exponent sgn v.
 
-    Coulomb friction has both exponents zero, quadratic damping velocity_exponent 2, structural damping
-    displacement_exponent 1. `coefficient` [N or N m] is the force at v0 = `reference_velocity` and
-    x0 = `reference_displacement`.
+    Coulomb friction has both exponents zero, quadratic damping velocity_exponent 2, structural
+    damping displacement_exponent 1. `coefficient` [N or N m] is the force at v0 =
+    `reference_velocity` and x0 = `reference_displacement`.
     """
 
-    of_speed: ClassVar[bool] = True
+    depends_on_speed: ClassVar[bool] = True
     coefficient: Annotated[float, "N or N m", NOT_NEGATIVE]
     velocity_exponent: Annotated[float, "1", NOT_NEGATIVE]
     displacement_exponent: Annotated[float, "1", NOT_NEGATIVE]
     reference_velocity: Annotated[float, "m/s or rad/s", POSITIVE]
     reference_displacement: Annotated[float, "m or rad", POSITIVE]
-    pull = staticmethod(way_pull)
+    force_and_slope = staticmethod(force_of_mean_speed)
 
     @property
-    def row(self) -> FloatArray:
-        """k, p and a."""
-        p, a = self.velocity_exponent, self.displacement_exponent
-        size = self.coefficient / self.reference_velocity**p / self.reference_displacement**a
-        return np.array((size, p, a, 0.0, 0.0))
+    def parameter_row(self) -> FloatArray:
+        """k, p and a; the level is zero, and the law acts on both sides of it."""
+        p = self.velocity_exponent
+        a = self.displacement_exponent
+        k = self.coefficient / self.reference_velocity**p / self.reference_displacement**a
+        return np.array((k, p, a, 0.0, 0.0))
 
 
 class Overflow(PortForce):
-    """F = coefficient ((v - level) / v0)^exponent where v > level, v0 = `reference_velocity`; else zero.
+    """F = coefficient ((v - level) / v0)^exponent where v > level, else zero.
 
-    What begins at a level, an overflow or a relief valve: of speed, so that at a port of a state it is a flow
-    out of what is full, v the level.
+    v0 is `reference_velocity`.
+
+    A flow that begins at a level, such as that of an overflow or a relief valve. At a port whose
+    speed is a filling level, F is a flow out of what is full.
     """
 
-    of_speed: ClassVar[bool] = True
+    depends_on_speed: ClassVar[bool] = True
     coefficient: Annotated[float, "N or N m", NOT_NEGATIVE]
     exponent: Annotated[float, "1", POSITIVE]
     level: Annotated[float, "m/s or rad/s", NOT_NEGATIVE]
     reference_velocity: Annotated[float, "m/s or rad/s", POSITIVE]
-    pull = staticmethod(way_pull)
+    force_and_slope = staticmethod(force_of_mean_speed)
 
     @property
-    def row(self) -> FloatArray:
-        """k, p, the level, and that there is none below."""
-        size = self.coefficient / self.reference_velocity**self.exponent
-        return np.array((size, self.exponent, 0.0, self.level, 1.0))
+    def parameter_row(self) -> FloatArray:
+        """k, p and the level; the law acts above the level only."""
+        k = self.coefficient / self.reference_velocity**self.exponent
+        return np.array((k, self.exponent, 0.0, self.level, 1.0))
 
 
-def holds(law: FloatArray) -> bool:
+def can_hold(law: FloatArray) -> bool:
     """Return whether the force can bring a port to rest in finite time, and hold it there."""
-    return bool(law[1] < 1.0 and law[4] == 0.0)
+    return bool(law[EXPONENT] < 1.0 and law[ONE_SIDED] == 0.0)
 
 
-def strength(law: FloatArray, x: float, weight: float) -> float:
-    """Return the strength at a position, for a port whose speed a unit impulse changes by `weight`."""
-    return float(weight * law[0] * power(abs(x), law[2]))
+def is_dry_friction(law: FloatArray) -> bool:
+    """Return whether the size of the force does not depend on the speed."""
+    return bool(law[EXPONENT] == 0.0)
 
 
-def steady(law: FloatArray, x: float, speed: float) -> float:
+def strength(law: FloatArray, x: float, inverse_mass: float) -> float:
+    """Return the strength of a law at position `x` of a port, see the head of this file."""
+    return float(inverse_mass * law[COEFFICIENT] * power(abs(x), law[POSITION_EXPONENT]))
+
+
+def steady_force(law: FloatArray, x: float, speed: float) -> float:
     """Return the force at a position and a speed."""
-    above = speed - law[3]
-    if above == 0.0 or (law[4] == 1.0 and above < 0.0):
+    above_level = speed - law[LEVEL]
+    if above_level == 0.0 or (law[ONE_SIDED] == 1.0 and above_level < 0.0):
         return 0.0
-    size = law[0] * power(abs(x), law[2]) * power(abs(above), law[1])
-    return float(size if above > 0.0 else -size)
+    size = (
+        law[COEFFICIENT]
+        * power(abs(x), law[POSITION_EXPONENT])
+        * power(abs(above_level), law[EXPONENT])
+    )
+    return float(size if above_level > 0.0 else -size)
 
 
-def kick(law: FloatArray, speed: float, strength: float, duration: float, through: bool) -> float:
-    """Return the speed after the law alone has acted; with `through`, dry friction does not stop at zero."""
-    exponent, above = law[1], speed - law[3]
-    size, spent = abs(above), strength * duration
-    if size == 0.0 or (law[4] == 1.0 and above < 0.0) or (exponent > 1.0 and size < 1e-60):
+def speed_after(
+    law: FloatArray, speed: float, strength: float, duration: float, passes_zero: bool
+) -> float:
+    """Return the speed of a port after the law has acted on it alone for a duration [s].
+
+    With `passes_zero`, dry friction goes on with its sign where the speed has become zero.
+    """
+    exponent = law[EXPONENT]
+    above_level = speed - law[LEVEL]
+    size = abs(above_level)
+    impulse = strength * duration
+    is_inactive = size == 0.0 or (law[ONE_SIDED] == 1.0 and above_level < 0.0)
+    if is_inactive or (exponent > 1.0 and size < 1e-60):
         return speed
     if exponent == 0.0:
-        size = size - spent if through else max(size - spent, 0.0)
+        size = size - impulse if passes_zero else max(size - impulse, 0.0)
     elif exponent == 1.0:
-        size *= np.exp(-spent)
+        size *= np.exp(-impulse)
     elif exponent == 2.0:
-        size /= 1.0 + spent * size
+        size /= 1.0 + impulse * size
     else:
-        root = size ** (1.0 - exponent) - (1.0 - exponent) * spent
-        size = root ** (1.0 / (1.0 - exponent)) if root > 0.0 else 0.0
-    return float(law[3] + size if above > 0.0 else law[3] - size)
+        base = size ** (1.0 - exponent) - (1.0 - exponent) * impulse
+        size = base ** (1.0 / (1.0 - exponent)) if base > 0.0 else 0.0
+    return float(law[LEVEL] + size if above_level > 0.0 else law[LEVEL] - size)
 
 
 def holding_limit(law: FloatArray, strength: float, duration: float) -> float:
-    """Return the largest speed that a law which `holds` brings to rest within `duration`."""
-    rest = 1.0 - law[1]
-    return power(rest * strength * duration, 1.0 / rest)
+    """Return the largest speed that a law which `can_hold` brings to rest within `duration` [s]."""
+    one_minus_exponent = 1.0 - law[EXPONENT]
+    return power(one_minus_exponent * strength * duration, 1.0 / one_minus_exponent)
 
 
-def crossing(
-    law: FloatArray, begin: float, end: float, slopes: tuple[float, float], lost: float, strength: float,
-    h: float,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Return what must be added where the speed of a port changes sign within a step.
+def reversal_correction(
+    law: FloatArray,
+    begin: float,
+    end: float,
+    slopes: tuple[float, float],
+    speed_lost: float,
+    strength: float,
+    duration: float,
+) -> tuple[float, float, float]:
+    """Return the correction of a step in which the speed of a port changes its sign.
 
-    The turn is that of the cubic through the values and slopes of the speed. Impulse and first moment of the
-    force are those of the way before and after it.
+    The step has taken friction of the first sign throughout. The reversal is that of the cubic
+    through the values and slopes of the speed; the impulse of friction and its first moment are
+    corrected for the time after it.
 
     Parameters
     ----------
-    law : ndarray
-        A law that `holds`.
+    law : (5 + E,) array
+        A law that `can_hold`.
     begin, end : float
-        Speed at both ends as friction of the first sign would have it.
+        Speed at both ends, with friction of the first sign.
     slopes : tuple of float
-        Its derivatives there.
-    lost : float
-        What the first half kick took from the speed.
-    strength, h : float
-        Of the law at its position; duration of the step.
+        Accelerations at both ends.
+    speed_lost : float
+        What the first half of the impulse took from the speed.
+    strength : float
+        Strength of the law at its position.
+    duration : float
+        Duration of the step [s].
 
     Returns
     -------
     speed : float
-        To be added to the speed at the end.
+        Correction of the speed at the end.
     position : float
-        To be added to the position at the end; or, if friction holds, the way from the step's begin to the
-        turn.
-    held : float
-        1 if friction holds from the turn on.
+        Correction of the position at the end; if friction holds, the distance from the step's begin
+        to the reversal instead.
+    is_held : float
+        1 if friction holds the port from the reversal on, else 0.
     """
-    sign, one = (1.0 if begin > 0.0 else -1.0), law[1] + 1.0
-    linear = h * slopes[0]
-    square = 3.0 * (end - begin) - 2.0 * linear - h * slopes[1]
-    cubic = linear + h * slopes[1] - 2.0 * (end - begin)
-    low, high = 0.0, 1.0
+    sign = 1.0 if begin > 0.0 else -1.0
+    power_plus_one = law[EXPONENT] + 1.0
+    # coefficients of the cubic, by the fraction u of the step
+    linear = duration * slopes[0]
+    square = 3.0 * (end - begin) - 2.0 * linear - duration * slopes[1]
+    cubic = linear + duration * slopes[1] - 2.0 * (end - begin)
+    # the reversal, by bisection
+    low = 0.0
+    high = 1.0
     for _ in range(40):
         u = 0.5 * (low + high)
         if sign * (begin + u * (linear + u * (square + u * cubic))) > 0.0:
@@ -162,20 +205,39 @@ def crossing(
         else:
             high = u
     u = 0.5 * (low + high)
-    slope = (linear + u * (2.0 * square + 3.0 * u * cubic)) / h
-    before = max(-sign * slope, 0.0)
-    free = -sign * (slope + 2.0 * lost / h)  # backwards acceleration without this friction
-    if free <= 0.0 or 0.5 * h * free <= holding_limit(law, strength, 0.5 * h):
-        way = h * u * (begin + u * (linear / 2.0 + u * (square / 3.0 + u * cubic / 4.0)))
-        if one == 1.0:
-            way -= sign * strength * h * h / 12.0
-        return 0.0, way, 1.0
-    first, rest = u * h, (1.0 - u) * h
-    drag = -sign * strength * power(before, law[1]) * first**one / one
-    push = -sign * strength * power(free, law[1]) * rest**one / one
-    moment = drag * (rest + first * one / (one + 1.0)) - push * rest / (one + 1.0)
-    if one == 1.0:
-        # Half kicks at both ends of a step shift the position by force h^2 / 12. The shift is undone when
-        # the force ends, but here the next force begins, of the other sign.
-        moment -= sign * strength * h * h / 6.0
-    return drag - push + lost, moment + lost * h, 0.0
+    slope = (linear + u * (2.0 * square + 3.0 * u * cubic)) / duration
+    deceleration = max(-sign * slope, 0.0)
+    # backwards, without this friction
+    free_acceleration = -sign * (slope + 2.0 * speed_lost / duration)
+    limit = holding_limit(law, strength, 0.5 * duration)
+    if free_acceleration <= 0.0 or 0.5 * duration * free_acceleration <= limit:
+        distance = (
+            duration * u * (begin + u * (linear / 2.0 + u * (square / 3.0 + u * cubic / 4.0)))
+        )
+        if power_plus_one == 1.0:
+            distance -= sign * strength * duration * duration / 12.0
+        return 0.0, distance, 1.0
+    # impulses and first moment of friction before and after the reversal
+    time_before = u * duration
+    time_after = (1.0 - u) * duration
+    impulse_before = (
+        -sign
+        * strength
+        * power(deceleration, law[EXPONENT])
+        * time_before**power_plus_one
+        / power_plus_one
+    )
+    impulse_after = (
+        -sign
+        * strength
+        * power(free_acceleration, law[EXPONENT])
+        * time_after**power_plus_one
+        / power_plus_one
+    )
+    arm_before = time_after + time_before * power_plus_one / (power_plus_one + 1.0)
+    moment = impulse_before * arm_before - impulse_after * time_after / (power_plus_one + 1.0)
+    if power_plus_one == 1.0:
+        # Half impulses at both ends of a step shift the position by force h^2 / 12. The shift is
+        # undone when the force ends, but here the next force begins, of the other sign.
+        moment -= sign * strength * duration * duration / 6.0
+    return impulse_before - impulse_after + speed_lost, moment + speed_lost * duration, 0.0

@@ -12,7 +12,7 @@ from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Effect, EffectParameter, Prior, Setting
 from discrepancy.catalogue.library import library
-from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 from discrepancy.system.interface import Model
@@ -130,7 +130,7 @@ def drift_effect(deviation=0.3, exponent=1.0) -> Effect:
     return _effect("drift", build, deviation, frozenset(TrialKind), "y2")
 
 
-OFFSET, DRIFT = Term(offset_effect(), "y1"), Term(drift_effect(), "y2")
+OFFSET, DRIFT = EffectTerm(offset_effect(), "y1"), EffectTerm(drift_effect(), "y2")
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Linear:
         """Return all residuals, those that do not count left out."""
         point, parts = self.point(x), []
         for number, data in enumerate(self.problem.trials):
-            response = self.problem.answer(number, point, self.candidate)
+            response = self.problem.response_with(number, point, self.candidate)
             parts.append(self.problem.residual(number, point, response)[data.weight > 0.0])
         return np.concatenate(parts)
 
@@ -246,7 +246,7 @@ def with_noise(problem: Problem, **records: NoiseRecord | None) -> Problem:
     return problem_of(replace(problem.campaign, channels=channels), problem.model)
 
 
-def fitted(problem: Problem, *terms: Term, **given) -> CandidateFit:
+def fitted(problem: Problem, *terms: EffectTerm, **given) -> CandidateFit:
     """Return the fit of some terms, from the start that the problem has for them."""
     candidate = Candidate(terms)
     return fit(problem, candidate, problem.start(candidate), **given)

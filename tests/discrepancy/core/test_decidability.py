@@ -12,7 +12,7 @@ from scipy.stats import norm
 from benchmarks.cantilever import Cantilever, campaign
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, TrialKind
-from discrepancy.fits.candidate import Term
+from discrepancy.fits.candidate import EffectTerm
 from discrepancy.judgement.next_experiment import (
     Proposal,
     mutual_information,
@@ -155,7 +155,10 @@ def test_information_of_one_reading_against_quadrature(shift, weight):
     trial = replace(trial, values=np.full((1, 1), 1.5))
     tight = {"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)}
     problem = kit.problem_of(Campaign("", {"y1": channel}, (trial,), None, tight, ""), kit.ClosedForm())
-    none, other = kit.fitted(problem), kit.fitted(problem, Term(kit.offset_effect(deviation=0.02), "y1"))
+    none, other = (
+        kit.fitted(problem),
+        kit.fitted(problem, EffectTerm(kit.offset_effect(deviation=0.02), "y1")),
+    )
     point = replace(none.point, effect=np.array([shift]))
     fits = [none, replace(other, point=point, covariance=np.diag([1.0, 1.0, 1e-12]))]
     proposal, weights = Proposal(trial, "", "", 1.0), np.array([weight, 1.0 - weight])
@@ -182,7 +185,7 @@ def test_another_amplitude_decides_between_amplitude_and_time():
     test = kit.chain_bench(static=False, amplitudes=(0.01, 0.01), samples=160)
     problem = test.problem(3, test.patch("cubic_stiffness", {"stiffening": 0.01}, "end"))
     stiffening, drift = kit.chosen("cubic_stiffness", "stiffness_drift")
-    fits = [kit.fitted(problem, term) for term in (Term(stiffening, "end"), Term(drift))]
+    fits = [kit.fitted(problem, term) for term in (EffectTerm(stiffening, "end"), EffectTerm(drift))]
     information = {
         item.trial.name: mutual_information(problem, item, fits, HALF) for item in proposals(problem)
     }

@@ -14,8 +14,8 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Prior
 from discrepancy.errors import DiscrepancyError, FitError
-from discrepancy.fits.candidate import Candidate, Term
-from discrepancy.fits.fitting import attempt, fit, upper_factor
+from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.fits.fitting import attempt, cholesky_factor, fit
 from discrepancy.fits.predictive import residual_set
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -52,7 +52,7 @@ def check(problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):
     at, first = 0, problem.shared.size + candidate.size
     for number, data in enumerate(problem.trials):
         parts = problem.linearise(number, point, candidate)
-        found, index = problem.columns(number, point, parts, candidate)
+        found, index = problem.prediction_derivatives(number, point, parts, candidate)
         rows = data.standardised(found).reshape(len(found), -1)
         local, shared = np.split(rows, [data.unknowns.size])
         counts = (data.weight > 0.0).ravel()
@@ -86,7 +86,7 @@ def test_derivatives_by_all_unknowns_of_the_closed_form(at_rest, noise):
 @pytest.mark.parametrize(("free", "tolerance"), [(False, TOLERANCE), (True, 0.06)])
 def test_derivatives_by_an_effect_on_the_chain(free, tolerance):
     """A law of speed, and its exponent."""
-    candidate = Candidate((Term(kit.chosen("quadratic_damping")[0], "end", free_shape=free),))
+    candidate = Candidate((EffectTerm(kit.chosen("quadratic_damping")[0], "end", free_shape=free),))
     about, spread = (candidate.start() + 0.1, 0.2) if free else (0.3, 0.3)
     check(kit.BENCH.problem(1), candidate, effect=about, spread=spread, tolerance=tolerance)
 
@@ -102,7 +102,7 @@ def test_samples_that_do_not_count_change_nothing():
     point = linear.point(0.3 * np.random.default_rng(0).standard_normal(linear.size))
     for number in range(len(problem.trials)):
         first, second = (
-            p.residual(number, point, p.answer(number, point, Candidate())) for p in (problem, other)
+            p.residual(number, point, p.response_with(number, point, Candidate())) for p in (problem, other)
         )
         np.testing.assert_allclose(first, second, atol=1e-9)
     # nor are they counted as residuals of nought
@@ -175,7 +175,7 @@ def test_evidence_with_flat_priors_is_the_limit_of_wide_ones():
     """A flat zero adds a constant to every hypothesis: differences are those of wide priors."""
     flat = kit.closed_problem(seed=9, offset_deviation=inf)
     channels = {name: replace(item, offset_deviation=100.0) for name, item in flat.campaign.channels.items()}
-    term = Term(kit.drift_effect(exponent=3.0, deviation=0.1), "y2")
+    term = EffectTerm(kit.drift_effect(exponent=3.0, deviation=0.1), "y2")
     one, other = (
         kit.fitted(problem, term).log_evidence - kit.fitted(problem).log_evidence
         for problem in (flat, kit.problem_of(replace(flat.campaign, channels=channels), flat.model))
@@ -192,7 +192,7 @@ def test_evidence_with_unknown_variance_against_quadrature(freedom):
         parameters={"slope": (1.0, 1e-9), "curvature": (0.5, 1e-9)},
         noise=NoiseRecord(0.02, freedom) if freedom else None,
     )  # fmt: skip
-    found = kit.fitted(problem, Term(kit.offset_effect(deviation=0.1), "y1"))
+    found = kit.fitted(problem, EffectTerm(kit.offset_effect(deviation=0.1), "y1"))
     linear = kit.Linear(problem, found.candidate)
 
     def log_joint(u):
@@ -214,7 +214,7 @@ def test_evidence_with_unknown_variance_against_quadrature(freedom):
 def test_a_curvature_that_is_none_is_refused():
     for wrong in (np.nan, np.inf, -1.0):
         with pytest.raises(FitError, match=r"not finite|singular"):
-            upper_factor(np.diag([1.0, wrong]))
+            cholesky_factor(np.diag([1.0, wrong]))
 
 
 # ---------------------------------------------------------------- candidates that no fit can follow
@@ -230,7 +230,9 @@ def softening(coefficient, reference):
 
     (cubic,) = kit.chosen("cubic_stiffness")
     sizes = (replace(cubic.parameters[0], prior=Prior("normal", -30.0, 30.0)),)
-    return Term(replace(cubic, identifier="ninth_power", build=build, parameters=sizes, shape=()), "slide")
+    return EffectTerm(
+        replace(cubic, identifier="ninth_power", build=build, parameters=sizes, shape=()), "slide"
+    )
 
 
 @pytest.fixture(scope="module")

@@ -9,11 +9,11 @@ import pytest
 
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm
+from discrepancy.judgement.comparison import SimulationComparison
 from discrepancy.judgement.conclusion import look_alike_remark, with_untested
-from discrepancy.judgement.court import Court
-from discrepancy.judgement.naming import Case, name
-from discrepancy.missing_force.shares import OF_READINGS, Share
+from discrepancy.judgement.naming import Case, reach_verdict
+from discrepancy.missing_force.shares import OF_READINGS, GapShare
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch, SensorSaturation
@@ -90,7 +90,7 @@ def test_the_verdict_on_what_is_hidden(case, seed):
     how = {"noise": NOISES.get(case.get("noise")), "noise_scale": case.get("noise_scale", 1.0)}
     laws = ModelPatch.from_list(case.get("laws", []), "a case")  # that no effect of the catalogue is
     patch = sum((bench.patch(*item) for item in hidden), laws)
-    verdict, found, fit = name(bench.problem(seed, patch, **how), rivals)
+    verdict, found, fit = reach_verdict(bench.problem(seed, patch, **how), rivals)
     assert verdict.kind in kinds, verdict.sentence
     wanted = sorted(item[0] for item in hidden)
     if verdict.kind is VerdictKind.NAMED or kinds == (VerdictKind.NAMED_IN_PART,):
@@ -113,7 +113,7 @@ def test_the_verdict_on_what_is_hidden(case, seed):
     assert sum(found.set_probabilities().values()) == pytest.approx(1.0)
     assert sorted(fit.candidate.identifiers) == wanted
     # each was tried alone as well: deletion has its comparison
-    tried = {item.candidate.identifiers for item in found.all().values()}
+    tried = {item.candidate.identifiers for item in found.compared_fits().values()}
     assert {(identifier,) for identifier in wanted} <= tried
     for effect in verdict.effects:
         ((_, values, place),) = (item for item in hidden if item[0] == effect.identifier)
@@ -127,7 +127,7 @@ def test_a_sensor_that_saturates_is_named_with_its_limit(place):
     limit, rivals = 2e-4, RIVALS["soft or saturated"]
     channel, quantity = ("*", "strain") if place == "all strain" else (place, "")
     hidden = SensorSaturation(channel, limit, quantity)
-    verdict, _, _ = name(SMALL.problem(11, ModelPatch((hidden,))), rivals)
+    verdict, _, _ = reach_verdict(SMALL.problem(11, ModelPatch((hidden,))), rivals)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     assert all(gate.passed is not False for gate in verdict.gates)
     (effect,) = verdict.effects
@@ -154,7 +154,7 @@ def test_a_joint_that_slips_is_named_though_it_has_more_elements(slip_ratio):
     (joint,) = SMALL.patch("joint_micro_slip", values, "joint")
     problem = SMALL.problem(5, ModelPatch((replace(joint, element_count=400),)))
     few = replace(problem.campaign, trials=problem.campaign.trials[1:4])  # loads to both sides, a release
-    verdict, _, _ = name(kit.problem_of(few, problem.model), HYSTERESIS)
+    verdict, _, _ = reach_verdict(kit.problem_of(few, problem.model), HYSTERESIS)
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     (effect,) = verdict.effects
     assert effect.identifier == "joint_micro_slip"
@@ -178,12 +178,12 @@ def test_a_gain_of_half_a_thousandth_is_no_name(gain, kind):
     }
     fine = replace(bench, campaign=replace(bench.campaign, channels=channels, parameters=known))
     patch = fine.patch("load_cell", {"gain_error": gain, "tare_ratio": 0.0})
-    verdict, found, fit = name(fine.problem(2, patch), kit.chosen("load_cell"))
+    verdict, found, fit = reach_verdict(fine.problem(2, patch), kit.chosen("load_cell"))
     assert verdict.kind is kind, verdict.sentence
     if kind is VerdictKind.NOTHING_MISSING:
         assert "below 0.1 % of what it acts on" in verdict.sentence
         assert verdict.effects == ()
-        assert fit is found.none
+        assert fit is found.no_effect
         assert found.best().candidate.identifiers == ("load_cell",)
 
 
@@ -195,9 +195,9 @@ def test_without_a_noise_record_the_sentence_says_so():
         (0.4, kit.NOISE, VerdictKind.NAMED),
     ):
         problem = kit.closed_problem(seed=3, effect=effect, noise=noise, offset_deviation=0.0)
-        verdict, found, fit = name(problem, (kit.offset_effect(),))
+        verdict, found, fit = reach_verdict(problem, (kit.offset_effect(),))
         assert verdict.kind is kind, verdict.sentence
-        share = Court(found).share_of(fit, held_out=False)
+        share = SimulationComparison(found).share(fit, held_out=False)
         assert share.value == pytest.approx(float(effect > 0.0), abs=0.01)
         assert ("No noise record" in verdict.sentence) is (noise is None)
     assert "record" not in verdict.sentence
@@ -206,18 +206,18 @@ def test_without_a_noise_record_the_sentence_says_so():
 def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_of_a_group():
     """Which further effect stands beside it stays open; what does not fit alone is no name so."""
     problem = SMALL.problem(11, SMALL.patch(*FRICTION))
-    found = name(problem, kit.chosen(FRICTION[0]))[1]
+    found = reach_verdict(problem, kit.chosen(FRICTION[0]))[1]
     places = {"coulomb_friction": "joint", "load_cell": "", "gauge_gain": "g1"}
-    friction, cell, gain = (Term(kit.chosen(key)[0], place) for key, place in places.items())
+    friction, cell, gain = (EffectTerm(kit.chosen(key)[0], place) for key, place in places.items())
     for terms in ((cell,), (friction, gain), (cell, gain)):
-        found.keep(kit.fitted(problem, *terms), exact=True)
+        found.record(kit.fitted(problem, *terms), exact=True)
     right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
-    outcome = Case(found, {more: 0.7, right: 0.3}).shared()
+    outcome = Case(found, {more: 0.7, right: 0.3}).common_effects()
     assert outcome[0].kind is VerdictKind.NAMED
     assert [item.identifier for item in outcome[0].effects] == list(right)
     assert outcome[0].probability == pytest.approx(1.0)
     for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
-        assert Case(found, shares).shared() is None
+        assert Case(found, shares).common_effects() is None
     # patch and proof are those of a member that fits, the probability is that of those together
     verdict, _, nearest = Case(found, {("load_cell",): 0.6, right: 0.38, (): 0.02}).open()
     assert verdict.kind is VerdictKind.GROUP
@@ -250,13 +250,13 @@ def test_coloured_noise_with_a_short_record_is_no_gap(seed):
         samples = channel.noise.standard_deviation * draw(generator, (100, 1))[:, 0]
         samples -= samples.mean()
         records[key] = NoiseRecord(float(samples.std()), 99.0, samples, 0.012, "pre-trigger")
-    verdict, _, _ = name(kit.with_noise(problem, **records), SLOW)
+    verdict, _, _ = reach_verdict(kit.with_noise(problem, **records), SLOW)
     assert verdict.kind is VerdictKind.NOTHING_MISSING, verdict.sentence
 
 
 def share_of(after, gap, noise):
     """Return the share that a law is of a gap, by what is left of it, in trials that were held out."""
-    return Share(noise + gap, after, noise, True, 4, 1.0, 2.0, OF_READINGS, tested=True)
+    return GapShare(noise + gap, after, noise, True, 4, 1.0, 2.0, OF_READINGS, tested=True)
 
 
 def test_shares_and_their_interval():
@@ -269,15 +269,15 @@ def test_shares_and_their_interval():
     assert half.value == pytest.approx(0.5, abs=0.05)
     assert low < 0.5 < high
     better = share_of(noise + 0.3 * gap, gap, noise)
-    assert better.told_from(half)
-    assert not half.told_from(better)
+    assert better.is_larger_than(half)
+    assert not half.is_larger_than(better)
     assert share_of(0.9 * noise, gap, noise).value == 1.0
 
 
 def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_of_the_gap():
     """The best name, a law with a shape of its own and a longer set are no rivals, nor what is far off."""
     friction, drag, cubic = (
-        Term(*one)
+        EffectTerm(*one)
         for one in zip(kit.chosen(FRICTION[0], "quadratic_damping", "cubic_stiffness"), "aab", strict=True)
     )
 
@@ -292,12 +292,12 @@ def test_rivals_are_other_names_each_once_that_are_close_no_longer_and_as_much_o
         held(-1.0, 0.9, replace(friction, free_shape=True)), held(-1.0, 0.9, replace(drag, free_shape=True)),
         held(-1.0, 0.9, drag, cubic), held(-1.0 - SEARCH.force_rival, 0.9, drag), held(-1.0, 0.5, drag),
     )  # fmt: skip
-    court = object.__new__(Court)
-    court.score, court.told = (lambda item: item.score), (lambda item: item.told)
-    court.contenders = [best, second, freed, *others]
-    assert court.rivals(best) == [second]
-    court.contenders = [best, held(-1.0, 0.9, drag), second]
-    assert [item.candidate.terms for item in court.rivals(best)] == [(drag,), (cubic,)]
+    comparison = object.__new__(SimulationComparison)
+    comparison.score, comparison.decisive_share = (lambda item: item.score), (lambda item: item.told)
+    comparison.contenders = [best, second, freed, *others]
+    assert comparison.competitors(best) == [second]
+    comparison.contenders = [best, held(-1.0, 0.9, drag), second]
+    assert [item.candidate.terms for item in comparison.competitors(best)] == [(drag,), (cubic,)]
 
 
 # ---------------------------------------------------------------- what a name does not exclude

@@ -9,15 +9,21 @@ from scipy.stats import binom, chi2, kstest
 
 from discrepancy.campaign.noise_tests import variance_p_value
 from discrepancy.campaign.records import NoiseRecord
-from discrepancy.fits.candidate import Candidate, Point, Remainder, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point, ResidualProcess
 from discrepancy.fits.fitting import fit
-from discrepancy.fits.gates import SHAPE_GAIN, absolute_gate, absolute_tests, prior_tests, shape_gate
-from discrepancy.fits.predictive import drawn_from, residual_set, with_draws
+from discrepancy.fits.gates import (
+    SHAPE_GAIN,
+    absolute_fit_tests,
+    check_absolute_fit,
+    check_shape,
+    prior_tests,
+)
+from discrepancy.fits.predictive import importance_draws, residual_set, with_draws
 from discrepancy.fits.screening import Screen
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.location.locate import locate
-from discrepancy.search.honest_evidence import left_by, refitted, widened
-from discrepancy.search.starts import pairs
+from discrepancy.search.starts import best_pairs
+from discrepancy.search.wide_noise import refit_under_wide_noise, residual_process_of, with_wide_noise
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import ModelPatch, RunOffset
 
@@ -29,15 +35,20 @@ def test_pairs_and_gains_are_those_of_fits():
     problem = kit.closed_problem(seed=12, effect=0.12, gain_deviation=0.2)
     none = kit.fitted(problem)
     screen = Screen(problem, none)
-    terms = (Term(kit.offset_effect(deviation=10.0), "y1"), Term(kit.drift_effect(deviation=10.0), "y1"))
+    terms = (
+        EffectTerm(kit.offset_effect(deviation=10.0), "y1"),
+        EffectTerm(kit.drift_effect(deviation=10.0), "y1"),
+    )
     changes = [next(iter(screen.changes(term))) for term in terms]
-    ((misfit, first, second),) = pairs(changes, screen.sign)
+    ((misfit, first, second),) = best_pairs(changes, screen.sign)
     found = kit.fitted(problem, *terms)
     assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
     start = np.concatenate((first.best, second.best))
     np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
     same = replace(changes[0], term=terms[1])
-    assert pairs([changes[0], changes[0]], screen.sign) == pairs([changes[0], same], screen.sign) == []
+    assert (
+        best_pairs([changes[0], changes[0]], screen.sign) == best_pairs([changes[0], same], screen.sign) == []
+    )
     for term, change in zip(terms, changes, strict=True):
         found = kit.fitted(problem, term)
         prior = 0.5 * float(found.point.effect @ found.point.effect)
@@ -50,7 +61,7 @@ def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
     line = 0.1 * np.cos(2.0 * np.pi * 7.0 * 0.01 * np.arange(200))
     problem = kit.closed_problem(kinds=("ringdown",), samples=200, extra=lambda rows: line)
     (mode,) = kit.chosen("unmodelled_mode")
-    change = next(Screen(problem, kit.fitted(problem)).changes(Term(mode, "y1")))
+    change = next(Screen(problem, kit.fitted(problem)).changes(EffectTerm(mode, "y1")))
     assert mode.parameters[0].prior.value(change.start[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
 
 
@@ -74,14 +85,14 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
         sums = (1.0 + gap) * generator.chisquare(problem.counts - found.spent) / scale
         residuals = tuple(generator.standard_normal(r.shape) for r in found.residuals)
         drawn = replace(found, sums=sums, residuals=residuals)
-        rejected += absolute_gate(problem, drawn).passed is False
-        of_one.append(absolute_tests(problem, drawn)[0][1])
+        rejected += check_absolute_fit(problem, drawn).passed is False
+        of_one.append(absolute_fit_tests(problem, drawn)[0][1])
     assert gap or kstest(of_one, "uniform").pvalue > 1e-3
-    whiteness = any(name.startswith("whiteness") for name, _ in absolute_tests(problem, found))
+    whiteness = any(name.startswith("whiteness") for name, _ in absolute_fit_tests(problem, found))
     assert whiteness or samples < 120
     assert rejected > 112 if gap else rejected <= binom.isf(1e-3, draws, 1e-3)
-    wide = Remainder(np.zeros(3), np.full(3, 2.0), *np.zeros((2, 3)), np.ones(3, dtype=bool))
-    told = dict(absolute_tests(problem, replace(found, remainder=wide)))["variance of y1"]
+    wide = ResidualProcess(np.zeros(3), np.full(3, 2.0), *np.zeros((2, 3)), np.ones(3, dtype=bool))
+    told = dict(absolute_fit_tests(problem, replace(found, residual_process=wide)))["variance of y1"]
     count = problem.counts[0] - found.spent[0]
     assert told == pytest.approx(variance_p_value(found.sums[0] / count, count / 4.0, freedom / 4.0))
 
@@ -95,14 +106,16 @@ def test_draws_have_the_moments_of_a_gaussian_of_a_box_and_of_a_bent_ridge(sprea
     def gaussian(x):
         return 0.5 * float((x - 1.0) @ np.linalg.solve(covariance, x - 1.0))
 
-    draws, again = (drawn_from(gaussian, np.ones(3), spread * np.eye(3)) for _ in range(2))
+    draws, again = (importance_draws(gaussian, np.ones(3), spread * np.eye(3)) for _ in range(2))
     deviations = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose((draws.mean(axis=0) - 1.0) / deviations, 0.0, atol=0.15)
     np.testing.assert_allclose(draws.std(axis=0), deviations, rtol=0.1)
     assert draws.tobytes() == again.tobytes()
-    box = drawn_from(lambda x: np.inf if np.abs(x).max() > 1.0 else 0.0, np.zeros(2), spread * np.eye(2))
+    box = importance_draws(
+        lambda x: np.inf if np.abs(x).max() > 1.0 else 0.0, np.zeros(2), spread * np.eye(2)
+    )
     np.testing.assert_allclose(np.quantile(box, (0.05, 0.95), axis=0).T, [(-0.9, 0.9)] * 2, atol=0.07)
-    bent = drawn_from(
+    bent = importance_draws(
         lambda x: 0.5 * x[0] ** 2 + 0.5 * ((x[1] - x[0] ** 2) / 0.2) ** 2, np.zeros(2), spread * np.eye(2)
     )
     np.testing.assert_allclose(np.quantile(bent[:, 0], (0.05, 0.95)), (-1.645, 1.645), atol=0.5)
@@ -112,29 +125,29 @@ def test_draws_have_the_moments_of_a_gaussian_of_a_box_and_of_a_bent_ridge(sprea
 def test_without_a_record_nothing_absolute_is_said_but_of_colour():
     problem = kit.closed_problem(seed=1, noise=None, samples=150)
     found = kit.fitted(problem)
-    gate = absolute_gate(problem, found)
+    gate = check_absolute_fit(problem, found)
     assert gate.passed is None
     assert "No noise record" in gate.reason
     wave = 30.0 * np.sin(0.3 * np.arange(150))[:, np.newaxis]
     swung = replace(found, residuals=tuple(r + wave if len(r) == 150 else r for r in found.residuals))
-    assert absolute_gate(problem, swung).passed is False
+    assert check_absolute_fit(problem, swung).passed is False
 
 
 def test_shape_gate_compares_evidence():
     problem = kit.closed_problem(seed=1)
-    found = kit.fitted(problem, Term(kit.offset_effect(), "y1"))
+    found = kit.fitted(problem, EffectTerm(kit.offset_effect(), "y1"))
     for gain, passes in ((-3.0, True), (SHAPE_GAIN - 0.01, True), (SHAPE_GAIN + 0.01, False)):
-        gate = shape_gate(found, replace(found, log_evidence=found.log_evidence + gain))
+        gate = check_shape(found, replace(found, log_evidence=found.log_evidence + gain))
         assert gate.passed is passes
         assert gate.statistic == pytest.approx(gain)
-    assert shape_gate(found, None).passed is True
+    assert check_shape(found, None).passed is True
 
 
 def test_unknowns_are_judged_beside_their_priors():
     effect = kit.offset_effect()
     shape = replace(effect, parameters=(replace(effect.parameters[0], magnitude=False),))
     problem = kit.closed_problem(seed=1, gain_deviation=0.1)
-    found = kit.fitted(problem, Term(shape, "y1"))
+    found = kit.fitted(problem, EffectTerm(shape, "y1"))
     far = replace(found.point, shared=np.array([3.0, 1.0, 2.0, 0.0, 2.0]), effect=np.array([4.0]))
     told = dict(prior_tests(problem, replace(found, point=far)))
     wanted = {
@@ -167,7 +180,7 @@ def test_intervals_are_as_wide_as_the_posterior_behind_ripples():
     problem = kit.closed_problem(seed=3, effect=0.2)
     smooth = kit.fitted(problem, kit.OFFSET)
     (course,) = named_effects(problem, smooth)[0].parameters
-    candidate = Candidate((Term(rippled(course.value), "y1"),))
+    candidate = Candidate((EffectTerm(rippled(course.value), "y1"),))
     found = fit(problem, candidate, smooth.point)
     drawn = with_draws(problem, found)
     (narrow,) = named_effects(problem, found)[0].parameters
@@ -228,8 +241,8 @@ def test_noise_without_a_record_is_what_the_fit_leaves():
             np.testing.assert_allclose(item.noise_deviation, data.deviation, rtol=0.25)
         told += any(cell.significant for cell in locate(found).cells)
     assert told <= 2
-    left = Remainder(*(size * np.ones(3) for size in (500.0, 5.0, 1.0, 0.0)), np.zeros(3, dtype=bool))
-    for item in residual_set(unknown, replace(kit.fitted(unknown), remainder=left)).trials:
+    left = ResidualProcess(*(size * np.ones(3) for size in (500.0, 5.0, 1.0, 0.0)), np.zeros(3, dtype=bool))
+    for item in residual_set(unknown, replace(kit.fitted(unknown), residual_process=left)).trials:
         assert np.all(item.predictive_deviation < 1.5 * item.noise_deviation)
     apart = held_out_problem(5, noise=None)
     for item in residual_set(apart, kit.fitted(apart)).trials:  # the same in trials that were held out
@@ -271,7 +284,7 @@ def ringing(seed, samples, extra=None, **given):
     """Return ring-downs with something added to the first channel, and what their fit leaves."""
     problem = kit.closed_problem(seed=seed, kinds=("ringdown",), samples=samples, extra=extra, **given)
     none = kit.fitted(problem)
-    return problem, none, left_by(problem, none)
+    return problem, none, residual_process_of(problem, none)
 
 
 def covariance(time, size, tau, frequency):
@@ -296,10 +309,10 @@ def test_white_noise_has_no_remainder(freedom):
     wrong = 0
     for seed in range(40):
         problem, found, left = ringing(seed, 150, noise=NoiseRecord(0.02, freedom))
-        wrong += left.acts
-        assert np.all(left.factor >= 1.0)
+        wrong += left.is_present
+        assert np.all(left.noise_factor >= 1.0)
         if seed == 0:
-            assert refitted(problem, widened(problem, left), found) is found
+            assert refit_under_wide_noise(problem, with_wide_noise(problem, left), found) is found
     assert wrong <= 1
 
 
@@ -311,21 +324,21 @@ def test_size_time_and_frequency_are_found(size, tau, frequency):
     problem, _, left = ringing(4, 900, coloured(size, tau, frequency))
     first = problem.channel_names.index("y1")
     over_noise = np.sqrt(np.mean([data.trial.noise_factor**-2 for data in problem.trials]))
-    assert left.size[first] == pytest.approx(size * over_noise, rel=0.2)
-    assert left.time[first] == pytest.approx(tau, rel=0.6, abs=0.04)
+    assert left.amplitude[first] == pytest.approx(size * over_noise, rel=0.2)
+    assert left.correlation_time[first] == pytest.approx(tau, rel=0.6, abs=0.04)
     assert 2.0 * np.pi * left.frequency[first] == pytest.approx(frequency, abs=1.0)
-    assert np.all(np.delete(left.size, first) == 0.0)
-    assert not left.is_noise
+    assert np.all(np.delete(left.amplitude, first) == 0.0)
+    assert not left.is_all_recorded_colour
 
 
 def test_evidence_under_a_wider_noise_is_that_of_a_campaign_with_such_noise():
     """Optimum, covariance and evidence are those of the same campaign whose records say so."""
     problem, none, left = ringing(4, 300, coloured(3.0, 0.15, 0.0))
-    found = refitted(problem, widened(problem, left), none)
+    found = refit_under_wide_noise(problem, with_wide_noise(problem, left), none)
     names = problem.campaign.channels
-    said = kit.fitted(kit.with_noise(
-        problem, **{key: NoiseRecord(0.02 * float(f), inf) for key, f in zip(names, left.factor, strict=True)}
-    ))  # fmt: skip
+    factors = zip(names, left.noise_factor.tolist(), strict=True)
+    records = {key: NoiseRecord(0.02 * factor, inf) for key, factor in factors}
+    said = kit.fitted(kit.with_noise(problem, **records))
     np.testing.assert_allclose(found.point.shared, said.point.shared, rtol=1e-3, atol=1e-4)
     np.testing.assert_allclose(found.covariance, said.covariance, rtol=1e-3, atol=1e-9)
     assert found.log_evidence == pytest.approx(said.log_evidence, abs=0.05)
@@ -344,7 +357,12 @@ def test_colour_of_the_noise_is_no_gap_where_stamps_are_uneven_and_it_stays():
         problem = kit.problem_of(replace(problem.campaign, trials=tuple(trials)), problem.model)
         problem = kit.with_noise(problem, y1=record)
         found = kit.fitted(problem)
-        wrong[0] += absolute_gate(problem, replace(found, remainder=left_by(problem, found))).passed is False
+        wrong[0] += (
+            check_absolute_fit(
+                problem, replace(found, residual_process=residual_process_of(problem, found))
+            ).passed
+            is False
+        )
         located = locate(residual_set(problem, found))
         assert all(cell.channel != "y1" for cell in located.cells)
         wrong[1] += located.disagrees

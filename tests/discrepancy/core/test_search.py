@@ -8,7 +8,7 @@ import pytest
 
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.gates import whiteness_tests
 from discrepancy.judgement import in_part
 from discrepancy.search.strategy import Search
@@ -121,9 +121,9 @@ def test_an_effect_of_a_set_that_fails_is_tried_at_its_other_places():
     hidden = hidden + bench.patch("gauge_gain", {"gain_error": 0.05}, "g1")
     problem = bench.problem(11, hidden)
     friction, gain = kit.chosen("coulomb_friction", "gauge_gain")
-    wrong = kit.fitted(problem, Term(friction, "end"), Term(gain, "g1"))
+    wrong = kit.fitted(problem, EffectTerm(friction, "end"), EffectTerm(gain, "g1"))
     search = Search(problem, (friction, gain), kit.fitted(problem))
-    search.keep(wrong, exact=True)
+    search.record(wrong, exact=True)
     assert search.best() is wrong
     search.move_effects()
     assert set(search.best().candidate.key) == {("coulomb_friction", "joint"), ("gauge_gain", "g1")}
@@ -138,15 +138,15 @@ class TwoRivals:
     def __init__(self, probability, gain, fits):
         self.problem, self.chance, self.fits = None, probability, fits
         self.contenders = [SimpleNamespace(log_evidence=gain, candidate=Candidate()) for _ in range(2)]
-        self.nothing = SimpleNamespace(log_evidence=0.0)
+        self.no_effect = SimpleNamespace(log_evidence=0.0)
 
-    def slimmed(self, best):
+    def simplest_equivalent(self, best):
         return best
 
-    def grew(self, best):
+    def enlarges_error(self, best):
         return False
 
-    def rivals(self, best):
+    def competitors(self, best):
         return self.contenders[1:]
 
     def probability(self, *items):
@@ -167,7 +167,7 @@ def test_a_group_needs_probability_evidence_and_members_that_fit(monkeypatch, pr
     monkeypatch.setattr(in_part, "_group", lambda *given: "group")
     monkeypatch.setattr(in_part, "_unexplained", lambda *given: "unexplained")
     monkeypatch.setattr(in_part, "named_effects", lambda *given: ())
-    assert in_part._verdict_of(TwoRivals(probability, gain, fits), None) == kind
+    assert in_part._verdict_by_comparison(TwoRivals(probability, gain, fits), None) == kind
 
 
 @pytest.mark.parametrize(
@@ -177,8 +177,8 @@ def test_a_group_needs_probability_evidence_and_members_that_fit(monkeypatch, pr
 def test_what_speaks_against_a_name_is_the_probability_or_the_evidence(
     monkeypatch, probability, gain, reason
 ):
-    monkeypatch.setattr(in_part, "_unexplained", lambda court, first, close, why="": why)
-    assert in_part._verdict_of(TwoRivals(probability, gain, True), None).endswith(reason)
+    monkeypatch.setattr(in_part, "_unexplained", lambda comparison, first, nearest, reason="": reason)
+    assert in_part._verdict_by_comparison(TwoRivals(probability, gain, True), None).endswith(reason)
 
 
 # ---------------------------------------------------------------- whiteness

@@ -7,11 +7,11 @@ import pytest
 
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Start, Trial, TrialKind
 from discrepancy.files.verdict import read_verdict
-from discrepancy.fits.beginnings import refitted_from_beginnings
+from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
 from discrepancy.judgement.closed_share import errors_text, share_text
-from discrepancy.judgement.conclusion import Outcome
+from discrepancy.judgement.conclusion import VerdictOutcome
 from discrepancy.judgement.moved_unknowns import moved_sentence, moved_unknowns
 from discrepancy.judgement.verdict_checks import checked_verdict, far_held_out_records, unfitted_records
 from discrepancy.report.figures import ReportInput
@@ -66,7 +66,7 @@ def test_beginnings_are_taken_from_the_first_readings_where_a_fit_from_rest_fail
     from_rest = fit(problem, Candidate(), start, local_only=True)
     count = float(problem.counts.sum())
     assert from_rest.chi_square > 1e3 * count
-    assert refitted_from_beginnings(problem, from_rest, local_only=True).chi_square < 1.2 * count
+    assert refit_from_first_readings(problem, from_rest, local_only=True).chi_square < 1.2 * count
 
 
 # ---------------------------------------------------------------- held-out trials far off
@@ -249,8 +249,8 @@ def test_a_hypothesis_with_which_the_error_grows_is_not_named():
     candidate = fit_of_name.candidate
     values = candidate.stepped(fit_of_name.effect, np.full(candidate.size, 4.0))
     worse = fit(found.problem, candidate, replace(fit_of_name.point, effect=values), iterations=0)
-    outcome = checked_verdict(Outcome(verdict, found.search, worse))
+    outcome = checked_verdict(VerdictOutcome(verdict, found.search, worse))
     assert outcome.verdict.kind is VerdictKind.UNEXPLAINED
     assert outcome.verdict.effects == outcome.verdict.resembles == ()
-    assert outcome.fit is found.search.none
+    assert outcome.fit is found.search.no_effect
     assert "larger (rms of" in outcome.verdict.sentence

@@ -11,7 +11,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.library import in_events, library
 from discrepancy.errors import CampaignDataError
-from discrepancy.fits.candidate import Candidate, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import fit
 from discrepancy.judgement.separability import as_predicted
 from discrepancy.sources.examples import example_campaign, plan_for
@@ -19,7 +19,7 @@ from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import investigate, open_hypotheses, patch_draws, solver_share, without_port
+from discrepancy.workflow import investigate, open_hypotheses, patch_draws, time_step_error, without_port
 from fe.runtime.patch import ModelPatch, PowerDamping, Window
 from tests.discrepancy.rigs import FEW, drag_found, measured, one_mass, setting_of
 from tests.refusals import Inputs
@@ -55,7 +55,7 @@ def test_an_effect_is_named_and_proved_on_trials_not_used():
     assert found.proof.log_score_gain > 0.0
     assert found.location is not None
     assert not any("time steps cost" in remark for remark in found.verdict.remarks)
-    assert solver_share(found.problem, found.fit) < 0.1
+    assert time_step_error(found.problem, found.fit) < 0.1
     sets, shares = zip(
         *((f.candidate.identifiers, p) for f, p in open_hypotheses(found.search, count=4)), strict=True
     )
@@ -271,7 +271,7 @@ def test_friction_that_begins_with_an_event_is_named_with_it(campaign):
 def test_a_moment_that_is_a_parameter_is_found_within_one_percent(campaign):
     (effect,) = effects_of_file(Inputs(__file__).folder / "late_friction.toml")
     problem = kit.problem_of(replace(campaign, trials=campaign.trials[:1], events=()), MODEL)
-    term = Term(effect, "slide")
+    term = EffectTerm(effect, "slide")
     candidate = Candidate((term,))
     start = replace(problem.start(candidate), effect=np.array([0.0, 0.8]))
     found = fit(problem, candidate, start)

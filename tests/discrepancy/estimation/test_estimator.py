@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from discrepancy.estimation.effects import EffectLaws
-from discrepancy.estimation.estimator import Estimator, Start
+from discrepancy.estimation.estimator import EstimatorStart, MotionEstimator
 from discrepancy.estimation.linearised import Trajectory
 from discrepancy.estimation.refinement import adjustable_laws, refined
 from discrepancy.fits.candidate import Candidate
@@ -27,8 +27,10 @@ def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):
     trajectories = tuple(
         Trajectory(motion.added, motion.positions, motion.speeds, motion.forces) for motion in seen.motions
     )
-    estimator = Estimator(trials, search.problem.shared.precision, search.about(seen.processes))
-    start = Start(np.zeros(0), seen.shared, trajectories, seen.processes)
+    estimator = MotionEstimator(
+        trials, search.problem.shared.precision, search.prior_processes(seen.processes)
+    )
+    start = EstimatorStart(np.zeros(0), seen.shared, trajectories, seen.processes)
     found = estimator.estimate(nothing, start)
     assert found.log_evidence == pytest.approx(seen.log_evidence, abs=0.05)
     for one, motion in zip(found.trials, seen.motions, strict=True):

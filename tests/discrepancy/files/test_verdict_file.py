@@ -97,10 +97,10 @@ def test_every_primitive_with_any_numbers_survives_the_file(data, tmp_path_facto
     for kind in data.draw(st.lists(st.sampled_from(sorted(PRIMITIVES)), min_size=1, max_size=4)):
         primitive = PRIMITIVES[kind]
         values = {
-            name: data.draw(COURSE if name in primitive.courses else VALUES[wanted])
-            for name, wanted in primitive.values().items()
+            name: data.draw(COURSE if name in primitive.formula_fields else VALUES[wanted])
+            for name, wanted in primitive.value_types().items()
         }
-        windows = data.draw(st.lists(WINDOW, max_size=2)) if primitive.in_windows else []
+        windows = data.draw(st.lists(WINDOW, max_size=2)) if primitive.can_act_in_windows else []
         primitives.append(primitive(**values, windows=tuple(windows)))
     effect = replace(MASS, patch=ModelPatch(tuple(primitives)))
     path = tmp_path_factory.mktemp("patch") / "patch.json"
@@ -147,7 +147,9 @@ def test_the_shipped_schema_is_that_of_the_records_and_every_key_in_the_page(nam
             assert f"`{key}`" in page, key
     assert {kind for kind in PRIMITIVES if f"`{kind}`" in page} == set(PRIMITIVES) == set(PRIMITIVE_UNITS)
     for kind, primitive in PRIMITIVES.items():  # every real parameter has a unit
-        assert set(PRIMITIVE_UNITS[kind]) == {key for key, own in primitive.values().items() if own is float}
+        assert set(PRIMITIVE_UNITS[kind]) == {
+            key for key, own in primitive.value_types().items() if own is float
+        }
     with pytest.raises(VerdictFileError, match="but not for 'report'"):
         shipped_schema("report")
 

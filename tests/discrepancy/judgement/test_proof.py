@@ -12,11 +12,11 @@ from discrepancy.campaign.held_out import choose_held_out
 from discrepancy.campaign.protocol import Release
 from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.errors import FitError
-from discrepancy.fits.gates import absolute_gate
+from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.judgement.closed_share import closed_share
-from discrepancy.judgement.consistency_gate import consistency_gate, directions, score_tests
-from discrepancy.judgement.naming import name
-from discrepancy.judgement.proof import correlation_time, held_out_gate, log_density, prove, scores
+from discrepancy.judgement.consistency_gate import check_consistency, directions, score_tests
+from discrepancy.judgement.naming import reach_verdict
+from discrepancy.judgement.proof import check_held_out, correlation_time, log_density, prove, scores
 from discrepancy.verdict import VerdictKind
 from tests.discrepancy.bench import Bench, with_noise
 from tests.discrepancy.core import kit
@@ -63,7 +63,7 @@ def test_the_share_closed_is_one_less_the_square_of_the_errors_over_each_other()
     bench = Bench(amplitudes=MANY, held_out=HELD)
     before = bench.fit(np.random.default_rng(5), extra=lacking(bench, 25.0))
     after = bench.fit(np.random.default_rng(5))
-    assert [held_out_gate(item).passed for item in (before, after)] == [False, True]
+    assert [check_held_out(item).passed for item in (before, after)] == [False, True]
     proof = prove(before, after)
     assert proof.held_out_before.chi_square_per_sample > 3.0
     left = proof.held_out_after.chi_square_per_sample / proof.held_out_before.chi_square_per_sample
@@ -91,7 +91,7 @@ def test_no_gap_is_said_and_not_divided_by():
     assert proof.closed is None
     assert "show no gap before" in proof.closed_reason
     bare = with_noise(fitted, None)
-    assert held_out_gate(bare).passed is None
+    assert check_held_out(bare).passed is None
     proof = prove(bare, bare)
     assert isnan(proof.held_out_after.chi_square_per_sample)
     assert proof.closed.value == 0.0  # of the error itself
@@ -290,10 +290,10 @@ def test_what_the_sum_of_squares_does_not_show_is_seen(made, term, change, words
     truth = kit.closed_problem(samples=1500, **made)
     flight = change.get("flight", False)
     right, wrong = changed(truth, flight=flight), changed(truth, **change)
-    assert consistency_gate(right, asked(right, term)[0]).passed
+    assert check_consistency(right, asked(right, term)[0]).passed
     found, _, tests = asked(wrong, term)
-    assert absolute_gate(wrong, found).passed
-    gate = consistency_gate(wrong, found)
+    assert check_absolute_fit(wrong, found).passed
+    gate = check_consistency(wrong, found)
     assert gate.passed is False
     assert gate.statistic < 1e-3
     assert all(word in gate.reason for word in words)
@@ -301,7 +301,7 @@ def test_what_the_sum_of_squares_does_not_show_is_seen(made, term, change, words
     assert {test.name for test in tests} == {*loads, "zeros of the static runs", f"channel {term.place}"}
     if words != ("static loads",):
         return
-    verdict, _, _ = name(right, (term.effect,))
+    verdict, _, _ = reach_verdict(right, (term.effect,))
     assert verdict.kind is VerdictKind.NAMED, verdict.sentence
     assert [gate.name for gate in verdict.gates] == [
         "absolute fit",
@@ -309,7 +309,7 @@ def test_what_the_sum_of_squares_does_not_show_is_seen(made, term, change, words
         "consistency",
         "held-out trials",
     ]
-    verdict, _, _ = name(wrong, (term.effect,))
+    verdict, _, _ = reach_verdict(wrong, (term.effect,))
     assert verdict.kind is VerdictKind.UNEXPLAINED, verdict.sentence
     assert "static loads" in verdict.sentence
     assert verdict.effects == ()
@@ -317,7 +317,7 @@ def test_what_the_sum_of_squares_does_not_show_is_seen(made, term, change, words
 
 def test_without_loads_there_is_nothing_to_be_consistent_with():
     without = kit.closed_problem(seed=1, kinds=("ringdown",))
-    gate = consistency_gate(without, kit.fitted(without))
+    gate = check_consistency(without, kit.fitted(without))
     assert gate.passed is None
     assert np.isnan(gate.statistic)
 

@@ -10,9 +10,9 @@ from benchmarks.force_events import KINDS, counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.conclusion import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch
-from discrepancy.missing_force.explained import seen
-from discrepancy.missing_force.filtered import Filtered, Process, Regression, regression
-from discrepancy.missing_force.shares import _noise
+from discrepancy.missing_force.explained import with_most_probable_forces
+from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, regression
+from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
@@ -120,7 +120,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     local, share = random.standard_normal((unknown, 40, 2)) * used, 0.4 * unknown
     process = Process(2.0, 0.15, rough)
     trial = trial_of(time, residual, used=used, local=local, coloured=((0, share, 12.0),) if share else ())
-    filtered = Filtered(trial, [(0, process)])
+    filtered = ForceFilter(trial, [(0, process)])
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
     noise = np.kron(share * np.exp(-12.0 * np.abs(time[:, None] - time)), np.diag([1.0, 0.0]))
@@ -149,10 +149,10 @@ def test_steady_gains_are_those_of_every_step():
     random = np.random.default_rng(4)
     time = 0.02 * np.arange(900)
     trial = trial_of(time, random.standard_normal((900, 2)))
-    filtered = Filtered(trial, [(0, PROCESS)])
+    filtered = ForceFilter(trial, [(0, PROCESS)])
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
     object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
-    every = Filtered(jittered, [(0, PROCESS)])
+    every = ForceFilter(jittered, [(0, PROCESS)])
     late = [states(one)[0][[200, 899]] for one in (filtered, every)]
     assert [np.array_equal(*covers) for covers in late] == [True, False]
     assert evidence(filtered) == pytest.approx(evidence(every), abs=1e-6)
@@ -169,7 +169,7 @@ def states(filtered):
 def test_states_and_noise_by_closed_forms():
     """Backwards a force of a long correlation would grow by e^1000 within a step, and stays finite."""
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
-    filtered = Filtered(trial, [(0, Process(1.0, 1e-3))])
+    filtered = ForceFilter(trial, [(0, Process(1.0, 1e-3))])
     assert np.isfinite(evidence(filtered))
     assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
     # a pushed state
@@ -182,7 +182,7 @@ def test_states_and_noise_by_closed_forms():
     # noise of a deviation of one, part of it coloured
     count = 5000
     told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=((0, 0.4, 12.0),))
-    made = _noise(told)
+    made = _simulated_noise(told)
     np.testing.assert_allclose(made.std(axis=0), 1.0, rtol=0.1)
     assert made[1:, 0] @ made[:-1, 0] / count == pytest.approx(0.4 * np.exp(-12.0 * 0.02), abs=0.1)
     # noise of first order is taken apart
@@ -263,7 +263,7 @@ def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(
     trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), settled=settled)
     search = EventSearch(View([trial], np.zeros(0)), 0, EVENT)
     for on, forces in ((False, [REST]), (True, [EVENT, REST])):
-        wanted = evidence(Filtered(trial, [(0, one) for one in forces]))
+        wanted = evidence(ForceFilter(trial, [(0, one) for one in forces]))
         found = search.evidence(search.products((EVENT, REST), [np.full(40, on)]))
         assert found == pytest.approx(wanted, abs=1e-7)
 
@@ -348,7 +348,7 @@ def test_an_event_on_a_reading_is_looked_for_by_name_in_records_of_other_channel
         trials[1], deviation=trials[1].deviation[::-1],
         system=replace(system, outputs=system.outputs[::-1], through=system.through[:, ::-1]),
     )  # fmt: skip
-    forced = seen(View(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
+    forced = with_most_probable_forces(View(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
     number, found = _most_telling(0, forced, names)
     shown = [trial.system.through[0] != 0.0 for trial in found.view.trials]
     assert number == 0

@@ -13,13 +13,13 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
-from discrepancy.fits.candidate import Candidate, Point, Term
+from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
-from discrepancy.missing_force.shares import ForceShares, missing_force, order_of
+from discrepancy.missing_force.shares import ForceShares, explained_variance, missing_force
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
@@ -112,7 +112,7 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypat
     again = search.followed(ranked[0], ranked[0].candidate, ranked[0].effect)
     deviations = np.sqrt(np.diag(ranked[0].effect_covariance))
     np.testing.assert_allclose((again.effect - ranked[0].effect) / deviations, 0.0, atol=0.4)
-    share = ForceShares(search).of(ranked[0], held_out=False)
+    share = ForceShares(search).share_of(ranked[0], held_out=False)
     assert share.value > 0.85
     assert share.interval[0] <= share.value <= share.interval[1]
 
@@ -130,7 +130,7 @@ def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
 def test_one_effect_at_two_places_has_a_prior():
     """Where it is the only one that is looked for."""
     setting = chain("ringdown", 0.004).setting
-    both = Candidate(tuple(Term(FRICTION, place) for place in FRICTION.places(setting)[:2]))
+    both = Candidate(tuple(EffectTerm(FRICTION, place) for place in FRICTION.places(setting)[:2]))
     assert log_prior(both, 1, setting) == log_prior(both, 2, setting) > -20.0
 
 
@@ -138,7 +138,7 @@ def test_a_report_opens_with_the_missing_force(tmp_path):
     blind(tmp_path, CART, samples=96)
     found = investigate(tmp_path / "campaign", tmp_path / "campaign" / "model.toml", FEW)
     missing = found.missing
-    assert missing.told.port == "rail"
+    assert missing.at_port.port == "rail"
     assert missing.law == "Coulomb friction"
     assert share_of(missing) > 0.9
     for item in missing.courses:  # a step: its size hardly varies where the cart moves
@@ -212,7 +212,7 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tm
 
 def drawn_through(search, effect, place):
     """Return an effect along the missing force, from where it is first seen."""
-    term = Term(effect, place)
+    term = EffectTerm(effect, place)
     start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2][0]
     return search.followed(search.whole, Candidate((term,)), start)
 
@@ -284,7 +284,7 @@ def test_friction_that_holds_is_the_law_of_the_missing_force():
     """The joint sticks half of the time; what is told of it is of the trials in motion."""
     search = ForceSearch(chain("laboratory", 0.004))
     missing = missing_force(search, drawn_through(search, FRICTION, "joint"))
-    assert (missing.told.port, missing.law) == ("joint", "Coulomb friction")
+    assert (missing.at_port.port, missing.law) == ("joint", "Coulomb friction")
     assert share_of(missing) > 0.95
     for item in missing.courses:
         slips = np.abs(item.speed) > 0.02
@@ -307,10 +307,13 @@ def test_one_law_stands_where_several_follow_the_jumps_that_an_accelerometer_sho
     found = search(problem_of(Campaign("rubs", channels, tuple(trials), None, {}, ""), rig), FEW[:3])
     alone = found.best()
     assert alone.candidate.identifiers == ("coulomb_friction",)
-    both, again = alone.candidate.plus(Term(FEW[0], "slide")), Search(found.problem, FEW[:3], found.none)
+    both, again = (
+        alone.candidate.with_term(EffectTerm(FEW[0], "slide")),
+        Search(found.problem, FEW[:3], found.no_effect),
+    )
     begun = replace(alone.point, effect=np.append(alone.effect, 0.0))
     again.keep(fit(found.problem, both, begun), exact=True)  # the other one was found first
-    again.sets()
+    again.search_sets()
     assert again.best().candidate.identifiers == ("coulomb_friction",)
 
 
@@ -325,6 +328,6 @@ def test_a_model_with_the_right_law_of_its_own_has_no_gap_at_any_time():
 def test_a_force_is_ordered_by_the_variable_that_it_is_a_function_of():
     random = np.random.default_rng(4)
     x, v = random.uniform(-1.0, 1.0, (2, 400))
-    assert order_of(x, x**3) > 0.9
-    assert order_of(v, x**3) < 0.2
-    assert order_of(np.zeros(400), x) == 0.0
+    assert explained_variance(x, x**3) > 0.9
+    assert explained_variance(v, x**3) < 0.2
+    assert explained_variance(np.zeros(400), x) == 0.0

@@ -1,6 +1,6 @@
 """The posterior of a model's parameters beside closed forms and dense integration.
 
-`python -m benchmarks.study_rig_coverage` asks how often intervals hold the truth.
+`python -m benchmarks.studies.rig_coverage` asks how often intervals hold the truth.
 """
 
 from collections.abc import Callable

@@ -132,7 +132,7 @@ def test_parameters_are_shown_before_and_after(drag):
         assert moments[0] == pytest.approx([item.mean, norm.ppf(0.95) * item.deviation], rel=0.03)
         assert moments[2][0] == pytest.approx(value, abs=0.06 * moments[2][1])
         assert moments[2][1] < moments[0][1]
-    nothing = replace(drag, fit=drag.search.none)
+    nothing = replace(drag, fit=drag.search.no_effect)
     assert [row[:4] for row in parameter_rows(nothing)] == [row[:4] for row in rows]
     assert {len(row) for row in parameter_rows(nothing)} == {4}
 

@@ -10,7 +10,7 @@ import xarray as xr
 from hypothesis import given
 from hypothesis import strategies as st
 
-from benchmarks.study_hidden_effects import fly_mission
+from benchmarks.studies.hidden_effects import fly_mission
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import choice_of_run

@@ -22,8 +22,8 @@ from discrepancy.system.motion import Motion, motion_of
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.system_state import SystemState
 from fe.runtime import patch as patches
-from fe.runtime.motion import laws_of
 from fe.runtime.patch import MicroSlip, ModelPatch, PowerDamping, Primitive
+from fe.runtime.port_laws import port_laws
 from tests.discrepancy.rigs import INPUTS, FloatArray, asked, laws, model_of, seen
 from tests.fe.runtime.stepping import force_of, second_order, states_of
 
@@ -191,7 +191,7 @@ def on_joint(modes: int, beta: float) -> LinearSystem:
 
 def let_go(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **how: int) -> Motion:
     system = on_joint(how.pop("modes", 3), beta)
-    acts = laws_of(ModelPatch(items), list(system.ports))
+    acts = port_laws(ModelPatch(items), list(system.ports))
     excitation = Excitation(time, time, initial=np.zeros((0, 2)), release=ReleasePoint(row, RELEASE))
     return motion_of(system, excitation, acts, **how)
 

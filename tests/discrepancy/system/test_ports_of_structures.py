@@ -12,7 +12,7 @@ from discrepancy.model_choice import choose_model
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
 from fe.full.factorisation import Factorisation
-from fe.reduction.model_cache import reduced_structure
+from fe.reduction.model_cache import reduced_model
 from fe.runtime.errors import FiniteElementError
 from fe.runtime.patch import PowerStiffness
 from fe.structure.design import load_structure
@@ -77,7 +77,7 @@ def test_a_port_changes_neither_the_structure_nor_its_fmu(write_ported_beam, tmp
     choices, fmus, hashes, rigs = [], [], [], []
     for number, ports in enumerate([(), (AT_POINT,)]):
         file = write_ported_beam(*ports)
-        reduced = reduced_structure(file)
+        reduced = reduced_model(file)
         hashes.append(reduced.design_hash)
         fmus.append(build_fmu(reduced, tmp_path / f"{number}.fmu").path.read_bytes())
         rigs.append(rig_text(load_structure(file), "beam.fmu"))

@@ -24,7 +24,7 @@ from fe.reduction.built_once import cache_folder
 from fe.reduction.model_cache import cache_file
 from fe.reduction.reduced_basis import reduce_structure
 from fe.runtime.patch import ModelPatch, PointMass, PowerDamping, PowerStiffness, RootCompliance
-from fe.runtime.wing_rows import PatchArrays
+from fe.runtime.patch_arrays import PatchArrays
 from fe.structure.design import load_structure
 from fe.structure.operators import load_and_assemble
 from fe.wing.design import load_design

@@ -28,7 +28,7 @@ from fe.reduction import model_cache
 from fe.reduction.built_once import built_once, cache_folder
 from fe.reduction.model_cache import MODELLING_PACKAGES, cache_file, patch_arrays, reduced_model, wing_fields
 from fe.runtime import arrays as array_records
-from fe.runtime.arrays import KeptArrays, arrays_from_bytes, arrays_to_bytes
+from fe.runtime.arrays import StoredArrays, arrays_from_bytes, arrays_to_bytes
 from fe.runtime.errors import ReducedModelFileError
 from fe.structure.tables import StructureSettings
 from fe.wing.design import WingDesign
@@ -87,8 +87,8 @@ def test_a_member_that_is_no_plain_array_is_one_sentence():
 
 
 @pytest.fixture(scope="module", params=["model", "coarse_fields", "coarse_patch_arrays"])
-def kept(request: pytest.FixtureRequest) -> KeptArrays:
-    found: KeptArrays = request.getfixturevalue(request.param)
+def kept(request: pytest.FixtureRequest) -> StoredArrays:
+    found: StoredArrays = request.getfixturevalue(request.param)
     return found
 
 
@@ -156,8 +156,8 @@ def builds(monkeypatch: pytest.MonkeyPatch, coarse_fields, coarse_patch_arrays) 
     """Names of the designs that were built; the builds themselves are replaced by finished ones."""
     built: list[str] = []
 
-    def building(made: KeptArrays) -> Callable[..., KeptArrays]:
-        def build(design: WingDesign, *_: object) -> KeptArrays:
+    def building(made: StoredArrays) -> Callable[..., StoredArrays]:
+        def build(design: WingDesign, *_: object) -> StoredArrays:
             built.append(design.name)
             return replace(made, design_hash=design.hash)
 

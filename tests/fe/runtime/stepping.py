@@ -8,15 +8,17 @@ from scipy.linalg import expm
 
 from fe.runtime.arrays import FloatArray
 from fe.runtime.modal_system import ModalSystem
-from fe.runtime.motion import NO_LAWS, PLAIN, Begin, Kernel, Laws, advance, steps_under
-from fe.runtime.motion import substeps as divided
+from fe.runtime.motion import PLAIN_KERNEL, InitialMotion, Kernel, integrate_motion
 from fe.runtime.motion_arrays import ModalMotion
 from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.port_laws import NO_LAWS, PortLaws
+from fe.runtime.time_steps import loaded_steps
+from fe.runtime.time_steps import step_boundaries as divided
 
 
 def simulate(
     system: ModalSystem,
-    laws: Laws,
+    laws: PortLaws,
     *,
     q: FloatArray,
     v: FloatArray,
@@ -35,9 +37,11 @@ def simulate(
     boundaries = divided(system, NO_LAWS if substeps else laws, stamps, refinement * (substeps or 1))
     modal = np.outer(np.interp(boundaries.time, stamps, force), np.broadcast_to(shape, q.shape)) + constant
     feed = np.zeros((len(boundaries.time), len(laws)))
-    steps = steps_under(system, boundaries, modal[:-1], modal[1:], feed)
-    begin = Begin(q, v, memory)
-    return advance(system, laws, steps._replace(time=start + steps.time), begin, kernel or PLAIN)
+    steps = loaded_steps(system, boundaries, modal[:-1], modal[1:], feed)
+    begin = InitialMotion(q, v, memory)
+    return integrate_motion(
+        system, laws, steps._replace(time=start + steps.time), begin, kernel or PLAIN_KERNEL
+    )
 
 
 def exact(
@@ -84,7 +88,7 @@ def force_of(law: Any, x: float, v: float, z: FloatArray) -> float:
     return float(law.stiffness * (z.mean() - x)) if len(z) else 0.0
 
 
-limits_of = cache(MicroSlip.elements)
+limits_of = cache(MicroSlip.slip_displacements)
 
 
 def rates_of(law: Any, v: float, z: FloatArray) -> FloatArray:

@@ -16,19 +16,19 @@ from fe.runtime.arrays import FORCE
 from fe.runtime.errors import SolutionError
 from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.modal_system import ModalSystem, rayleigh_coefficients, rayleigh_damping_ratio
-from fe.runtime.motion import (
+from fe.runtime.motion import static_solution
+from fe.runtime.motion_arrays import ModalMotion
+from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
+from fe.runtime.port_laws import (
     NO_LAWS,
     PLANFORM,
     STATION_PORTS,
-    Laws,
-    at_stations,
-    laws_of,
+    PortLaws,
     port_flexibility,
-    static_solution,
+    port_laws,
+    spread_over_stations,
 )
-from fe.runtime.motion_arrays import ModalMotion
-from fe.runtime.patch import BoucWen, FreePlay, MicroSlip, ModelPatch, PowerDamping, PowerStiffness, Primitive
-from fe.runtime.static_path import settle_port
+from fe.runtime.static_path import solve_port_position
 from fe.runtime.wing_rows import planform_stations
 from tests.fe.runtime.stepping import exact, force_of, rates_of, second_order, simulate, states_of
 from tests.refusals import Inputs
@@ -49,8 +49,8 @@ AT_EACH = {law.kind: law for law in named("each")}
 """One of each law, over the planform."""
 
 
-def laws(*items: Primitive) -> Laws:
-    return laws_of(ModelPatch(items), ["tip", "root", "mass", PLANFORM])
+def laws(*items: Primitive) -> PortLaws:
+    return port_laws(ModelPatch(items), ["tip", "root", "mass", PLANFORM])
 
 
 def moved(*items: Primitive, system: ModalSystem = WING, **options: Any) -> Any:
@@ -62,10 +62,10 @@ def moved(*items: Primitive, system: ModalSystem = WING, **options: Any) -> Any:
 def test_the_slope_is_that_of_the_force(kind):
     """On ways to both sides from a place where it was never loaded, whose memory stays."""
     law = laws(AT_EACH[kind])
-    memory = law.memory()
+    memory = law.unloaded_memory()
     for x in (-0.03, 0.0013, 0.021):
         force = [
-            functions.pull(law.numbers[0], law.values[0], memory[0], x + way, 0.02)
+            functions.force_and_slope(law.law_numbers[0], law.parameters[0], memory[0], x + way, 0.02)
             for way in (-1e-7, 0.0, 1e-7)
         ]
         assert force[1][1] == pytest.approx((force[2][0] - force[0][0]) / 2e-7, rel=2e-3, abs=1e-6)
@@ -124,10 +124,10 @@ def test_a_structure_that_softens_away_is_refused():
 @pytest.mark.parametrize("flexibility", [0.1, 0.16])  # from 1/6 m/N on there is more than one root
 def test_a_sine_on_flexibility_is_settled(flexibility):
     sine = laws(patch.SineForce("tip", 2.0, 3.0, 0.4))
-    ports = sine.at_rest()._replace(leader=np.zeros(1, dtype=np.int64))
+    ports = sine.port_arrays_at_rest()._replace(leader=np.zeros(1, dtype=np.int64))
     for y in np.linspace(-9.0, 9.0, 91):
-        memory = sine.memory()
-        x = settle_port(0, ports, memory, y, flexibility, 1.0)
+        memory = sine.unloaded_memory()
+        x = solve_port_position(0, ports, memory, y, flexibility, 1.0)
         near = 1e-11 * (abs(x) + abs(y))
         assert abs(x + flexibility * memory[0, FORCE] - y) <= near
         assert flexibility * abs(memory[0, FORCE] - 2.0 * np.sin(3.0 * x + 0.4)) <= near
@@ -222,11 +222,11 @@ def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind):
     """What is elsewhere in a patch stays as it is."""
     share, item = planform_stations(1.8, 0.4, 0.25)[1], AT_EACH[kind]
     before, after = patch.PointMass(0.1, 1.0), FreePlay("root", 2.0, 1e-3)
-    first, *spread, last = at_stations(ModelPatch((before, item, after)), share)
+    first, *spread, last = spread_over_stations(ModelPatch((before, item, after)), share)
     assert (first, last) == (before, after)
-    assert at_stations(ModelPatch((before, after)), share) == ModelPatch((before, after))
+    assert spread_over_stations(ModelPatch((before, after)), share) == ModelPatch((before, after))
     assert [force.port for force in spread if isinstance(force, PortForce)] == list(STATION_PORTS)
-    one, parts = laws(item), laws_of(ModelPatch(tuple(spread)), STATION_PORTS)
+    one, parts = laws(item), port_laws(ModelPatch(tuple(spread)), STATION_PORTS)
     np.testing.assert_allclose(parts.values[:, 0], share * one.values[0, 0], rtol=1e-12)
     assert np.all(parts.values[:, 1:PARAMETERS] == one.values[0, 1:PARAMETERS])
     assert np.allclose(
@@ -330,7 +330,7 @@ def test_friction_stops_a_mass_where_it_stops_to_the_fourth_order_of_the_step(ra
 
 def test_damping_acts_on_modes_that_hold_nearly_all_of_a_ports_flexibility():
     """All but a tenth; what it does elsewhere is compared with an integrator in `test_lumped.py`."""
-    acts = laws_of(ModelPatch((PowerDamping("mass", 1.5, 0.5, 0.0, 6.0, 1.0),)), ["mass"])
+    acts = port_laws(ModelPatch((PowerDamping("mass", 1.5, 0.5, 0.0, 6.0, 1.0),)), ["mass"])
     for share, on_modes in ((0.095, True), (0.105, False)):
         left_out = np.array([share / (1.0 - share) / 40.0])
         system = ModalSystem(np.sqrt([40.0]), np.zeros((1, 1)), {"mass": np.ones(1)}, left_out)
@@ -368,7 +368,7 @@ def test_an_iwan_joint_loses_the_energy_of_its_density_and_obeys_masing(chi):
     first = whole_force(law, 0.5 * (amplitude - loop[down]))
     np.testing.assert_allclose(whole[400] - whole[down], 2.0 * first, atol=1e-12)
     # all slip at the slip force
-    assert law.elements().mean() == pytest.approx(0.25)
+    assert law.slip_displacements().mean() == pytest.approx(0.25)
     assert whole_force(law, np.array([50.0]))[0] == pytest.approx(1.0)
 
 

@@ -9,14 +9,14 @@ from scipy.linalg import expm
 
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime import patch
-from fe.runtime.arrays import PLACE, FloatArray
+from fe.runtime.arrays import POSITION, FloatArray
 from fe.runtime.errors import InvalidPatchError, InvalidStateError, OutsideModelError
 from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, ModelPatch, PointMass, RootCompliance
-from fe.runtime.patched_wing import PatchedState, PatchedWing
+from fe.runtime.patch_arrays import PatchArrays
+from fe.runtime.patched_wing import PatchedStructure, PatchedWing
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
-from fe.runtime.wing_rows import PatchArrays
 from fe.wing.gauges import gauge_output
 from fe.wing.operators import (
     AffineOperators,
@@ -31,7 +31,7 @@ from tests.fe.runtime.stepping import second_order
 from tests.refusals import Inputs, refused
 from tests.wings import rigid, wing_integrator
 
-HOLDING = PatchedState.holding
+HOLDING = PatchedStructure.holding_load
 STATE, MASSES = (1.0073, (0.2, 0.1)), (0.1688, 0.1344)
 SOUND = (1.0, (0.0, 0.0))
 FACTOR = {"young_modulus_factor": STATE[0]}
@@ -55,10 +55,10 @@ class Compared:
         self, *items: Any, state: Any = STATE, masses: Any = MASSES, temperature: float = 0.0
     ) -> Any:
         vector = np.array((state[0], *state[1], *masses, 0.0, 0.0))
-        return self.wing.at(vector, ModelPatch(items), temperature)
+        return self.wing.structure_at(vector, ModelPatch(items), temperature)
 
     def load(self, load_factor: float, *items: Any) -> FloatArray:
-        return np.array((load_factor, load_factor**2)) @ self.wing.load_parts(ModelPatch(items))
+        return np.array((load_factor, load_factor**2)) @ self.wing.manoeuvre_loads(ModelPatch(items))
 
     def alike(self, reduced: FloatArray, full: FloatArray, operators: AffineOperators) -> None:
         strain, tip = operators.gauge_output @ full, float(operators.tip_row @ full)
@@ -136,7 +136,7 @@ def test_a_change_of_the_structure_is_that_of_the_full_model(both, change, given
     ):
         both.alike(structure.static(reduced), full, operators)
     squares = lowest_eigenpairs(stiffness, operators.mass(point_masses(*masses)), 3)[0]
-    found, wanted = structure.lowest(3).frequency, np.sqrt(squares) / (2.0 * np.pi)
+    found, wanted = structure.lowest_modes(3).frequency, np.sqrt(squares) / (2.0 * np.pi)
     assert found[[0, 2]] == pytest.approx(wanted[[0, 2]], rel=FREQUENCY)  # flapwise
     assert found[1] == pytest.approx(wanted[1], rel=1e-3 if change is softer else FREQUENCY)
 
@@ -300,9 +300,9 @@ def test_rest_is_the_static_response_and_stays(kind, model, beam_reduction, inte
     values, motion = {"load_factor": 3.0, "tip_force": 5.0}, integrator
     if kind == "beam":
         model, values = beam_reduction.model, {"z1": 0.3, "pump": 0.07, "load_factor": 3.0, "push": 50.0}
-        motion = ModalIntegrator(model, model.vector(values), 5.0, 2e-5)
+        motion = ModalIntegrator(model.structure_at(model.vector(values)), 5.0, 2e-5)
     load, static = model.load_coefficients(model.vector(values)), model.static_response(values)
-    state, wanted = motion.at_rest(load), np.append(static.strain, static.displacement)
+    state, wanted = motion.state_at_rest(load), np.append(static.strain, static.displacement)
     for _ in range(5):
         np.testing.assert_allclose(motion.outputs(state)[: len(wanted)], wanted, rtol=1e-9)
         assert motion.modes.output[-1] @ state.velocity == pytest.approx(0.0, abs=1e-9)
@@ -313,8 +313,8 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     """Once the high modes have died away, strain, position and acceleration agree."""
     model, values = beam_reduction.model, {"e": 1.05, "z1": 0.6, "z2": 0.3, "pump": 0.07, "load_factor": 0.0}
     vector, let_go = (model.vector({**values, "push": push}) for push in (100.0, 0.0))
-    motion = ModalIntegrator(model, vector, *model.damping)
-    state = motion.at_rest(model.load_coefficients(vector))
+    motion = ModalIntegrator(model.structure_at(vector), *model.damping)
+    state = motion.state_at_rest(model.load_coefficients(vector))
     for _ in range(3):
         state = motion.advance(state, 2e-3, model.load_coefficients(let_go))
     stiffness, mass, load = beam.system_at({**values, "push": 100.0})
@@ -328,7 +328,7 @@ def test_a_released_beam_moves_as_the_full_model(beam, beam_reduction):
     wanted = np.concatenate((rows @ moved[:n], acceleration))
     size = np.concatenate((np.abs(rows @ start), np.abs(acceleration)))
     assert np.all(np.abs(motion.outputs(state) - wanted) < 5e-3 * size)
-    same = ModalIntegrator(model, vector, *model.damping)
+    same = ModalIntegrator(model.structure_at(vector), *model.damping)
     taken = motion.outputs(same.take_over(state, motion))
     np.testing.assert_allclose(taken, motion.outputs(state), rtol=1e-6, atol=1e-9 * float(size.max()))
 
@@ -337,25 +337,27 @@ def test_a_released_wing_for_patches_moves_as_all_its_unknowns(both):
     """What its modes leave out fades as the damping has it, for a law as well."""
     vector = np.array((1.0, 0.0, 0.0, 0.169, 0.134, 1.0, 0.0))
     weak = patch.PowerStiffness("tip", 1e-6, 1.0, 0, 1.0)  # which only tells where the tip is
-    motion = ModalIntegrator(both.wing, vector, ALPHA, BETA, ModelPatch((weak,)))
-    structure, load = motion.structure, motion.structure.acting(vector)
-    answers, tip = structure.answers, both.wing.port_rows["tip"]
-    held = 0.03 / (structure.outputs[-1] @ answers[:, HOLDING]) * answers[:, HOLDING]
+    motion = ModalIntegrator(both.wing.structure_at(vector, ModelPatch((weak,))), ALPHA, BETA)
+    structure, load = motion.structure, motion.structure.load_coefficients(vector)
+    answers, tip = structure.unit_responses, both.wing.port_rows["tip"]
+    held = 0.03 / (structure.output_rows[-1] @ answers[:, HOLDING]) * answers[:, HOLDING]
     rest, n = answers[:, :4] @ load, len(held)
-    state = motion.advance(motion.released(0.03, load, HOLDING), 5e-4, load)
+    state = motion.advance(motion.state_after_release(0.03, load, HOLDING), 5e-4, load)
     ratio = np.linalg.solve(structure.mass, structure.stiffness)
     generator = second_order(ratio, ALPHA * np.eye(n) + BETA * ratio)
     wanted = rest + (expm(5e-4 * generator) @ np.concatenate((held, np.zeros(n))))[:n]
-    assert state.memory[0, PLACE] == pytest.approx(tip @ wanted, rel=1e-4)
+    assert state.memory[0, POSITION] == pytest.approx(tip @ wanted, rel=1e-4)
     assert motion.point_displacement(state, HOLDING) == pytest.approx(tip @ wanted, rel=1e-4)
-    error = np.abs(motion.outputs(state) - structure.outputs @ wanted)
-    assert np.all(error < 5e-3 * np.abs(structure.outputs @ held))
+    error = np.abs(motion.outputs(state) - structure.output_rows @ wanted)
+    assert np.all(error < 5e-3 * np.abs(structure.output_rows @ held))
 
 
 def test_damage_in_flight_keeps_motion_and_changes_strain(model, integrator):
     damaged = wing_integrator(model, **{**HEALTHY, "stiffness_loss": (0.4, 0.2)})
     for duration in (0.003, 0.05, 0.11):
-        before = integrator.advance(integrator.released(0.03, (3.0, 0.0), TIP_FORCE), duration, (3.0, 0.0))
+        before = integrator.advance(
+            integrator.state_after_release(0.03, (3.0, 0.0), TIP_FORCE), duration, (3.0, 0.0)
+        )
         after = damaged.take_over(before, integrator)
         assert damaged.outputs(after)[-1] == pytest.approx(integrator.outputs(before)[-1], abs=2e-3 * 0.1)
         kept = damaged.modes.shape.T @ damaged.modes.mass @ integrator.modes.shape @ before.velocity
@@ -367,18 +369,18 @@ def test_damage_in_flight_keeps_motion_and_changes_strain(model, integrator):
     static = model.static_response({"z1": 0.4, "z2": 0.2, "load_factor": 3.0})
     np.testing.assert_allclose(damaged.outputs(late)[:-1], static.strain, rtol=1e-6)
     # 5 cm inboard of the tip, which is released at 3 cm, the load point moves less and in time with it
-    released = integrator.released(0.03, (0.0, 0.0), TIP_FORCE)
+    released = integrator.state_after_release(0.03, (0.0, 0.0), TIP_FORCE)
     assert 0.9 * 0.03 < integrator.point_displacement(released, TIP_FORCE) < 0.03
     # from rest, damage sets the wing moving about its new, lower-stiffness equilibrium
-    taken = damaged.take_over(integrator.at_rest((3.0, 0.0)), integrator)
-    kept = damaged.structure.to_modes @ integrator.structure.answers[:, :2] @ (3.0, 0.0)
+    taken = damaged.take_over(integrator.state_at_rest((3.0, 0.0)), integrator)
+    kept = damaged.structure.modal_projection @ integrator.structure.unit_responses[:, :2] @ (3.0, 0.0)
     np.testing.assert_allclose(taken.displacement, kept, atol=1e-9 * np.abs(kept).max())
 
 
 def test_bad_input_is_refused(model, integrator):
     for duration, load in ((0.0, 1.0), (-1.0, 1.0), (np.nan, 1.0), (np.inf, 1.0), (0.1, np.nan)):
         with pytest.raises(InvalidStateError, match="needs a positive duration and a finite load"):
-            integrator.advance(integrator.at_rest((1.0, 0.0)), duration, (load, 0.0))
+            integrator.advance(integrator.state_at_rest((1.0, 0.0)), duration, (load, 0.0))
     for name, value, kind in (
         ("damping_alpha", -1.0, InvalidStateError),
         ("damping_beta", np.nan, InvalidStateError),

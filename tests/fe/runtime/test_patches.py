@@ -24,7 +24,7 @@ from fe.runtime.patch import (
     SensorRotation,
 )
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, check_channels
-from fe.runtime.state import DigitalState, Geometry, losses_of, region_names
+from fe.runtime.state import DigitalState, Geometry, default_region_names, losses_of
 from tests.refusals import Inputs, refused
 
 INPUTS = Inputs(__file__)
@@ -42,7 +42,7 @@ def test_arithmetic_is_that_of_python(a, b, c):
     wanted = (a + 2 * b) / c - -(a**2) + math.sqrt(c) * min(a, b, 0) + abs(b) * float(np.exp(-c))
     assert formula.value({"a": a, "b": b, "c": c}) == wanted
     filled = Expression(formula.with_numbers({"a": a, "b": b}), {"c"}, "Here")
-    assert filled.used() == {"c"}
+    assert filled.used_names() == {"c"}
     assert filled.value({"c": c}) == wanted
     with refused(InvalidPatchError, "needs 'c', which has no value"):
         filled.value({})
@@ -62,7 +62,9 @@ def test_a_course_has_the_values_of_its_times(a, times):
     text = "a*max(0, time - 1, b) + step(time - 2)*sin(time)/(1 + abs(a))"
     formula, given = Expression(text, {"a", "b", "time"}, "Here"), {"a": a, "b": -2.0}
     single = [formula.value({**given, "time": time}) for time in times]
-    np.testing.assert_allclose(formula.course(np.array(times), given), single, rtol=1e-14, atol=1e-14)
+    np.testing.assert_allclose(
+        formula.values_over_time(np.array(times), given), single, rtol=1e-14, atol=1e-14
+    )
 
 
 def test_kinds_are_the_keys_of_patches_that_were_kept():
@@ -80,7 +82,7 @@ def test_impossible_states_are_refused_with_the_place(changes, place):
 
 def test_losses_stand_in_the_order_of_the_regions():
     regions = ("root", "z2", "tip")
-    assert region_names(3) == ("z1", "z2", "z3")
+    assert default_region_names(3) == ("z1", "z2", "z3")
     for losses, wanted in (
         ({"tip": 0.4, "root": 0.1}, (0.1, 0.0, 0.4)),
         ([0.1, 0.2, 0.3],) * 2,
@@ -104,8 +106,8 @@ VALUES = np.stack([np.cos(3 * TIME), 1e-3 * np.cos(5 * TIME), 2e-3 * np.sin(4 * 
 RATES = np.stack([-3 * np.sin(3 * TIME), -5e-3 * np.sin(5 * TIME), 8e-3 * np.cos(4 * TIME)], axis=1)
 
 
-def applied(items: ModelPatch, *given, filtered=filtered_record, **more):
-    return apply_sensors(items, *given, filtered=filtered, **more)
+def applied(items: ModelPatch, *given, high_pass=filtered_record, **more):
+    return apply_sensors(items, *given, high_pass=high_pass, **more)
 
 
 def shown(*primitives, record=RECORD, **more):
@@ -185,7 +187,7 @@ def test_what_cannot_be_is_refused_in_one_sentence(kind, given, sentence):
     item = ModelPatch((patch.PRIMITIVES[kind](*given),))
     with refused(InvalidPatchError, sentence):
         check_channels(item, CHANNELS)
-        applied(item, RECORD, VALUES, RATES, filtered=FilterMemory(None, 0.1).filtered)
+        applied(item, RECORD, VALUES, RATES, high_pass=FilterMemory(None, 0.1).filter_row)
     check_channels(ModelPatch((SensorGain("*", 0.1), SensorGain("g1", 0.1), Clock(0.0, 0.1))), CHANNELS)
 
 
@@ -229,7 +231,7 @@ def test_rates_through_the_high_pass(order):
     quick = tuple((name, "acceleration") for name, _ in CHANNELS)  # which is none at rest: a step
     for record in (RECORD, FORCED):
         assert shown(item, record=replace(record, channels=quick))[0][0] == pytest.approx(VALUES[0])
-        before = FilterMemory(None, 0.0).filtered(
+        before = FilterMemory(None, 0.0).filter_row(
             HighPass("*", 0.4), replace(record, channels=quick), VALUES[:1], RATES
         )
         assert before[0] == pytest.approx(VALUES[:1])

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy import io, sparse
 
+import uav_twin
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import FiniteElementError
@@ -190,3 +191,18 @@ def test_the_hash_is_of_the_content_of_every_file(chain, tmp_path):
         factor = 1.1 if name == "k.mtx" else 0.9
         other = f"{content} " if isinstance(content, str) else factor * content
         assert chain({name: other}).design_hash != first
+
+
+def test_the_same_verbs_serve_wings_and_structures(tmp_path, coarse_design):
+    """They take the design of a wing, or the path of a structure file, and values by name."""
+    wing = uav_twin.assemble(coarse_design)
+    response = uav_twin.static_response(wing, {"z1": 0.4, "load_factor": 3.0})
+    lift = wing.turn(3.0)
+    displacement = Factorisation(wing.stiffness(stiffness_loss={"z1": 0.4})).solve(lift)
+    assert response.strain == pytest.approx(wing.gauge_output @ displacement, rel=1e-9)
+    modes = uav_twin.natural_frequencies(wing, 4)
+    assert uav_twin.flapwise_bending_modes(wing, modes).tolist()[0] == 0
+    chain = uav_twin.assemble(write_chain(tmp_path))
+    squares, _ = lowest_eigenpairs(chain.stiffness(), chain.mass(), 2)
+    found = uav_twin.natural_frequencies(chain, 2).frequency
+    assert found == pytest.approx(np.sqrt(squares) / (2.0 * np.pi), rel=1e-9)

@@ -107,14 +107,14 @@ def motion(kind: Kind, ours: OurFmus) -> Shown:
     model, given = ours.model(kind.file), kind.parameters
     damping = [given.get(f"damping_{name}", model.damping[k]) for k, name in enumerate(("alpha", "beta"))]
     begin = model.vector(dict(ChainMap(*kind.start.values())))
-    now = ModalIntegrator(model, begin, *damping)
+    now = ModalIntegrator(model.structure_at(begin), *damping)
     tip, at_start = given.get("initial_tip_displacement", 0.0), model.load_coefficients(begin)
-    state = now.released(tip, at_start, TIP_FORCE) if tip else now.at_rest(at_start)
+    state = now.state_after_release(tip, at_start, TIP_FORCE) if tip else now.state_at_rest(at_start)
     health, shown = dict.fromkeys(model.regions, 0.0) | kind.start.get("health", {}), []
     for row in kind.rows:
         vector = model.vector(row)
         if health != (health := {name: row[name] for name in model.regions}):
-            was, now = now, ModalIntegrator(model, vector, *damping)
+            was, now = now, ModalIntegrator(model.structure_at(vector), *damping)
             state = now.take_over(state, was)
         state = now.advance(state, kind.binding.step_size, model.load_coefficients(vector))
         shown.append(now.outputs(state))

@@ -16,7 +16,7 @@ import pytest
 from fmpy import read_model_description
 
 from fe.runtime.reduced import ReducedModel
-from fe.runtime.state import WING, DigitalState
+from fe.runtime.state import WING_MODEL_NAME, DigitalState
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import inspect_fmu, read_fmu
 from fmu_asset.check import check_file, check_fmu
@@ -191,7 +191,7 @@ def test_the_compiled_one_declares_the_same_and_all_of_its_sources(ours) -> None
 
 def test_a_structure_of_the_wings_name_is_no_wing(ours) -> None:
     model = ours.model("beam")
-    table, roles = structure_table(replace(model, name=WING), {})
+    table, roles = structure_table(replace(model, name=WING_MODEL_NAME), {})
     assert roles.displacement_bound == "displacement_error_bound"
     assert [row.name for row in table] == [row.name for row in structure_table(model, {})[0]]
 

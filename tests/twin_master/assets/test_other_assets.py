@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from benchmarks.seeds import fly_seeds
+from benchmarks.studies.seeds import fly_seeds
 from fe.full.factorisation import Factorisation, lowest_eigenpairs
 from fe.runtime.errors import FiniteElementError, InvalidDesignError
 from fe.structure.design import load_structure
@@ -156,7 +156,7 @@ def test_many_lives_of_an_asset_with_its_own_damage_are_refused(tmp_path):
 
 @pytest.mark.slow
 def test_the_papers_policy_and_its_reliability():
-    """Bars of 300 missions, widened for 80; `benchmarks/study_level_turns.py` flies as many as wanted."""
+    """Bars of 300 missions, widened for 80; `benchmarks/studies/level_turns.py` flies as many as wanted."""
     knowledge, source = of_wing("paper_level_turns", 0)
     z1 = knowledge.model.states.coordinates[:, 0]
     np.testing.assert_array_equal(knowledge.plan.control_index, np.where(z1 < 0.59, 1, 0))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
-from benchmarks.study_planning import PROBLEMS, tiger
+from benchmarks.studies.planning import PROBLEMS, tiger
 from twin_master.errors import InvalidModelError, InvalidObservationError, PlanningError
 from twin_master.network import belief_planning
 from twin_master.network.belief_planning import (
@@ -356,7 +356,8 @@ def drawn(seed: int, states: int, moves_first: bool, discount: float = 0.8) -> D
 
 @pytest.mark.parametrize(
     ("problem", "below", "above", "gap"),
-    [  # as published, and by Storm 2.0, see `benchmarks.study_planning`: 200,000 beliefs, grids of 400 and 24
+    # as published, and by Storm 2.0, see `benchmarks.studies.planning`: 200,000 beliefs, grids of 400 and 24
+    [
         (tiger(0.75), 1.933 - 5e-4, 1.933 + 5e-4, 1e-4),
         (tiger(0.95), 19.3711, 19.3716, 1e-4),
         (PROBLEMS["maze of 4 x 3"](), 1.8490, 1.9066, 1e-2),

@@ -1,0 +1,181 @@
+"""What a fleet learns about its probabilities to worsen; docs/fleets.md shows the figures.
+
+    python -m benchmarks.studies.fleets coverage --fleets 200
+    python -m benchmarks.studies.fleets groups --fleets 40
+    python -m benchmarks.studies.fleets half --twins 1000
+
+`coverage`: how often 95 % intervals hold the truth. `groups`: what groups gain from each other.
+`half`: what flying with the learnt probabilities is worth. Every mission flies the reduced model
+in this process; each part prints its table.
+"""
+
+import argparse
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fe.reduction.model_cache import reduced_model
+from twin_master.assets.reduced_model import ReducedModelSource
+from twin_master.fleet.evidence import Worsening, scaled_likelihood, transition_evidence
+from twin_master.fleet.plan import Member
+from twin_master.fleet.posterior import Grid, refined, shared
+from twin_master.fleet.store import outcomes_of
+from twin_master.mission.preparation import Knowledge, prepare_knowledge
+from twin_master.mission.side_by_side import Flights, fly_side_by_side
+from twin_master.network.inference import predict
+from twin_master.scenario.reading import load_scenario, parse_scenario
+
+Float = NDArray[np.float64]
+
+ASSUMED = {"2g": 0.05, "3g": 0.10}
+AHEAD = 10
+
+
+def knowledge(true: dict[str, float], believed: dict[str, float], *, fixed: bool) -> Knowledge:
+    """Return what twins of `growing_damage` know, whose damage grows with other probabilities.
+
+    With `fixed`, noise and parameter are those of the true assets, so that rates are all that is
+    unknown.
+    """
+    table = load_scenario("growing_damage").scenario.to_dict()
+    table["transition"]["probability"] = believed
+    table["truth"]["probability"] = true
+    table.pop("notice")  # with it no twins are flown side by side
+    if fixed:
+        table["observation"]["standard_deviation"] = table["truth"]["noise"]["standard_deviation"]
+        mean = table["asset"]["parameters"]["young_modulus_factor"]
+        table["calibration"] |= {"source": "fixed", "mean": mean, "curve": "published"}
+    scenario = parse_scenario(table, "study")
+    return prepare_knowledge(scenario, ReducedModelSource(scenario, reduced_model()), 0)
+
+
+def flights(known: Knowledge, first: int, count: int) -> Flights:
+    """Fly some twins under seeds that follow each other."""
+    asset = ReducedModelSource(known.scenario, reduced_model()).open()
+    truths = [known.truth(seed) for seed in range(first, first + count)]
+    return fly_side_by_side(known, truths, [asset] * count)
+
+
+def learnt(known: Knowledge, flown: Flights) -> Grid:
+    """Return the likelihood of the probabilities to worsen."""
+    worsening = Worsening.of(known.scenario)
+    likelihood, _ = scaled_likelihood(known.sensor_model, flown.row, flown.control_index)
+
+    def log_likelihood(points: Float) -> Float:
+        evidence = transition_evidence(worsening, points, likelihood, flown.control_index)
+        return np.asarray(evidence.sum(axis=0))
+
+    return refined(log_likelihood, len(worsening.names))
+
+
+def coverage(fleets: int, twins: int) -> None:
+    """Print how often the 95 % interval of each probability holds the true one of a fleet."""
+    generator = np.random.default_rng(1)
+    inside = np.zeros((fleets, 2), dtype=bool)
+    for fleet in range(fleets):
+        rates = np.exp(generator.uniform(np.log(0.02), np.log(0.2), 2))
+        known = knowledge(dict(zip(ASSUMED, rates.tolist(), strict=True)), ASSUMED, fixed=True)
+        grid = learnt(known, flights(known, 1000 * fleet, twins))
+        for number, (marginal, rate) in enumerate(zip(grid.marginals, rates.tolist(), strict=True)):
+            low, high = marginal.interval()
+            inside[fleet, number] = low <= rate <= high
+    for name, column in zip(ASSUMED, inside.T, strict=True):
+        share = column.mean()
+        print(
+            f"| {name}, {fleets} fleets of {twins} "
+            f"| {100 * share:.1f} ± {error(share, fleets):.1f} % |"
+        )
+    share = inside.mean()
+    print(f"| both | {100 * share:.1f} ± {error(share, inside.size):.1f} % |")
+
+
+def error(share: float, count: int) -> float:
+    """Return the standard error of a share in percent."""
+    return float(100.0 * np.sqrt(share * (1.0 - share) / count))
+
+
+def groups(fleets: int, twins: int) -> None:
+    """Print rms error and coverage of the rates of 12 groups of 5 twins, alone and shared."""
+    generator = np.random.default_rng(2)
+    errors: dict[str, list[float]] = {"alone": [], "shared": []}
+    inside: dict[str, list[bool]] = {"alone": [], "shared": []}
+    for fleet in range(fleets):
+        grids, rates = [], []
+        for group in range(12):
+            true = generator.beta(0.08 * 60.0, 0.92 * 60.0, 2)
+            known = knowledge(dict(zip(ASSUMED, true.tolist(), strict=True)), ASSUMED, fixed=True)
+            grids.append(learnt(known, flights(known, 10_000 * fleet + 100 * group, twins)))
+            rates.append(true)
+        marginals_of = {"alone": [grid.marginals for grid in grids], "shared": shared(grids)[1]}
+        for what, found in marginals_of.items():
+            for true, marginals in zip(rates, found, strict=True):
+                for rate, marginal in zip(true.tolist(), marginals, strict=True):
+                    low, high = marginal.interval()
+                    errors[what].append(marginal.mean - rate)
+                    inside[what].append(low <= rate <= high)
+    for what, deviations in errors.items():
+        rms = float(np.sqrt(np.mean(np.square(deviations))))
+        share = float(np.mean(inside[what]))
+        print(f"| {what} | {rms:.4f} | {100 * share:.1f} ± {error(share, len(deviations)):.1f} % |")
+
+
+def half(twins: int) -> None:
+    """Print early fallbacks and prediction scores where true rates are half of the assumed."""
+    true = {name: 0.5 * rate for name, rate in ASSUMED.items()}
+    teacher = knowledge(true, ASSUMED, fixed=False)
+    flown = flights(teacher, 0, twins)
+    means = [marginal.mean for marginal in learnt(teacher, flown).marginals]
+    found = dict(zip(ASSUMED, means, strict=True))
+    print("learnt", {name: round(rate, 4) for name, rate in found.items()})
+    scores = {}
+    for what, believed in (("assumed", ASSUMED), ("learnt", found), ("known", true)):
+        known = knowledge(true, believed, fixed=False)
+        later = flights(known, 100_000, twins)
+        members = [Member(row, "", 0, {}) for row in range(twins)]
+        early = float(outcomes_of(known, later, members)["early"].mean())
+        scores[what] = score(known, later)
+        print(
+            f"| {what} | {100 * early:.1f} ± {error(early, twins):.1f} % "
+            f"| {scores[what].mean():.3f} |"
+        )
+    for what in ("assumed", "known"):
+        gain = scores["learnt"] - scores[what]
+        print(
+            f"learnt against {what}: {gain.mean():.3f} "
+            f"± {gain.std(ddof=1) / np.sqrt(twins):.3f} a prediction"
+        )
+
+
+def score(known: Knowledge, flown: Flights) -> Float:
+    """Return the mean log probability of the true state ten turns ahead, of each twin: (B,)."""
+    model = known.model
+    steps = flown.state.shape[1]
+    result = np.zeros(len(flown.state))
+    begins = range(5, steps - AHEAD, 10)
+    for twin in range(len(result)):
+        for begin in begins:
+            control = int(flown.control_index[twin, begin])
+            ahead = predict(model, flown.filtered[twin, begin], control, known.plan.policy, AHEAD)
+            state = model.states.index(tuple(flown.state[twin, begin + AHEAD]))
+            result[twin] += np.log(max(float(ahead.predicted[-1, state]), 1e-12)) / len(begins)
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("part", choices=("coverage", "groups", "half"))
+    parser.add_argument("--fleets", type=int, default=200)
+    parser.add_argument("--twins", type=int)
+    arguments = parser.parse_args()
+    if arguments.part == "half":
+        half(arguments.twins or 1000)
+        return
+    parts: dict[str, Any] = {"coverage": coverage, "groups": groups}
+    parts[arguments.part](
+        arguments.fleets, arguments.twins or (50 if arguments.part == "coverage" else 5)
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,44 @@
+"""Sums and modes of small dense matrices.
+
+NumPy and relative imports only: this file is copied into the FMU.
+"""
+
+import numpy as np
+
+from .arrays import FloatArray
+
+
+def dense_sum(coefficients: FloatArray, terms: FloatArray) -> FloatArray:
+    """Return the sum of coefficients (T,) times dense terms (T, n, m)."""
+    flat_terms = terms.reshape(len(terms), -1)
+    return np.asarray((coefficients @ flat_terms).reshape(terms.shape[1:]))
+
+
+def lowest_modes(
+    stiffness: FloatArray, mass: FloatArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the lowest undamped modes of dense matrices.
+
+    The problem is solved as M x = K x / omega^2: in a basis of modes the stiffness is well
+    conditioned and the mass is not, and the low modes are the largest eigenvalues, which keep all
+    their digits.
+
+    Parameters
+    ----------
+    stiffness, mass : (n, n) array
+        K and M.
+    count : int
+        Number of modes M.
+
+    Returns
+    -------
+    frequency : (M,) array
+        Natural frequencies [Hz].
+    shape : (n, M) array
+        Mass-normalised shapes.
+    """
+    inverse_cholesky = np.linalg.inv(np.linalg.cholesky(stiffness))
+    inverse_squares, vectors = np.linalg.eigh(inverse_cholesky @ mass @ inverse_cholesky.T)
+    inverse_omega = np.sqrt(inverse_squares[::-1][:count])
+    frequency = 1.0 / (2.0 * np.pi * inverse_omega)
+    return frequency, inverse_cholesky.T @ vectors[:, ::-1][:, :count] / inverse_omega

@@ -1,0 +1,310 @@
+"""The laws of a patch at the ports of a model, as arrays for the loops of motion.
+
+NumPy and relative imports only: this file is copied into the FMU.
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isfinite
+from typing import Any
+
+import numpy as np
+
+from .arrays import FIRST_ELEMENT, BoolArray, FloatArray, IntArray
+from .errors import InvalidPatchError
+from .laws import LAWS
+from .laws.interface import PARAMETERS, PortForce
+from .modal_system import ModalSystem
+from .motion_arrays import IMMOVABLE, SPEED_LAW, PortArrays
+from .patch import ModelPatch, StiffnessDrift
+from .primitive import Primitive
+
+# ---------------------------------------------------------------- forces spread over a planform
+
+PLANFORM = "planform"
+"""The port of a force that is spread over a planform, such as that of air, which resists where a
+wing moves, not its mean motion. The law acts at every station on the motion of that station, with a
+force in proportion to the station's fraction of the area. The stations are those of the integral of
+Gauss and Legendre along the span."""
+STATION_COUNT = 6
+"""Stations of the integral: ring-downs under quadratic drag are within 1e-3 microstrain of those
+with 24 stations."""
+STATION_PORTS = tuple(f"{PLANFORM}[{number}]" for number in range(1, STATION_COUNT + 1))
+"""Ports of the stations, from the root to the tip."""
+
+
+def port_in_patch(port: str) -> str:
+    """Return the name that a patch has for a port: `PLANFORM` for the ports of its stations."""
+    return PLANFORM if port in STATION_PORTS else port
+
+
+def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> ModelPatch:
+    """Return a patch with each law at `PLANFORM` replaced by one law at every station.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        A patch; what acts elsewhere stays, in its order.
+    area_fractions : (S,) array
+        Fraction of the planform's area of each station.
+    """
+    primitives: list[Primitive] = []
+    for primitive in patch:
+        if not isinstance(primitive, PortForce) or primitive.port != PLANFORM:
+            primitives.append(primitive)
+            continue
+        for port, fraction in zip(STATION_PORTS, area_fractions.tolist(), strict=True):
+            changes: dict[str, Any] = {
+                name: fraction * getattr(primitive, name) for name in primitive.proportional
+            }
+            primitives.append(replace(primitive, **changes, port=port))
+    return ModelPatch(tuple(primitives))
+
+
+# ---------------------------------------------------------------- laws of a patch
+
+Span = tuple[float, float]
+"""Begin and end of a stretch of time [s]."""
+
+
+@dataclass(frozen=True)
+class PortLaws:
+    """The internal forces of a patch as arrays for the loops.
+
+    Attributes
+    ----------
+    ports : tuple of str
+        Port of each of the J laws.
+    law_numbers : (J,) array of int
+        Number of each law in `fe.runtime.laws.LAWS`.
+    parameters : (J, 5 + E) array
+        Parameters of each law, then those of its hysteretic elements.
+    stiffness_rate : float
+        Drift of the whole structure's stiffness [1/s].
+    active_spans : tuple of tuple of (float, float)
+        Stretches of time in which each law acts [s], none for a law that always acts; empty where
+        all laws always act.
+    drift_start : float
+        Time at which the stiffness begins to drift [s].
+    """
+
+    ports: tuple[str, ...]
+    law_numbers: IntArray
+    parameters: FloatArray
+    stiffness_rate: float = 0.0
+    active_spans: tuple[tuple[Span, ...], ...] = ()
+    drift_start: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.ports)
+
+    @property
+    def linear(self) -> bool:
+        """Whether the structure stays linear: no laws, and no drift of the stiffness."""
+        return not self.ports and self.stiffness_rate == 0.0
+
+    def port_rows(
+        self, rows: Mapping[str, FloatArray], width: int, time: float | None = None
+    ) -> FloatArray:
+        """Return the row of each law's port as one array.
+
+        Parameters
+        ----------
+        rows : mapping of str to (width,) array
+            Row of each port by name.
+        width : int
+            Number of coordinates.
+        time : float, optional
+            A time [s] at which the rows of laws that do not act are zero.
+
+        Returns
+        -------
+        (J, width) array
+            The rows.
+        """
+        law_rows = np.array([rows[name] for name in self.ports], dtype=np.float64)
+        law_rows = law_rows.reshape(len(self), width)
+        if time is not None:
+            law_rows[~self.active_at(time)] = 0.0
+        return law_rows
+
+    @property
+    def switching_times(self) -> tuple[float, ...]:
+        """Times at which a law begins or ends to act [s]."""
+        times = [time for spans in self.active_spans for span in spans for time in span]
+        return tuple(filter(isfinite, times))
+
+    def active_at(self, time: float) -> BoolArray:
+        """Return whether each of the laws (J,) acts at a time [s]."""
+        active = np.ones(len(self), dtype=bool)
+        for j, spans in enumerate(self.active_spans):
+            if spans:
+                active[j] = any(begin <= time < end for begin, end in spans)
+        return active
+
+    def has_same_laws(self, other: "PortLaws") -> bool:
+        """Return whether the laws and their ports are the same, so that their memory can stay."""
+        return (
+            self.ports == other.ports
+            and self.parameters.shape == other.parameters.shape
+            and bool(np.array_equal(self.law_numbers, other.law_numbers))
+        )
+
+    @cached_property
+    def depends_on_speed(self) -> IntArray:
+        """1 for each law (J,) of speed, 0 for a law of position."""
+        return np.array(
+            [LAWS[number].depends_on_speed for number in self.law_numbers], dtype=np.int64
+        )
+
+    def unloaded_memory(self) -> FloatArray:
+        """Return the memory (J, 5 + E) of laws that have never been loaded, E at least 1."""
+        elements = self.parameters.shape[1] - PARAMETERS
+        return np.zeros((len(self), FIRST_ELEMENT + max(1, elements)))
+
+    def port_arrays(
+        self,
+        motion_rows: FloatArray,
+        force_rows: FloatArray,
+        flexibility: FloatArray,
+        relaxation: float,
+        transition: FloatArray,
+    ) -> PortArrays:
+        """Return the arrays of the laws for the loops of motion.
+
+        Parameters
+        ----------
+        motion_rows, force_rows : (J, M) array
+            Modal rows of the motion of each law's port, and along which the law acts.
+        flexibility : (J,) array
+            Residual flexibility of each law's port.
+        relaxation : float
+            Time constant of the residual position [s].
+        transition : (S, 2M, 2M) array
+            Linear steps of the S lengths.
+        """
+        modes = motion_rows.shape[1]
+        inverse_mass = np.sum(motion_rows * force_rows, axis=1)
+        impulse_response = force_rows @ transition[:, :, modes:].transpose(0, 2, 1)
+        return PortArrays(
+            motion_rows=motion_rows,
+            force_rows=force_rows,
+            inverse_mass=inverse_mass,
+            leader=self._leaders(inverse_mass, flexibility),
+            impulse_response=np.ascontiguousarray(impulse_response),
+            law_number=self.law_numbers,
+            depends_on_speed=self.depends_on_speed,
+            parameters=self.parameters,
+            flexibility=flexibility,
+            relaxation=relaxation,
+            stiffness_rate=self.stiffness_rate,
+        )
+
+    def _leaders(self, inverse_mass: FloatArray, flexibility: FloatArray) -> IntArray:
+        """Return the leader (J,) of each law, see `PortArrays`."""
+        on_modes = (self.depends_on_speed == 1) & (flexibility == 0.0)
+        immovable = inverse_mass == 0.0
+        locations = list(zip(self.ports, on_modes.tolist(), immovable.tolist(), strict=True))
+        first_law = np.array([locations.index(location) for location in locations], dtype=np.int64)
+        return np.where(immovable, IMMOVABLE, np.where(on_modes, SPEED_LAW, first_law))
+
+    def port_arrays_at_rest(self) -> PortArrays:
+        """Return the arrays of the laws for static solutions, which have no modes."""
+        no_modes = np.zeros((len(self), 0))
+        return self.port_arrays(
+            motion_rows=no_modes,
+            force_rows=no_modes,
+            flexibility=np.zeros(len(self)),
+            relaxation=0.0,
+            transition=np.zeros((0, 0, 0)),
+        )
+
+
+NO_LAWS = PortLaws((), np.zeros(0, dtype=np.int64), np.zeros((0, PARAMETERS)))
+"""The linear structure."""
+
+
+def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = False) -> PortLaws:
+    """Return the internal forces of a patch; laws without magnitude are left out.
+
+    Parameters
+    ----------
+    patch : ModelPatch
+        The patch; primitives of other kinds are left out.
+    ports : collection of str
+        Ports that the model has.
+    in_windows : bool
+        Whether the model can follow laws that act in windows only, those of its trial.
+
+    Raises
+    ------
+    InvalidPatchError
+        If a law acts on a port that the model does not have, has an impossible number, or acts in a
+        window only where the model cannot follow it.
+    """
+    forces = []
+    for law in patch.of(PortForce):
+        assert isinstance(law, PortForce)
+        _check_port(law, ports)
+        if law.magnitude == 0.0:
+            continue
+        law.check()
+        if law.windows and not in_windows:
+            raise InvalidPatchError(
+                f"The primitive {law.kind!r} acts in a window, which lumped models alone can "
+                "follow."
+            )
+        forces.append(law)
+    drifts = [primitive for primitive in patch if isinstance(primitive, StiffnessDrift)]
+    stiffness_rate = sum((drift.rate for drift in drifts), 0.0)
+    if not forces:
+        return replace(NO_LAWS, stiffness_rate=stiffness_rate) if stiffness_rate else NO_LAWS
+    # rows of one length, with zeros after shorter ones
+    rows = [law.parameter_row for law in forces]
+    longest = max(map(len, rows))
+    spans = tuple(tuple(window.span for window in law.windows) for law in forces)
+    return PortLaws(
+        ports=tuple(law.port for law in forces),
+        law_numbers=np.array([LAWS.index(type(law)) for law in forces], dtype=np.int64),
+        parameters=np.array([np.pad(row, (0, longest - len(row))) for row in rows]),
+        stiffness_rate=stiffness_rate,
+        active_spans=spans if any(spans) else (),
+    )
+
+
+def _check_port(law: PortForce, ports: Collection[str]) -> None:
+    """Raise `InvalidPatchError` if a law acts on a port that the model does not have."""
+    if law.port in ports:
+        return
+    names = dict.fromkeys(map(port_in_patch, ports))
+    available = f"it has {', '.join(names)}" if ports else "it has none"
+    raise InvalidPatchError(
+        f"The primitive {law.kind!r} acts on the port {law.port!r}, which this model does not "
+        f"have; {available}."
+    )
+
+
+LEAST_RESIDUAL = 0.1
+"""Fraction of a port's flexibility that modes must leave out for damping there to act through
+it."""
+
+
+def port_flexibility(system: ModalSystem, laws: PortLaws) -> FloatArray:
+    """Return the residual flexibility (J,) of the laws' ports.
+
+    It is zero for damping at ports where the modes give nearly all of the flexibility: friction
+    there acts on the modes themselves, which needs no small steps. Forces at other ports do not
+    count.
+    """
+    flexibility = np.zeros(len(laws))
+    if system.flexibility is None or not len(laws):
+        return flexibility
+    port_names = list(system.ports)
+    residual = system.flexibility[[port_names.index(name) for name in laws.ports]]
+    rows = laws.port_rows(system.ports, len(system.angular_frequency))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        of_modes = np.nansum(rows**2 / system.angular_frequency**2, axis=1)
+    nearly_rigid = residual < LEAST_RESIDUAL * (residual + of_modes)
+    acts_on_modes = (laws.depends_on_speed == 1) & nearly_rigid
+    return np.where(acts_on_modes | (residual <= 0.0), 0.0, residual)

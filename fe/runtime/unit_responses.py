@@ -1,0 +1,115 @@
+"""Responses of a structure to unit loads: of its modes, and of the modes that are left out.
+
+NumPy and relative imports only: this file is copied into the FMU.
+"""
+
+from functools import cached_property
+
+import numpy as np
+
+from .arrays import FloatArray
+from .modal_system import ModalSystem, rayleigh_damping_ratio
+from .structure_in_motion import StructureInMotion
+
+
+class UnitResponses:
+    """Responses of a structure to its L + J unit loads: L loads, then forces at ports of J laws.
+
+    Parameters
+    ----------
+    structure : StructureInMotion
+        The structure, with M modes.
+    damping_alpha, damping_beta : float
+        Rayleigh damping [1/s], [s].
+    """
+
+    def __init__(
+        self, structure: StructureInMotion, damping_alpha: float, damping_beta: float
+    ) -> None:
+        self.structure = structure
+        self.alpha = damping_alpha
+        self.beta = damping_beta
+        law_count = 0 if structure.laws is None else len(structure.laws)
+        self.load_count = structure.unit_loads.shape[1] - law_count
+
+    @cached_property
+    def damping_ratio(self) -> FloatArray:
+        """Damping ratios (M,) of the modes."""
+        return rayleigh_damping_ratio(self.alpha, self.beta, self.structure.modes.frequency)
+
+    @cached_property
+    def omega(self) -> FloatArray:
+        """Angular frequencies (M,) of the modes [rad/s]."""
+        return np.asarray(2.0 * np.pi * self.structure.modes.frequency)
+
+    @cached_property
+    def participation(self) -> FloatArray:
+        """Modal forces (M, L + J) of the unit loads."""
+        return np.asarray(self.structure.mode_shapes.T @ self.structure.unit_loads)
+
+    @cached_property
+    def modal_coordinates(self) -> FloatArray:
+        """Modal coordinates (M, L + J) at rest under the unit loads."""
+        return np.asarray(self.participation / self.omega[:, np.newaxis] ** 2)
+
+    @cached_property
+    def residual_displacements(self) -> FloatArray:
+        """Displacements (n, L + J) under the unit loads, of the modes that are left out."""
+        of_modes = self.structure.mode_shapes @ self.modal_coordinates
+        return np.asarray(self.structure.unit_responses - of_modes)
+
+    @cached_property
+    def modal_outputs(self) -> FloatArray:
+        """Outputs (O, M) by modal coordinates."""
+        return np.asarray(self.structure.output_rows @ self.structure.mode_shapes)
+
+    @cached_property
+    def residual_outputs(self) -> FloatArray:
+        """Outputs (O, L + J) under the unit loads, of the modes that are left out."""
+        return np.asarray(self.structure.output_rows @ self.residual_displacements)
+
+    @property
+    def law_loads(self) -> FloatArray:
+        """Unit loads (n, J) at the ports of the laws."""
+        return self.structure.unit_loads[:, self.load_count :]
+
+    @cached_property
+    def port_positions(self) -> FloatArray:
+        """Positions (J, L + J) of the laws' ports at rest under the unit loads."""
+        return np.asarray(self.law_loads.T @ self.structure.unit_responses)
+
+    @property
+    def port_positions_by_loads(self) -> FloatArray:
+        """Positions (J, L) of the laws' ports at rest under unit loads that are not at ports."""
+        return self.port_positions[:, : self.load_count]
+
+    @property
+    def port_compliance(self) -> FloatArray:
+        """Positions (J, J) of the laws' ports at rest under unit forces at them."""
+        return self.port_positions[:, self.load_count :]
+
+    @cached_property
+    def system(self) -> ModalSystem:
+        """The modes with the ports of the laws."""
+        damping = np.diag(self.alpha + self.beta * self.omega**2)
+        if self.structure.laws is None:
+            return ModalSystem(self.omega, damping)
+        names = self.structure.laws.ports
+        rows = self.participation[:, self.load_count :].T
+        # residual flexibility; a smaller one than this is rounding
+        flexibility = np.diag(self.port_compliance)
+        residual = flexibility - np.sum((rows / self.omega) ** 2, axis=1)
+        is_flexible = np.array(
+            [name not in self.structure.rigid_ports for name in names], dtype=bool
+        )
+        residual = np.where((residual > 1e-9 * flexibility) & is_flexible, residual, 0.0)
+        # several laws may act at one port
+        row_of_port = dict(zip(names, rows, strict=True))
+        residual_of_port = dict(zip(names, residual.tolist(), strict=True))
+        return ModalSystem(
+            angular_frequency=self.omega,
+            damping=damping,
+            ports=row_of_port,
+            flexibility=np.array(list(residual_of_port.values())),
+            relaxation=self.beta,
+        )
