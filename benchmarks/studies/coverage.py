@@ -63,7 +63,7 @@ class MeasuredWing:
         True values of `STATE`.
     static : LoadDisplacementData
         Its load test.
-    readings : tuple of Reading
+    readings : tuple of FigureReading
         Its weight, frequencies and damping.
     """
 
