@@ -44,9 +44,9 @@ def run() -> list[Measurement]:
                 lambda: asset.step({"load_factor": next(loads)}), repeats=REPEATS, inner=INNER
             )
         joining = 1e3 * median_seconds(lambda: Wiring(wiring.structure), repeats=5)
-    beside = "the three stepped one by one"
+    reference = "the three stepped one by one"
     return [
-        Measurement("step of three FMUs in process", coupled, "us", None, beside, alone),
+        Measurement("step of three FMUs in process", coupled, "us", None, reference, alone),
         Measurement("overhead of the coupling", coupled - alone, "us", 50.0),
         Measurement("step of three FMUs in three workers", isolated, "us"),
         Measurement(f"state of three FMUs saved, {size} bytes", saved, "us"),
@@ -105,23 +105,23 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
 
             def one_by_one() -> None:
                 load = next(loads)
-                for asset, given in zip(assets, inputs, strict=True):
-                    if "load_factor" in given:
-                        given["load_factor"] = load
-                    asset.step(load=given).values.tolist()
+                for asset, load_inputs in zip(assets, inputs, strict=True):
+                    if "load_factor" in load_inputs:
+                        load_inputs["load_factor"] = load
+                    asset.step(load=load_inputs).values.tolist()
 
             def together() -> None:
                 coupled.step({"load_factor": next(loads)})
 
             times: tuple[list[float], list[float]] = ([], [])
             for _ in range(REPEATS):
-                for function, seen in zip((together, one_by_one), times, strict=True):
+                for function, seconds in zip((together, one_by_one), times, strict=True):
                     begin = time.perf_counter()
                     for _ in range(INNER):
                         function()
-                    seen.append((time.perf_counter() - begin) / INNER)
+                    seconds.append((time.perf_counter() - begin) / INNER)
             saved = median_seconds(coupled.save_state, repeats=REPEATS)
-            medians = [1e6 * float(np.median(seen)) for seen in times]
+            medians = [1e6 * float(np.median(seconds)) for seconds in times]
             return medians[0], medians[1], 1e6 * saved, len(coupled.save_state())
         finally:
             for asset in assets:

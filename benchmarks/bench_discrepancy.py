@@ -54,9 +54,9 @@ def run() -> list[Measurement]:
         )
     problem = _problem(model, cases["compliant root hidden"], SEED)
     usable = tuple(effect for effect in library() if effect.unavailable(problem.setting) is None)
-    found = Search(problem, usable, fit(problem, Candidate(), problem.start(Candidate())))
+    scan = Search(problem, usable, fit(problem, Candidate(), problem.start(Candidate())))
     begin = time.perf_counter()
-    found.fit_pairs()
+    scan.fit_pairs()
     pairs = len(usable) * (len(usable) - 1) // 2
     rows.append(
         Measurement(

@@ -30,17 +30,17 @@ def run() -> list[Measurement]:
     source = ReducedModelSource(scenario, reduced_model())
     knowledge, asset = prepare_knowledge(scenario, source, 0), source.open()
     truths = [knowledge.truth(seed) for seed in range(TWINS)]
-    turns = TWINS * scenario.mission.steps
+    steps = TWINS * scenario.mission.steps
     fly_one_by_one(knowledge, truths[:1], lambda *_: asset)  # compiles
     flown = fly_side_by_side(knowledge, truths, [asset] * TWINS)
-    together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / turns
+    together = cpu_seconds(lambda: fly_side_by_side(knowledge, truths, [asset] * TWINS)) / steps
     alone = cpu_seconds(lambda: fly_one_by_one(knowledge, truths[:ALONE], lambda *_: asset))
     alone /= ALONE * scenario.mission.steps
-    seen = flown.row, flown.control_index
+    observations = flown.row, flown.control_index
     sensors = knowledge.sensor_model
-    likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *seen)) / turns
+    likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *observations)) / steps
     worsening = Worsening.of(scenario)
-    scaled = scaled_likelihood(sensors, *seen)[0]
+    scaled = scaled_likelihood(sensors, *observations)[0]
     points = np.full((POINTS, 2), 0.1)
     transition_evidence(worsening, points[:1], scaled[:1], flown.control_index[:1])
     learning = cpu_seconds(
@@ -52,29 +52,29 @@ def run() -> list[Measurement]:
         fly_fleet(ensemble(quiet, range(1)), folder / "start")
         start = cpu_seconds(lambda: fly_fleet(ensemble(quiet, range(1)), folder / "one"))
         fleet = ensemble(quiet, range(4 * TWINS))
-        whole = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
+        stored_seconds = cpu_seconds(lambda: fly_fleet(fleet, folder / "many")) - start
     to_ten_thousand = 10_000 / (4 * TWINS)
     return [
         Measurement(
-            "turn of a twin, side by side", 1e6 * together, "us", None, "alone", 1e6 * alone
+            "step of a twin, side by side", 1e6 * together, "us", None, "alone", 1e6 * alone
         ),
         Measurement(
-            "likelihood of a turn in it", 1e6 * likelihood, "us", None, "all", 1e6 * together
+            "likelihood of a step in it", 1e6 * likelihood, "us", None, "all", 1e6 * together
         ),
         Measurement(
             "10,000 twins stored, beside start-up (from 1,024)",
-            to_ten_thousand * whole,
+            to_ten_thousand * stored_seconds,
             "s",
             8.0,
             "likelihoods alone",
             likelihood * 500_000,
         ),
         Measurement(
-            "evidence of a turn at a point of a grid",
-            1e6 * learning / (turns * POINTS),
+            "evidence of a step at a point of a grid",
+            1e6 * learning / (steps * POINTS),
             "us",
             None,
-            "likelihood of a turn",
+            "likelihood of a step",
             1e6 * likelihood,
         ),
     ]

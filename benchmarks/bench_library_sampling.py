@@ -59,7 +59,7 @@ def run() -> list[Measurement]:
     Beside the wall clock stands what the processor time of the processes says: the speed-up on two
     processors that nobody else uses.
     """
-    found = []
+    measurements = []
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         for name, grid in (
@@ -72,15 +72,15 @@ def run() -> list[Measurement]:
             contents = set()
             for turn in range(REPEATS):
                 for workers in (1, 2):
-                    begin, own = _children(), time.process_time()
+                    begin, own_begin = _children(), time.process_time()
                     out = Path(folder) / f"{name}-{turn}-{workers}.nc"
                     wall[workers].append(sample_library(grid, out, workers=workers).seconds)
-                    spent = (_children() - begin) / workers + time.process_time() - own
+                    spent = (_children() - begin) / workers + time.process_time() - own_begin
                     free[workers].append(spent)
                     contents.add(out.read_bytes())
             assert len(contents) == 1
             label = f"{name}, {grid.size} points"
-            found += [
+            measurements += [
                 Measurement(
                     f"{label}: speed-up by a second process",
                     min(wall[1]) / min(wall[2]),
@@ -94,7 +94,7 @@ def run() -> list[Measurement]:
                     f"{label}: two processes, per point", 1e6 * min(wall[2]) / grid.size, "us"
                 ),
             ]
-    return found
+    return measurements
 
 
 def _children() -> float:

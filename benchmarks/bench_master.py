@@ -50,7 +50,7 @@ def run() -> list[Measurement]:
             "in process": lambda: _simulation(wing, binding, isolated=False),
             "worker": lambda: _simulation(wing, binding, isolated=True),
         }
-        whole = least_seconds(simulations, repeats=12, inner=1)
+        simulation_seconds = least_seconds(simulations, repeats=12, inner=1)
         opened = {
             kind: stack.enter_context(FmiAsset(wing, binding, isolated=kind == "worker"))
             for kind in ("in process", "worker")
@@ -96,14 +96,14 @@ def run() -> list[Measurement]:
         ),
         Measurement(
             f"simulate, {STEPS} steps, times faster than fmpy",
-            whole["fmpy"] / whole["in process"],
+            simulation_seconds["fmpy"] / simulation_seconds["in process"],
             "x",
             2.0,
             larger_is_better=True,
         ),
         Measurement(
             "the same, through the worker",
-            whole["fmpy"] / whole["worker"],
+            simulation_seconds["fmpy"] / simulation_seconds["worker"],
             "x",
             larger_is_better=True,
         ),

@@ -107,46 +107,58 @@ def _calculix_seconds(program: str) -> float:
 
 def run() -> list[Measurement]:
     """Measure factorisation and solution, and what they are compared with."""
-    found: dict[str, float] = json.loads(_run(_SOLVE, str(REFINEMENT), str(REPEATS)))
-    size = f"{int(found['unknowns']):,} unknowns"
+    figures: dict[str, float] = json.loads(_run(_SOLVE, str(REFINEMENT), str(REPEATS)))
+    size = f"{int(figures['unknowns']):,} unknowns"
     measured = [
         Measurement(
             f"factorisation and solution, {size}",
-            found["first"],
+            figures["first"],
             "s",
             2.0,
             "SuperLU",
-            found["superlu"],
+            figures["superlu"],
         ),
         Measurement(
-            "the same, a pattern met before", found["again"], "s", 2.0, "SuperLU", found["superlu"]
+            "the same, a pattern met before",
+            figures["again"],
+            "s",
+            2.0,
+            "SuperLU",
+            figures["superlu"],
         ),
-        Measurement("its backward error", found["backward_error"], "1", 1e-12),
-        Measurement("its difference to SuperLU, of the largest", found["difference"], "1"),
+        Measurement("its backward error", figures["backward_error"], "1", 1e-12),
+        Measurement("its difference to SuperLU, of the largest", figures["difference"], "1"),
         Measurement(
             "its peak memory, with the operators",
-            found["peak"],
+            figures["peak"],
             "MB",
             None,
             "operators",
-            found["before"],
+            figures["before"],
         ),
-        Measurement("mesh and assembly of all operators", found["assembly"], "s"),
+        Measurement("mesh and assembly of all operators", figures["assembly"], "s"),
     ]
     program = calculix_program()
     if program is None:
         print("the solver beside CalculiX: left out, CalculiX (ccx) is not installed")
         return measured
     seconds = _calculix_seconds(program)
-    whole = found["assembly"] + found["first"]
+    assembly_and_solution = figures["assembly"] + figures["first"]
     return [
         *measured,
         Measurement(
             "CalculiX's run over factorisation and solution",
-            seconds / found["first"],
+            seconds / figures["first"],
             "x",
             3.0,
             larger_is_better=True,
         ),
-        Measurement("CalculiX's run", seconds, "s", None, "with mesh and assembly, ours", whole),
+        Measurement(
+            "CalculiX's run",
+            seconds,
+            "s",
+            None,
+            "with mesh and assembly, ours",
+            assembly_and_solution,
+        ),
     ]

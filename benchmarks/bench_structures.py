@@ -138,15 +138,17 @@ def _measured(divisions: tuple[int, int, int], *, superlu: bool) -> dict[str, fl
         done = subprocess.run(
             command, stdout=subprocess.PIPE, text=True, check=True, env=one_thread
         )
-        found: dict[str, float] = json.loads(done.stdout)
+        figures: dict[str, float] = json.loads(done.stdout)
         program = calculix_program()
         if program is not None:
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             command = [program, "-i", "static"]
             subprocess.run(command, cwd=folder, env=one_thread, capture_output=True, check=True)
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            found["calculix"] = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
-    return found
+            figures["calculix"] = (
+                after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+            )
+    return figures
 
 
 def run() -> list[Measurement]:
@@ -155,28 +157,33 @@ def run() -> list[Measurement]:
     if os.environ.get("UAV_TWIN_BENCH_LARGE"):
         sizes.append(_measured(LARGE, superlu=False))
     rows = []
-    for found in sizes:
-        size = f"{int(found['unknowns']):,} unknowns"
-        whole = found["assembly"] + found["solution"]
+    for figures in sizes:
+        size = f"{int(figures['unknowns']):,} unknowns"
+        assembly_and_solution = figures["assembly"] + figures["solution"]
         rows += [
-            Measurement(f"structure: mesh and assembly, {size}", found["assembly"], "s"),
+            Measurement(f"structure: mesh and assembly, {size}", figures["assembly"], "s"),
             Measurement(
                 f"structure: factorisation and solution, {size}",
-                found["solution"],
+                figures["solution"],
                 "s",
                 None,
-                "SuperLU" if "superlu" in found else "",
-                found.get("superlu"),
+                "SuperLU" if "superlu" in figures else "",
+                figures.get("superlu"),
             ),
-            Measurement(f"structure: reduction, {size}", found["reduction"], "s"),
-            Measurement(f"structure: its certified bound, {size}", found["bound"], "1", 6e-4),
-            Measurement(f"structure: peak memory of all that, {size}", found["memory"], "GiB"),
+            Measurement(f"structure: reduction, {size}", figures["reduction"], "s"),
+            Measurement(f"structure: its certified bound, {size}", figures["bound"], "1", 6e-4),
+            Measurement(f"structure: peak memory of all that, {size}", figures["memory"], "GiB"),
         ]
-        if "calculix" in found:
+        if "calculix" in figures:
             name = f"structure: CalculiX's run with two loads, {size}"
             rows.append(
                 Measurement(
-                    name, found["calculix"], "s", None, "assembly, factors, one load", whole
+                    name,
+                    figures["calculix"],
+                    "s",
+                    None,
+                    "assembly, factors, one load",
+                    assembly_and_solution,
                 )
             )
     first, second = sizes[:2]

@@ -134,8 +134,8 @@ def many_states() -> list[Measurement]:
     sensors = GaussianSensorModel(np.stack([2.0 * strain, 3.0 * strain], axis=1)[None], 125e-6)
     control = np.where(np.arange(STEPS) < 30, 1, 0)
     truth = model.states.index((0.2, 0.0, 0.4, 0.0, 0.0, 0.2))
-    seen = sensors.mean[truth, control] + 150e-6 * rng.normal(size=(STEPS, 24))
-    rows = sensors.log_likelihood_sequence(seen, control)
+    observations = sensors.mean[truth, control] + 150e-6 * rng.normal(size=(STEPS, 24))
+    rows = sensors.log_likelihood_sequence(observations, control)
     history = filter_sequence(model, control, rows)
 
     def step() -> None:
@@ -144,7 +144,7 @@ def many_states() -> list[Measurement]:
         )
 
     def likelihood() -> None:
-        sensors.log_likelihood(seen[-1], int(control[-1]))
+        sensors.log_likelihood(observations[-1], int(control[-1]))
 
     def mission() -> None:
         smooth(model, control, filter_sequence(model, control, rows).log_filtered)
@@ -206,18 +206,20 @@ def run() -> list[Measurement]:
         predict(model, filtered.filtered[-1], int(control[-1]), plan.policy, HORIZON)
 
     many_controls = np.tile(control, (TWINS, 1))
-    many = np.stack([sensors.log_likelihood_sequence(seen, control) for seen in observations])
+    many = np.stack(
+        [sensors.log_likelihood_sequence(observation, control) for observation in observations]
+    )
 
     def one_by_one() -> None:
         for likelihood in many:
             smooth(model, control, filter_sequence(model, control, likelihood).log_filtered)
 
-    known = known_control(history.filtered, control, 2)
+    known_controls = known_control(history.filtered, control, 2)
     ahead = [
         predict(model, b, int(u), plan.policy, HORIZON).joint
         for b, u in zip(history.filtered, control, strict=True)
     ]
-    beliefs = np.concatenate([known[:, None], np.stack(ahead)], axis=1)
+    beliefs = np.concatenate([known_controls[:, None], np.stack(ahead)], axis=1)
 
     def quantities() -> None:
         sensors.moments(beliefs)
@@ -227,11 +229,11 @@ def run() -> list[Measurement]:
     np.testing.assert_allclose(last, history.filtered[-1], rtol=1e-9, atol=1e-12)
     per_twin = "pgmpy variable elimination"
     online = median_seconds(online_step, repeats=25, inner=20)
-    whole = median_seconds(whole_history, repeats=25, inner=20)
+    history_seconds = median_seconds(whole_history, repeats=25, inner=20)
 
     def side_by_side() -> None:
-        found, _ = filter_many(model.transition, many_controls, many, model.log_prior)
-        smooth_many(model.transition, many_controls, found.filtered, found.log_filtered)
+        beliefs, _ = filter_many(model.transition, many_controls, many, model.log_prior)
+        smooth_many(model.transition, many_controls, beliefs.filtered, beliefs.log_filtered)
 
     batch = median_seconds(side_by_side, repeats=9)
     single = median_seconds(one_by_one, repeats=3)
@@ -241,7 +243,12 @@ def run() -> list[Measurement]:
     return [
         Measurement("online step at step 50", 1e3 * online, "ms", 1.0, per_twin, 1e3 * elimination),
         Measurement(
-            "smooth and predict 50 steps", 1e3 * whole, "ms", 0.5, per_twin, 1e3 * elimination
+            "smooth and predict 50 steps",
+            1e3 * history_seconds,
+            "ms",
+            0.5,
+            per_twin,
+            1e3 * elimination,
         ),
         Measurement(
             "smooth 1,000 twins of 50 steps", 1e3 * batch, "ms", 60.0, "one by one", 1e3 * single

@@ -1,4 +1,4 @@
-"""A watch that is taken up after few turns and after 20,000, up to its next decision."""
+"""A watch that is taken up after few steps and after 20,000, up to its next decision."""
 
 import os
 import subprocess
@@ -18,7 +18,7 @@ from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
 from twin_master.watch.opening import begun_watch, resumed_watch
 
-TURNS = 20_000
+STEPS = 20_000
 REPETITIONS = 7
 SCENARIO = "level_turns"
 
@@ -27,7 +27,7 @@ class _Told(Exception):  # noqa: N818 - ends a watch behind its first decision
     pass
 
 
-def record(watch: Watch, path: Path, turns: int) -> None:
+def record(watch: Watch, path: Path, steps: int) -> None:
     """Write what a sound wing shows, with noise."""
     scenario = watch.scenario
     values = watch.models[0].knowledge.sensor_model.value_per_draw[:, 0, 1].mean(axis=0)
@@ -35,12 +35,12 @@ def record(watch: Watch, path: Path, turns: int) -> None:
     count = scenario.observation.count
     with path.open("w") as file:
         file.write(
-            "turn,control," + ",".join(f"strain_{number + 1}" for number in range(count)) + "\n"
+            "step,control," + ",".join(f"strain_{number + 1}" for number in range(count)) + "\n"
         )
-        for turn in range(turns):
+        for step in range(steps):
             row = values + rng.normal(0.0, 1.2e-4, count)
             file.write(
-                f"{turn},{scenario.control_names[1]}," + ",".join(map(repr, row.tolist())) + "\n"
+                f"{step},{scenario.control_names[1]}," + ",".join(map(repr, row.tolist())) + "\n"
             )
 
 
@@ -72,32 +72,32 @@ def in_a_process(folder: Path, log: Path) -> list[float]:
 
 
 def run() -> list[Measurement]:
-    """Measure after one turn, after as many as are filtered again, and after years."""
+    """Measure after one step, after as many as are filtered again, and after years."""
     with tempfile.TemporaryDirectory() as name:
         place = Path(name)
         seconds = {}
         log = place / "log.csv"
-        for turns in (1, 99, TURNS + 19):  # 32 turns between two lines with all that is needed
-            folder = place / str(turns)
+        for steps in (1, 99, STEPS + 19):  # 32 steps between two lines with all that is needed
+            folder = place / str(steps)
             loaded = load_scenario(SCENARIO)
             with begun_watch(loaded.scenario, loaded.file, folder, SilentProgress()) as watch:
                 if not log.exists():
-                    record(watch, log, TURNS + 20)
-                watch.run(file_feed(log, watch.scenario), lambda _decision: None, turns=turns)
-            seconds[turns] = np.median(
+                    record(watch, log, STEPS + 20)
+                watch.run(file_feed(log, watch.scenario), lambda _decision: None, steps=steps)
+            seconds[steps] = np.median(
                 [in_a_process(folder, log) for _ in range(REPETITIONS)], axis=0
             )
     return [
         Measurement(
-            f"a watch taken up after {TURNS + 19} turns{what}",
-            float(seconds[TURNS + 19][kind]),
+            f"a watch taken up after {STEPS + 19} steps{suffix}",
+            float(seconds[STEPS + 19][kind]),
             "s",
             None,
-            f"after {turns}",
-            float(seconds[turns][kind]),
+            f"after {steps}",
+            float(seconds[steps][kind]),
         )
-        for turns in (1, 99)
-        for kind, what in ((0, ", all of its process"), (2, ", what depends on the journal"))
+        for steps in (1, 99)
+        for kind, suffix in ((0, ", all of its process"), (2, ", what depends on the journal"))
     ]
 
 

@@ -46,16 +46,20 @@ def model_of(folder: Path) -> Model:
 def name_case(folder: Path, left_out: dict[str, list[str]]) -> dict[str, Any]:
     """Return the verdict on one campaign as the scoring wants it."""
     started = time.perf_counter()
-    effects = [item for item in library() if item.identifier not in left_out.get(folder.name, [])]
+    effects = [
+        effect for effect in library() if effect.identifier not in left_out.get(folder.name, [])
+    ]
     try:
-        found = investigate(read_campaign(folder), model_of(folder), effects, thorough=False)
+        investigation = investigate(
+            read_campaign(folder), model_of(folder), effects, thorough=False
+        )
     except DiscrepancyError as error:
         return {
             "kind": "data error",
             "sentence": str(error),
             "seconds": time.perf_counter() - started,
         }
-    row = verdict_row(found)
+    row = verdict_row(investigation)
     row["seconds"] = time.perf_counter() - started
     return row
 
@@ -119,25 +123,26 @@ def estimates(found: Investigation) -> dict[str, list[float]]:
 def at_unit(patch: ModelPatch) -> ModelPatch:
     """Return a patch whose power laws have coefficients at unit speed and displacement."""
     primitives = []
-    for item in patch:
-        if isinstance(item, PowerDamping):
+    for primitive in patch:
+        if isinstance(primitive, PowerDamping):
             scale = (
-                item.reference_velocity**item.velocity_exponent
-                * item.reference_displacement**item.displacement_exponent
+                primitive.reference_velocity**primitive.velocity_exponent
+                * primitive.reference_displacement**primitive.displacement_exponent
             )
-            item = replace(
-                item,
-                coefficient=item.coefficient / scale,
+            primitive = replace(
+                primitive,
+                coefficient=primitive.coefficient / scale,
                 reference_velocity=1.0,
                 reference_displacement=1.0,
             )
-        elif isinstance(item, PowerStiffness):
-            item = replace(
-                item,
-                coefficient=item.coefficient / item.reference_displacement**item.exponent,
+        elif isinstance(primitive, PowerStiffness):
+            primitive = replace(
+                primitive,
+                coefficient=primitive.coefficient
+                / primitive.reference_displacement**primitive.exponent,
                 reference_displacement=1.0,
             )
-        primitives.append(item)
+        primitives.append(primitive)
     return ModelPatch(tuple(primitives))
 
 

@@ -60,13 +60,13 @@ class Tab:
             self._note(message)
 
     def _note(self, message: dict[str, Any]) -> None:
-        given = message.get("params", {})
+        parameters = message.get("params", {})
         if message["method"] == "Runtime.exceptionThrown":
-            self.errors.append(json.dumps(given["exceptionDetails"])[:2000])
-        elif message["method"] == "Log.entryAdded" and given["entry"]["level"] == "error":
-            self.errors.append(given["entry"]["text"])
+            self.errors.append(json.dumps(parameters["exceptionDetails"])[:2000])
+        elif message["method"] == "Log.entryAdded" and parameters["entry"]["level"] == "error":
+            self.errors.append(parameters["entry"]["text"])
         elif message["method"] == "Network.requestWillBeSent":
-            self.requests.append(given["request"]["url"])
+            self.requests.append(parameters["request"]["url"])
 
     def go(self, address: str, width: int = 1300, height: int = 1500) -> None:
         """Open an address in a window of a size."""
@@ -85,11 +85,11 @@ class Tab:
 
     def value(self, expression: str) -> Any:
         """Return the value of a JavaScript expression; promises are awaited."""
-        found = self.send(
+        answer = self.send(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
-        assert "exceptionDetails" not in found, found
-        return found["result"].get("value")
+        assert "exceptionDetails" not in answer, answer
+        return answer["result"].get("value")
 
     def wait(self, condition: str) -> None:
         """Wait until a JavaScript expression is true."""

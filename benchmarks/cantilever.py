@@ -106,19 +106,20 @@ def _system(modulus: float, structural: ModelPatch) -> LinearSystem:
     extra = np.zeros((SIZE, SIZE))
     compliance = 1.0 / ROOT_STIFFNESS
     ends = np.arange(ELEMENTS) * STEP
-    for item in structural:
-        if isinstance(item, LocalStiffnessLoss):
+    for primitive in structural:
+        if isinstance(primitive, LocalStiffnessLoss):
             inner = np.clip(
-                np.minimum(ends + STEP, item.start + item.length) - np.maximum(ends, item.start),
+                np.minimum(ends + STEP, primitive.start + primitive.length)
+                - np.maximum(ends, primitive.start),
                 0,
                 None,
             )
-            loss += item.loss * inner / STEP
-        elif isinstance(item, PointMass):
-            row = displacement_row(item.station)
-            extra += item.mass * np.outer(row, row)
-        elif isinstance(item, RootCompliance):
-            compliance += item.compliance
+            loss += primitive.loss * inner / STEP
+        elif isinstance(primitive, PointMass):
+            row = displacement_row(primitive.station)
+            extra += primitive.mass * np.outer(row, row)
+        elif isinstance(primitive, RootCompliance):
+            compliance += primitive.compliance
     stiffness = np.zeros((SIZE, SIZE))
     h = STEP
     k = (
@@ -228,23 +229,25 @@ def _motion(
 ) -> tuple[FloatArray, FloatArray | None, FloatArray]:
     """Return values and rates (N, C) of rows (C, n), and the torque (N,) of the load."""
     structural = patch.of(PointMass, RootCompliance, LocalStiffnessLoss)
-    softening = sum(item.coefficient for item in patch if isinstance(item, ModulusTemperature))
+    softening = sum(
+        primitive.coefficient for primitive in patch if isinstance(primitive, ModulusTemperature)
+    )
     modulus = float(conditions.parameters[0]) * (1.0 - softening * trial.temperature)
     place = LOAD_STATION if isinstance(trial.load_place, str) else trial.load_place[0]
     gain = 1.0
     tare = 0.0
-    behind = 0.05
+    chord_offset = 0.05
     washout = np.zeros(len(POINTS))
     relief = 0.0
-    for item in patch:
-        if isinstance(item, LoadPlace):
-            place, behind = place + item.along_span, behind + item.along_chord
-        elif isinstance(item, LoadGain):
-            gain, tare = gain * (1.0 + item.gain), tare + item.tare
-        elif isinstance(item, Washout):
-            washout = washout + item.coefficient * (POINTS / LENGTH) ** item.exponent
-        elif isinstance(item, InertiaRelief):
-            relief += item.fraction
+    for primitive in patch:
+        if isinstance(primitive, LoadPlace):
+            place, chord_offset = place + primitive.along_span, chord_offset + primitive.along_chord
+        elif isinstance(primitive, LoadGain):
+            gain, tare = gain * (1.0 + primitive.gain), tare + primitive.tare
+        elif isinstance(primitive, Washout):
+            washout = washout + primitive.coefficient * (POINTS / LENGTH) ** primitive.exponent
+        elif isinstance(primitive, InertiaRelief):
+            relief += primitive.fraction
     row = displacement_row(min(place, LENGTH))
     force = np.where(trial.force != 0.0, gain * trial.force + tare, 0.0)
     laws = port_laws(patch.of(*INTERNAL_FORCES), PORTS)
@@ -259,7 +262,7 @@ def _motion(
             excitation = replace(excitation, loads=[Load(row, history)])
         motion = motion_of(system, excitation, laws, conditions.refinement)
         response = motion.response([OutputEquation.of_row(row) for row in rows])
-        return response.values, response.rates, behind * force
+        return response.values, response.rates, chord_offset * force
     loads = np.outer(force, row)
     for n in range(len(force)):
         factor = trial.load_factor[n]
@@ -273,7 +276,7 @@ def _motion(
         values[chosen] = (
             _system(float(level), structural).static_path(loads, laws).values @ rows.T
         )[chosen]
-    return values, None, behind * force
+    return values, None, chord_offset * force
 
 
 def channel_list() -> dict[str, Channel]:

@@ -25,19 +25,22 @@ def usage(name: str, command: Any) -> Iterator[str]:
     """Yield the usage of a command, or of all commands of a group, one text each."""
     inner = getattr(command, "commands", {})
     if not inner or command.invoke_without_command:
-        words = [f"uav-twin{name}", *(word for item in command.params if (word := _shown(item)))]
+        words = [
+            f"uav-twin{name}",
+            *(word for parameter in command.params if (word := _shown(parameter))),
+        ]
         unbroken = " ".join(word.replace(" ", "\N{NO-BREAK SPACE}") for word in words[1:])
         text = f"{words[0]} {unbroken}".rstrip()
         yield fill(
             text, WIDTH, subsequent_indent=" " * 9, break_long_words=False, break_on_hyphens=False
         ).replace("\N{NO-BREAK SPACE}", " ")
-    for own_name, own in inner.items():
-        yield from usage(f"{name} {own_name}", own)
+    for own_name, subcommand in inner.items():
+        yield from usage(f"{name} {own_name}", subcommand)
 
 
 def _shown(item: Any) -> str:
     """Return an argument or option as it is written; an optional one stands in brackets."""
-    if item.name in EVERYWHERE:
+    if item.name in EVERYWHERE or getattr(item, "hidden", False):  # a former name of an option
         return ""
     if item.param_type_name == "argument":
         text = (item.metavar or item.name.upper()).strip("[]")

@@ -35,7 +35,7 @@ def range_of(prior: Prior) -> str:
 def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
     """Return the page of an effect."""
     tank = effect.identifier in FLOWS
-    what = "Tank" if tank else "Cantilever"
+    structure = "Tank" if tank else "Cantilever"
     _, place = picture_patch(effect, setting)
     values = picture_of(effect).values
     rows = []
@@ -47,7 +47,7 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         f"in the family {range_of(s.prior)}."
         for s in effect.shape
     ]
-    shown = ", ".join(f"{name} {value:g}" for name, value in values.items())
+    parameters = ", ".join(f"{name} {value:g}" for name, value in values.items())
     lines = [
         f"# {effect.name[0].upper()}{effect.name[1:]}",
         "",
@@ -65,10 +65,13 @@ def page(effect: Effect, text: Mapping[str, Any], setting: Setting) -> str:
         *([text["unit"], ""] if text["unit"] else []),
         f"![{effect.identifier}](images/{effect.identifier}.png)",
         "",
-        f"{what}: {shown}" + (f", place `{place}`." if place else "."),
+        f"{structure}: {parameters}" + (f", place `{place}`." if place else "."),
         "",
         "## Confused with",
-        *(f"- [`{other}`]({other}.md): {text['tell'][other]}" for other in effect.confusable),
+        *(
+            f"- [`{confused}`]({confused}.md): {text['tell'][confused]}"
+            for confused in effect.confusable
+        ),
         "",
         f"Sources: {'; '.join(source.rstrip('.') for source in text['references'])}.",
         "",
@@ -95,7 +98,7 @@ def readme() -> str:
 def pages() -> dict[str, str]:
     """Return every page by its file name."""
     texts, beam = paragraphs(), picture_setting()
-    made = {
+    texts_by_page = {
         f"{effect.identifier}.md": page(
             effect,
             texts[effect.identifier],
@@ -103,7 +106,7 @@ def pages() -> dict[str, str]:
         )
         for effect in library()
     }
-    return {"README.md": readme(), **made}
+    return {"README.md": readme(), **texts_by_page}
 
 
 def main() -> None:

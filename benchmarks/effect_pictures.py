@@ -45,14 +45,14 @@ class View:
         """Return what a channel shows with the effect [unit of the picture]."""
         column = trial.channels.index(channel)
         factor, _ = self.unit(channel)
-        shown = observe(
+        response = observe(
             self.setting.model,
             self.setting.campaign,
             trial,
             self.patch if patch is None else patch,
             Conditions(np.ones(1)),
         )
-        return factor * shown.values[:, column]
+        return factor * response.values[:, column]
 
     def unit(self, channel: str) -> tuple[float, str]:
         """Return factor and unit of a channel in a picture."""
@@ -88,14 +88,18 @@ def cycles(
     time: FloatArray, values: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return middle time, amplitude, frequency and damping ratio of each cycle of a ring-down."""
-    at = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
-    crossing = time[at] - values[at] * (time[at + 1] - time[at]) / (values[at + 1] - values[at])
+    crossings = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
+    crossing = time[crossings] - values[crossings] * (time[crossings + 1] - time[crossings]) / (
+        values[crossings + 1] - values[crossings]
+    )
     half = [0.5 * np.ptp(values[(time >= a) & (time <= b)]) for a, b in pairwise(crossing)]
     amplitude = np.array(half)
     frequency = 1.0 / np.diff(crossing)
-    far = 2  # cycles on either side, for the damping ratio
+    cycles_aside = 2  # cycles on either side, for the damping ratio
     ratio = np.full(len(amplitude), np.nan)
-    ratio[far:-far] = np.log(amplitude[: -2 * far] / amplitude[2 * far :]) / (4.0 * far * np.pi)
+    ratio[cycles_aside:-cycles_aside] = np.log(
+        amplitude[: -2 * cycles_aside] / amplitude[2 * cycles_aside :]
+    ) / (4.0 * cycles_aside * np.pi)
     return 0.5 * (crossing[1:] + crossing[:-1]), amplitude, frequency, ratio
 
 
@@ -378,8 +382,8 @@ def picture_setting(effect: Effect | None = None) -> Setting:
     """Return the setting of a picture: the cantilever, or for flows a tank."""
     if effect is not None and effect.identifier in FLOWS:
         return tank_setting()
-    given, model = campaign(), Cantilever()
-    return Setting(given, model, model.scales(given))
+    cantilever_campaign, model = campaign(), Cantilever()
+    return Setting(cantilever_campaign, model, model.scales(cantilever_campaign))
 
 
 def picture_patch(effect: Effect, setting: Setting) -> tuple[ModelPatch, str]:

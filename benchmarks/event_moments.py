@@ -67,8 +67,10 @@ def record(
 
 def found_in(time: FloatArray, values: FloatArray) -> Events:
     """Return the events of a record."""
-    one, _ = pattern_of_residuals("record", time, values[:, None], np.ones((len(values), 1), bool))
-    return events(one.view, 0, one.processes[0])
+    force, _ = pattern_of_residuals(
+        "record", time, values[:, None], np.ones((len(values), 1), bool)
+    )
+    return events(force.view, 0, force.processes[0])
 
 
 def main() -> None:
@@ -81,23 +83,23 @@ def main() -> None:
     began = clock.perf_counter()
     print(f"{'event':16s} {'within 1 %':>10s} {'90 % holds':>10s} {'missed':>7s} {'others':>7s}")
     for kind in KINDS:
-        found: dict[str, int] = defaultdict(int)
+        counts: dict[str, int] = defaultdict(int)
         for _ in range(arguments.count):
             time, values, truth = record(generator, kind)
             moments = found_in(time, values).moments(0)
             for true in truth:
-                found["moments"] += 1
+                counts["moments"] += 1
                 if not len(moments):
-                    found["missed"] += 1
+                    counts["missed"] += 1
                     continue
                 value, low, high = min(moments, key=lambda item: abs(item[0] - true))
-                found["close"] += abs(value - true) <= 0.01 * (time[-1] - time[0])
-                found["held"] += low <= true <= high
-            found["others"] += max(0, len(moments) - len(truth))
-        total = found["moments"]
+                counts["close"] += abs(value - true) <= 0.01 * (time[-1] - time[0])
+                counts["held"] += low <= true <= high
+            counts["others"] += max(0, len(moments) - len(truth))
+        total = counts["moments"]
         print(
-            f"{kind:16s} {found['close'] / total:10.1%} {found['held'] / total:10.1%} "
-            f"{found['missed']:7d} {found['others']:7d}  of {total} moments"
+            f"{kind:16s} {counts['close'] / total:10.1%} {counts['held'] / total:10.1%} "
+            f"{counts['missed']:7d} {counts['others']:7d}  of {total} moments"
         )
     false = 0
     for _ in range(2 * arguments.count):

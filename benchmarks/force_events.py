@@ -12,7 +12,7 @@ import argparse
 import shutil
 import time as clock
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,120 +41,264 @@ NOISES = (0.3, 1.0, 3.0)
 
 @dataclass(frozen=True)
 class Case:
-    """A campaign's folder, when events begin and end, and how long its record is [s]."""
+    """A campaign on disk, with its true events.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder of the campaign.
+    windows : tuple of (float, float)
+        Begin and end of each event [s].
+    length : float
+        Duration of the record [s].
+    """
 
     folder: Path
     windows: tuple[tuple[float, float], ...]
     length: float
 
 
+@dataclass(frozen=True)
+class EventRig:
+    """A rig for records with events, as in its campaign and model file.
+
+    Attributes
+    ----------
+    model : str
+        Tables of the model file.
+    channels : dict of str to (str, str, float)
+        Quantity, unit and usual noise of each channel.
+    input_quantity, input_unit : str
+        Quantity and unit of the drive.
+    amplitude : float
+        Size of the drive [unit].
+    parameters : dict of str to (str, float)
+        Scaled terms and prior deviation of each parameter.
+    states : int
+        Number of states of its equations.
+    """
+
+    model: str
+    channels: dict[str, tuple[str, str, float]]
+    input_quantity: str
+    input_unit: str
+    amplitude: float
+    parameters: dict[str, tuple[str, float]]
+    states: int
+
+
+RIGS = {
+    "heated": EventRig(
+        model=HEATED,
+        channels={"block": ("temperature", "K", 0.02)},
+        input_quantity="heat",
+        input_unit="W",
+        amplitude=80.0,
+        parameters={"capacity": ("capacity", 0.05), "loss": ("conductance", 0.1)},
+        states=1,
+    ),
+    "tanks": EventRig(
+        model=STORES,
+        channels={"upper": ("level", "m", 1e-3), "lower": ("level", "m", 1e-3)},
+        input_quantity="flow",
+        input_unit="m3/s",
+        amplitude=0.016,
+        parameters={"upper outlet": ("upper outlet", 0.05), "lower outlet": ("lower outlet", 0.05)},
+        states=2,
+    ),
+    "mass": EventRig(
+        model=MASS,
+        channels={"x": ("displacement", "m", 2e-4)},
+        input_quantity="force",
+        input_unit="N",
+        amplitude=12.0,
+        parameters={
+            "mass": ("mass", 0.03),
+            "spring": ("stiffness", 0.03),
+            "damper": ("damping", 0.1),
+        },
+        states=2,
+    ),
+}
+RIG_OF_KIND = {"power": "heated", "leak": "heated", "tank": "tanks"}
+"""Rig of each kind of event; the others act on the mass."""
+
+
+@dataclass(frozen=True)
+class Equations:
+    """True equations of the rigs with an event.
+
+    Attributes
+    ----------
+    kind : str
+        Kind of the event.
+    drive : callable
+        time -> drive of unit size.
+    event : callable
+        time -> size of the event, 0 outside of its windows.
+    constant : float
+        Size of an effect that acts always.
+    factors : (3,) array
+        True parameters over nominal ones.
+    """
+
+    kind: str
+    drive: Callable[[float], float]
+    event: Callable[[float], float]
+    constant: float
+    factors: FloatArray
+
+    def heated(self, t: float, y: FloatArray) -> list[float]:
+        """Return the rate of the temperature of a heated block; events heat or leak."""
+        size = self.event(t)
+        hidden = 60.0 * size if self.kind != "leak" else -1.5 * size * y[0]
+        power = 80.0 * self.drive(t) + hidden - 2.0 * self.factors[1] * y[0]
+        return [power / (400.0 * self.factors[0])]
+
+    def tanks(self, t: float, y: FloatArray) -> list[float]:
+        """Return the rates of the levels of two tanks; events leak from the lower one."""
+        upper_flow = 0.02 * self.factors[0] * y[0]
+        lower_flow = 0.025 * self.factors[1] * y[1]
+        leak = 0.02 * self.event(t) * y[1]
+        return [0.016 * self.drive(t) - upper_flow, upper_flow - lower_flow - leak]
+
+    def mass(self, t: float, y: FloatArray) -> list[float]:
+        """Return velocity and acceleration of a mass; events push, or rub as friction does."""
+        x, v = y
+        hidden = 4.0 * self.event(t) if self.kind == "push" else 0.0
+        if self.kind in ("friction", "always"):
+            size = self.constant if self.kind == "always" else self.event(t)
+            hidden = -1.5 * size * np.tanh(v / 1e-3)
+        spring = 200.0 * self.factors[1] * x
+        damper = 1.2 * self.factors[2] * v
+        force = 12.0 * self.drive(t) + hidden - spring - damper
+        return [v, force / (2.0 * self.factors[0])]
+
+
 def drawn(folder: Path, kind: str, seed: Sequence[int]) -> Case:
-    """Write a campaign of a kind and its model; return what is hidden in it."""
+    """Simulate a record with events of a kind and write its campaign and model.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to write to; replaced if it exists.
+    kind : str
+        One of `KINDS`.
+    seed : sequence of int
+        Seed of the record.
+    """
     generator = np.random.default_rng(seed)
     count = int(generator.choice([300, 600, 1200]))
     noise = float(generator.choice(NOISES))
-    factor = 1.0 + generator.uniform(-0.05, 0.05, 3)
-    slow = kind in ("power", "leak", "tank")
-    step = 5.0 if slow else 0.02
-    length = step * (count - 1)
+    factors = 1.0 + generator.uniform(-0.05, 0.05, 3)
+    is_slow = kind in RIG_OF_KIND
+    interval = 5.0 if is_slow else 0.02
+    length = interval * (count - 1)
+    time = interval * np.arange(count, dtype=np.float64)
+
+    # Events
     windows = []
     for k in range(int(generator.integers(1, 3))):
         begin = length * (0.5 * k + generator.uniform(0.08, 0.3))
         windows.append((begin, begin + length * generator.uniform(0.03, 0.15)))
     if kind in ("always", "nothing"):
         windows = []
-    time = step * np.arange(count, dtype=np.float64)
     sizes = np.exp(generator.uniform(np.log(0.15), np.log(1.0), 2))
-    levels = (
-        generator.uniform(0.3, 1.4, count // 10 + 1)
-        if slow
-        else generator.uniform(-1.0, 1.0, count)
-    )
-    hold = 10 if slow else 5
-    moments = [float(t) for t in time[hold::hold]]
+
+    # Drive: held levels
+    if is_slow:
+        levels = generator.uniform(0.3, 1.4, count // 10 + 1)
+    else:
+        levels = generator.uniform(-1.0, 1.0, count)
+    held_samples = 10 if is_slow else 5
+    moments = [float(t) for t in time[held_samples::held_samples]]
     breaks = sorted({*moments, *(t for window in windows for t in window)})
+
+    # A record without an event has any of the rigs; slow ones take 250 times as long
+    name = RIG_OF_KIND.get(kind, "mass")
+    if kind == "nothing":
+        name = ("heated", "tanks", "mass")[int(generator.integers(3))]
+        if name != "mass":
+            time = 250.0 * time
+            length = 250.0 * length
+            moments = [250.0 * t for t in moments]
+            breaks = moments
 
     def drive(t: float) -> float:
         return float(levels[np.searchsorted(moments, t, "right")])
 
-    def during(t: float) -> float:
-        return float(
-            sum(
-                size for size, (begin, end) in zip(sizes, windows, strict=False) if begin <= t < end
-            )
-        )
+    def event(t: float) -> float:
+        active = [
+            size for size, (begin, end) in zip(sizes, windows, strict=False) if begin <= t < end
+        ]
+        return float(sum(active))
 
-    def heated(t: float, y: FloatArray) -> list[float]:
-        hidden = 60.0 * during(t) if kind != "leak" else -1.5 * during(t) * y[0]
-        return [(80.0 * drive(t) + hidden - 2.0 * factor[1] * y[0]) / (400.0 * factor[0])]
-
-    def tanks(t: float, y: FloatArray) -> list[float]:
-        over = 0.02 * factor[0] * y[0]
-        return [0.016 * drive(t) - over, over - 0.025 * factor[1] * y[1] - 0.02 * during(t) * y[1]]
-
-    def moved(t: float, y: FloatArray) -> list[float]:
-        hidden = 4.0 * during(t) if kind == "push" else 0.0
-        if kind in ("friction", "always"):
-            rubs = sizes[0] if kind == "always" else during(t)
-            hidden = -1.5 * rubs * np.tanh(y[1] / 1e-3)
-        force = 12.0 * drive(t) + hidden - 200.0 * factor[1] * y[0] - 1.2 * factor[2] * y[1]
-        return [y[1], force / (2.0 * factor[0])]
-
-    slope = tanks if kind == "tank" else heated if slow else moved
-    if kind == "nothing":
-        slope = (heated, tanks, moved)[int(generator.integers(3))]
-        if slope is not moved:
-            time = 250.0 * time
-            breaks = [250.0 * t for t in moments]
-            length = 250.0 * length
-            moments = breaks
+    # Motion and readings
+    rig = RIGS[name]
+    equations = Equations(kind, drive, event, sizes[0], factors)
+    slope = {"heated": equations.heated, "tanks": equations.tanks, "mass": equations.mass}[name]
     course = Course(lambda t, order: drive(t), lambda t: 0.0, tuple(breaks))
-    states = solved(slope, [0.0, 0.0][: 1 if slope is heated else 2], course, time)
-    model, channels, unit, size, parameters = {
-        "heated": (
-            HEATED,
-            {"block": ("temperature", "K", 0.02)},
-            "heat W",
-            80.0,
-            {"capacity": ("capacity", 0.05), "loss": ("conductance", 0.1)},
-        ),
-        "tanks": (
-            STORES,
-            {"upper": ("level", "m", 1e-3), "lower": ("level", "m", 1e-3)},
-            "flow m3/s",
-            0.016,
-            {"upper outlet": ("upper outlet", 0.05), "lower outlet": ("lower outlet", 0.05)},
-        ),
-        "moved": (
-            MASS,
-            {"x": ("displacement", "m", 2e-4)},
-            "force N",
-            12.0,
-            {"mass": ("mass", 0.03), "spring": ("stiffness", 0.03), "damper": ("damping", 0.1)},
-        ),
-    }[slope.__name__]
-    deviations = noise * np.array([item[2] for item in channels.values()])
-    names = list(channels)
-    readings = states[:, : len(names)] + deviations * generator.standard_normal((count, len(names)))
+    states = solved(slope, [0.0] * rig.states, course, time)
+    deviations = noise * np.array([deviation for _, _, deviation in rig.channels.values()])
+    channels = len(rig.channels)
+    readings = states[:, :channels] + deviations * generator.standard_normal((count, channels))
+    at_rest = deviations * generator.standard_normal((400, channels))
+    values = rig.amplitude * np.array([drive(float(t)) for t in time])
     shutil.rmtree(folder, ignore_errors=True)
+    write_record(folder, kind, rig, time, values, readings, at_rest)
+    return Case(folder, tuple(windows), length)
+
+
+def write_record(
+    folder: Path,
+    name: str,
+    rig: EventRig,
+    time: FloatArray,
+    drive: FloatArray,
+    readings: FloatArray,
+    at_rest: FloatArray,
+) -> None:
+    """Write a campaign of one record, and its model.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to make.
+    name : str
+        Name of campaign and model.
+    rig : EventRig
+        The rig.
+    time, drive : (n,) array
+        Times [s], and drive [unit].
+    readings : (n, C) array
+        Readings of the channels.
+    at_rest : (m, C) array
+        Readings without motion, from which the noise is known.
+    """
     folder.mkdir(parents=True)
-    rest = deviations * generator.standard_normal((400, len(names)))
-    table(folder / "rest.csv", ["time", *names], np.column_stack((time[1] * np.arange(400), rest)))
-    held = size * np.array([drive(float(t)) for t in time])
-    table(folder / "1.csv", ["time", "drive", *names], np.column_stack((time, held, readings)))
-    text = f'format = 1\nname = "{kind}"\n\n[noise]\nfile = "rest.csv"\n'
-    for name, (quantity, of, _) in channels.items():
-        text += entry("channel", name=name, quantity=quantity, unit=of, output=name)
-    quantity, of = unit.split()
-    text += entry("input", name="drive", quantity=quantity, unit=of, hold="zero_order")
+    names = list(rig.channels)
+    rest_time = time[1] * np.arange(len(at_rest))
+    table(folder / "rest.csv", ["time", *names], np.column_stack((rest_time, at_rest)))
+    table(folder / "1.csv", ["time", "drive", *names], np.column_stack((time, drive, readings)))
+    text = f'format = 1\nname = "{name}"\n\n[noise]\nfile = "rest.csv"\n'
+    for channel, (quantity, unit, _) in rig.channels.items():
+        text += entry("channel", name=channel, quantity=quantity, unit=unit, output=channel)
+    text += entry(
+        "input",
+        name="drive",
+        quantity=rig.input_quantity,
+        unit=rig.input_unit,
+        hold="zero_order",
+    )
     text += entry("trial", name="record", kind="driven", file="1.csv", begins="still")
     (folder / "campaign.toml").write_text(text, "utf-8")
-    known = "".join(
-        entry("parameter", name=name, terms=terms, deviation=deviation, low=0.4, high=2.5)
-        for name, (terms, deviation) in parameters.items()
+    parameters = "".join(
+        entry("parameter", name=parameter, terms=terms, deviation=deviation, low=0.4, high=2.5)
+        for parameter, (terms, deviation) in rig.parameters.items()
     )
-    (folder / "model.toml").write_text(f'format = 1\nname = "{kind}"\n{model}{known}', "utf-8")
-    return Case(folder, tuple(windows), length)
+    (folder / "model.toml").write_text(
+        f'format = 1\nname = "{name}"\n{rig.model}{parameters}', "utf-8"
+    )
 
 
 def problem_of(case: Case) -> Problem:
@@ -167,9 +311,9 @@ def problem_of(case: Case) -> Problem:
 def found_in(case: Case) -> FloatArray:
     """Return medians and ends of the 90 % intervals (C, 3) of all changes of a record [s]."""
     search = ForceSearch(problem_of(case))
-    one = search.rough(max(search.at, key=lambda name: search.at[name].log_evidence))
-    ((port, process),) = one.processes.items()
-    return events(one.view, port, process).moments(0)
+    force = search.rough(max(search.at, key=lambda name: search.at[name].log_evidence))
+    ((port, process),) = force.processes.items()
+    return events(force.view, port, process).moments(0)
 
 
 def counted(case: Case, found: FloatArray) -> Counter[str]:

@@ -36,7 +36,7 @@ def report(found: Investigation, table: Table, label: str) -> None:
     scores = (
         []
         if proof is None
-        else [item for item in (proof.held_out_before, proof.held_out_after) if item]
+        else [errors for errors in (proof.held_out_before, proof.held_out_after) if errors]
     )
     rms = " to ".join(f"{1e3 * score.rms[SIGNAL]:.3f}" for score in scores if SIGNAL in score.rms)
     chi = " to ".join(f"{score.chi_square_per_sample:.2f}" for score in scores)
@@ -49,33 +49,36 @@ def alone(runs: Sequence[Investigation], begins: Sequence[float]) -> Table:
         "one effect alone", *(f"ln evidence from {begin:g} s" for begin in begins), "left, uV"
     )
     rows: dict[str, list[str]] = {}
-    left: dict[str, str] = {}
-    for number, found in enumerate(runs):
-        if found.search is None or found.problem is None:
+    unexplained: dict[str, str] = {}
+    for number, investigation in enumerate(runs):
+        if investigation.search is None or investigation.problem is None:
             continue
         best: dict[str, CandidateFit] = {}
-        for item in found.search.compared_fits().values():  # of all places the most probable
-            label = " ".join(item.candidate.identifiers) or "none"
-            if len(item.candidate.terms) < 2 and (
-                label not in best or found.search.score(best[label]) < found.search.score(item)
+        for fit in investigation.search.compared_fits().values():  # of all places the most probable
+            label = " ".join(fit.candidate.identifiers) or "none"
+            if len(fit.candidate.terms) < 2 and (
+                label not in best
+                or investigation.search.score(best[label]) < investigation.search.score(fit)
             ):
-                best[label] = item
-        for label, item in best.items():
-            shape = [u for part in named_effects(found.problem, item) for u in part.shape]
-            place = "".join(f" {term.place}" for term in item.candidate.terms)
+                best[label] = fit
+        for label, fit in best.items():
+            shape = [u for part in named_effects(investigation.problem, fit) for u in part.shape]
+            place = "".join(f" {term.place}" for term in fit.candidate.terms)
             cells = rows.setdefault(label, [""] * len(runs))
-            cells[number] = f"{item.log_evidence:.1f}{place}" + "".join(
+            cells[number] = f"{fit.log_evidence:.1f}{place}" + "".join(
                 f" ({u.name} {u.value:.2f})" for u in shape
             )
             if number == 0:
-                rest = [
+                residuals = [
                     1e6 * data.deviation[0] * float(np.sqrt((residual[:, 0] ** 2).mean()))
-                    for data, residual in zip(found.problem.trials, item.residuals, strict=True)
+                    for data, residual in zip(
+                        investigation.problem.trials, fit.residuals, strict=True
+                    )
                     if data.trial.is_dynamic
                 ]
-                left[label] = ", ".join(f"{value:.0f}" for value in rest)
+                unexplained[label] = ", ".join(f"{value:.0f}" for value in residuals)
     for label, values in rows.items():
-        table.add_row(label, *values, left.get(label, ""))
+        table.add_row(label, *values, unexplained.get(label, ""))
     return table
 
 
@@ -87,12 +90,12 @@ def by_the_others(campaign: Campaign) -> dict[str, float]:
     """
     records = [trial for trial in campaign.trials if trial.is_dynamic]
     values = np.array([trial.values[:, 0] for trial in records])
-    left = (values * len(values) - values.sum(axis=0)) / (
+    residuals = (values * len(values) - values.sum(axis=0)) / (
         len(values) - 1
     )  # less the mean of the others
     return {
-        trial.name: float(np.sqrt((rest**2).mean()))
-        for trial, rest in zip(records, left, strict=True)
+        trial.name: float(np.sqrt((residual**2).mean()))
+        for trial, residual in zip(records, residuals, strict=True)
         if trial.held_out
     }
 
@@ -101,11 +104,11 @@ def held_out_rms(campaign: Campaign, found: Investigation) -> str:
     """Return the residual of each held-out trial: after the mean of the others, and of the fit."""
     fitted = () if found.after is None else found.after.trials
     ours = {
-        item.trial.name: float(
-            np.sqrt((item.residual[:, item.trial.channels.index(SIGNAL)] ** 2).mean())
+        trial_fit.trial.name: float(
+            np.sqrt((trial_fit.residual[:, trial_fit.trial.channels.index(SIGNAL)] ** 2).mean())
         )
-        for item in fitted
-        if item.trial.held_out and SIGNAL in item.trial.channels
+        for trial_fit in fitted
+        if trial_fit.trial.held_out and SIGNAL in trial_fit.trial.channels
     }
     return ", ".join(
         f"{name} {1e6 * rms:.1f} uV by the others, "
@@ -151,8 +154,8 @@ def main() -> int:
             f"{row.chi_square:.1f}",
         )
     if first.location is not None:
-        for item in first.location.disagreements:
-            console.print(item)
+        for disagreement in first.location.disagreements:
+            console.print(disagreement)
     for experiment in first.verdict.next_experiments:
         console.print(experiment.description, f"{float(experiment.information):.3f}")
     return 0

@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 
 NAME = "watched_wing"
 SEED = 25
-TURNS = 60
+STEPS = 60
 YOUNG_MODULUS_FACTOR = 0.97
 NOISE = 150e-6
 THIRD_REGION = {"span_start": 0.5, "span_end": 0.9, "chord_start": 0.03, "chord_end": 0.6}
@@ -36,13 +36,13 @@ LOOSE_GAUGE = 4
 LOOSE_FROM = 10
 LOOSER = 0.1
 LOOSEST = 0.3
-"""Gauge, first turn, and the gain that it loses in each turn until it has lost so much."""
+"""Gauge, first step, and the gain that it loses in each step until it has lost so much."""
 SOFT_FROM = 25
 SOFTER = 0.025
 SOFTEST = 0.3
-"""First turn, loss of stiffness of the third region per turn, and its largest loss."""
+"""First step, loss of stiffness of the third region per step, and its largest loss."""
 DAMAGE = {"z1": {20: 0.2}, "z2": {5: 0.2}}
-"""Losses of the two regions of the model, from a turn on."""
+"""Losses of the two regions of the model, from a step on."""
 
 
 class _Wing:
@@ -52,7 +52,7 @@ class _Wing:
         design = load_design()
         defects = [*(defect.model_dump() for defect in design.defects), THIRD_REGION]
         self._operators = assemble(design.changed(defects=defects))
-        self._turn = 0
+        self._step = 0
         self._strain = cache(self._solved)
 
     def _solved(self, health: tuple[float, ...]) -> Float:
@@ -60,12 +60,12 @@ class _Wing:
         return static_response(self._operators, values).strain
 
     def observe(self, control: object, health: object) -> AssetReading:
-        """Return the strains of the next turn."""
-        turn = self._turn
-        self._turn += 1
-        soft = round(min(SOFTER * max(turn - SOFT_FROM + 1, 0), SOFTEST), 6)
+        """Return the strains of the next step."""
+        step = self._step
+        self._step += 1
+        soft = round(min(SOFTER * max(step - SOFT_FROM + 1, 0), SOFTEST), 6)
         strain = control["load_factor"] * self._strain((health["z1"], health["z2"], soft))  # type: ignore[index]
-        loose = min(LOOSER * max(turn - LOOSE_FROM + 1, 0), LOOSEST)
+        loose = min(LOOSER * max(step - LOOSE_FROM + 1, 0), LOOSEST)
         gain = np.where(np.arange(strain.size) == LOOSE_GAUGE - 1, 1.0 - loose, 1.0)
         return AssetReading(strain * gain, {})
 
@@ -74,12 +74,12 @@ def recorded() -> str:
     """Return the recording as CSV."""
     loaded = load_scenario(NAME).scenario
     gains = [
-        {"state": name, "first_step": turn, "gain": gain}
+        {"state": name, "first_step": step, "gain": gain}
         for name, steps in DAMAGE.items()
-        for turn, gain in steps.items()
+        for step, gain in steps.items()
     ]
     table = loaded.to_dict()
-    table["mission"] |= {"steps": TURNS, "seed": SEED}
+    table["mission"] |= {"steps": STEPS, "seed": SEED}
     table["truth"] = {"kind": "scripted", "gains": gains, "noise": {"standard_deviation": NOISE}}
     scenario = type(loaded).model_validate(table)
     knowledge = prepare_knowledge(
@@ -90,10 +90,10 @@ def recorded() -> str:
         knowledge.twin(),
         knowledge.plant(knowledge.truth(SEED), StatelessAsset(_Wing().observe)),
     )
-    lines = ["turn,control," + ",".join(f"strain_{g}_microstrain" for g in range(1, 25))]
-    for turn, (row, control) in enumerate(zip(flight.observed, flight.control_index, strict=True)):
+    lines = ["step,control," + ",".join(f"strain_{g}_microstrain" for g in range(1, 25))]
+    for step, (row, control) in enumerate(zip(flight.observed, flight.control_index, strict=True)):
         cells = ",".join(f"{1e6 * value:.1f}" for value in row)
-        lines.append(f"{turn},{scenario.control_names[control]},{cells}")
+        lines.append(f"{step},{scenario.control_names[control]},{cells}")
     return "\n".join(lines) + "\n"
 
 

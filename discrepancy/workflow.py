@@ -27,20 +27,15 @@ from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import time_step_error
 from discrepancy.fits.predictive import held_out_fit, residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.judgement.conclusion import (
-    NO_GAP,
-    calibrated_parameters,
-    look_alike_remark,
-    with_date,
-    with_untested,
-)
+from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
 from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
+from discrepancy.judgement.remarks import NO_GAP, look_alike_remark, with_date, with_untested
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.shares import MissingForce, seen_force
+from discrepancy.missing_force.port_force import MissingForce, seen_force
 from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
 from discrepancy.model_choice import load_model
 from discrepancy.proof_record import Proof

@@ -2,8 +2,8 @@
 
 Library code takes a `Progress` and need not know which one it is::
 
-    with progress.stage("Flying", total=50, unit="turns") as stage:
-        for turn in range(50):
+    with progress.stage("Flying", total=50, unit="steps") as stage:
+        for step in range(50):
             ...
             stage.advance()
 """

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 import typer
 
 import reporting.progress
+from reporting.former_options import former_option, move_former_options
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -62,8 +63,9 @@ def as_command(
 
     Parameters before `*` become arguments, the others options. The entry of a parameter is its
     help, or a table of arguments of Typer (`help`, `metavar`, `min`, `show_default`, ...), in which
-    `flags` is the name of an option that is not called like its parameter. Entries of the table
-    ``[shared]`` are for all commands that have no entry of their own.
+    `flags` is the name of an option that is not called like its parameter, and `former` the name
+    that the option had in earlier versions: it is still accepted, and not listed. Entries of the
+    table ``[shared]`` are for all commands that have no entry of their own.
 
     Parameters
     ----------
@@ -75,15 +77,22 @@ def as_command(
     tables = commands_of(function.__module__.partition(".")[0])
     entries = SHARED | tables["shared"] | tables.get(words, {})
 
+    former_flags: dict[str, str] = {}
+
     @functools.wraps(function)
     def command(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:
+        move_former_options(options, former_flags)
         return function(*arguments, **options)
 
     signature = inspect.signature(function)
     parameters = []
     for parameter in signature.parameters.values():
         if parameter.name in entries:
-            parameter = _as_typer_parameter(parameter, entries[parameter.name])
+            entry = entries[parameter.name]
+            if isinstance(entry, dict) and "former" in entry:
+                former_flags[parameter.name] = entry["former"]
+                parameters.append(former_option(parameter, entry))
+            parameter = _as_typer_parameter(parameter, entry)
         parameters.append(parameter)
     vars(command)["__signature__"] = signature.replace(parameters=parameters)
     return command
@@ -94,6 +103,7 @@ def _as_typer_parameter(
 ) -> inspect.Parameter:
     """Return a parameter whose annotation tells Typer its help and settings."""
     settings = {"help": entry} if isinstance(entry, str) else dict(entry)
+    settings.pop("former", None)
     if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
         flags = settings.pop("flags", "--" + parameter.name.replace("_", "-"))
         typer_information = typer.Option(flags, **settings)

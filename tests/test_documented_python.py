@@ -87,7 +87,7 @@ def bracket(folder: Path) -> None:
 
 
 def flown(name: str, steps: int, place: str) -> Callable[[Path], None]:
-    """Return what makes a run folder of the first turns of a mission, without its report."""
+    """Return what makes a run folder of the first steps of a mission, without its report."""
 
     def fly(folder: Path) -> None:
         scenario = (ROOT / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
@@ -118,7 +118,7 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
     ),
     "docs/campaign.md": ("discrepancy example static my_campaign --seed 1",),
     "docs/cart_in_ten_minutes.md": (lambda folder: (folder / "my_cart").mkdir(),),
-    # Each turn has damage of its own in the search for an effect.
+    # Each step has damage of its own in the search for an effect.
     "docs/discrepancy_missions.md": (flown("growing_damage", 12, "runs/mission"),),
     "docs/fmu_models.md": (WING_FMU, linked("rig.toml", INPUTS.folder / "rig.toml")),
     "docs/fmu.md": (
@@ -133,7 +133,7 @@ READER_HAS: dict[str, tuple[Callable[[Path], None] | str, ...]] = {
     # The page packs the FMU itself.
     "docs/python.md": ("fmu build --out drafted.fmu", "fmu bind drafted.fmu --out wing.toml", *VERDICT),
     "docs/real_wing.md": (converted_wing,),
-    # With the turn up to which the page reports, and one more.
+    # With the step up to which the page reports, and one more.
     "docs/report.md": (flown("level_turns", 22, "runs/level_turns"),),
     "docs/run_folder.md": (flown("level_turns", 22, "runs/level_turns"),),
     "docs/structures.md": (bracket,),

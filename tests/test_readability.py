@@ -53,13 +53,13 @@ class Counts:
 
 CEILINGS = {
     "reporting": Counts(packed=0, bundles=1.4, walrus=0, columns=0.6, untyped=21.3, vague=0.5),
-    "fe": Counts(packed=4, bundles=2, walrus=0, columns=1.9, untyped=2.7, vague=2.6),
-    "fmu_asset": Counts(packed=5.4, bundles=2.1, walrus=0.9, columns=0.3, untyped=7, vague=4.9),
+    "fe": Counts(packed=0.2, bundles=1.6, walrus=0, columns=1.4, untyped=2.2, vague=0.4),
+    "fmu_asset": Counts(packed=5.4, bundles=2.1, walrus=0.9, columns=0.3, untyped=7, vague=4.8),
     "calibration": Counts(packed=0, bundles=2.3, walrus=0, columns=3.6, untyped=1.2, vague=0.2),
     "discrepancy": Counts(packed=5.2, bundles=3.2, walrus=1.7, columns=1.6, untyped=3.5, vague=10.2),
     "scenarios": Counts(packed=0, bundles=0, walrus=0, columns=0, untyped=0, vague=0),
     "twin_master": Counts(packed=14.2, bundles=5, walrus=1.9, columns=4, untyped=13.4, vague=9.6),
-    "uav_twin": Counts(packed=4.6, bundles=0.8, walrus=1.6, columns=1.6, untyped=12.9, vague=11.2),
+    "uav_twin": Counts(packed=0, bundles=0.7, walrus=0, columns=0.7, untyped=5, vague=1.4),
     "benchmarks": Counts(packed=8, bundles=5.4, walrus=0.3, columns=5.6, untyped=4.6, vague=6.2),
     "evidence": Counts(packed=8, bundles=6.5, walrus=0, columns=32.5, untyped=3.9, vague=5.5),
 }

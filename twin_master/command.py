@@ -16,6 +16,7 @@ import typer
 
 from reporting import terminal
 from reporting.errors import ReportingError
+from reporting.former_options import former_names_as_lines
 from reporting.words import counted, number
 from scenarios import scenario_files
 from twin_master import parts
@@ -134,7 +135,8 @@ def guarded(application: Callable[[], None], *others: type[Exception]) -> None:
     `others` are base classes of errors of packages that this one may not import.
     """
     try:
-        application()
+        with former_names_as_lines(lambda: terminal.loudness.quiet):
+            application()
     except Exception as error:
         if terminal.loudness.verbose:
             traceback.print_exc()
@@ -166,9 +168,9 @@ def watch(
     replace: bool = False,
     follow: bool = False,
     pace: float = 0.0,
-    turns: int | None = None,
+    steps: int | None = None,
     model_patch: Path | None = None,
-    from_turn: int | None = None,
+    from_step: int | None = None,
     teach: bool = False,
     allow_unknown: bool = False,
     ca_file: Path | None = None,
@@ -179,11 +181,11 @@ def watch(
     view: bool = False,
     no_report: bool = False,
 ) -> None:
-    """Watch a real asset: observations in, a decision for each turn out, as a line of JSON.
+    """Watch a real asset: observations in, a decision for each step out, as a line of JSON.
 
     The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed.
 
-    Everything is kept in the folder after every turn. Ctrl-C ends a watch in order; --resume takes it up.
+    Everything is kept in the folder after every step. Ctrl-C ends a watch in order; --resume takes it up.
     """
     watches: list[parts.Watch] = []
     live = follow or observations is None or observations == "-" or parts.is_broker(observations)
@@ -202,8 +204,8 @@ def watch(
 
         folder = parts.watch(
             scenario, observations, out, {"seed": seed, "calibration": calibration, "library": library},
-            decide=decide, resume=resume, follow=follow, turns=turns, model_patch=model_patch,
-            from_turn=from_turn, teach=teach, allow_unknown=allow_unknown, ca_file=ca_file, replace=replace,
+            decide=decide, resume=resume, follow=follow, steps=steps, model_patch=model_patch,
+            from_step=from_step, teach=teach, allow_unknown=allow_unknown, ca_file=ca_file, replace=replace,
             last=last, report=not no_report, otherwise="-", begun=opened, progress=terminal.progress(),
         )  # fmt: skip
         _write("", flush=True)
@@ -258,7 +260,7 @@ def _line(scenario: "parts.Scenario", decision: Mapping[str, Any]) -> str:
     if decision.get("state_believed", True):
         health = ", ".join(f"{name} {said}" for name, said in parts.health_in_words(decision).items())
     line = (
-        f"{scenario.mission.step_name} {decision['turn']}: {decision['control']}, {health}; "
+        f"{scenario.mission.step_name} {decision['step']}: {decision['control']}, {health}; "
         f"next {decision['next_control']} with probability {decision['probability']:.3f}"
     )
     chosen = decision.get("decided_by", "model")
@@ -266,7 +268,7 @@ def _line(scenario: "parts.Scenario", decision: Mapping[str, Any]) -> str:
 
 
 def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
-    """Show a flight in the browser, turn by turn or while it goes on, or a whole fleet."""
+    """Show a flight in the browser, step by step or while it goes on, or a whole fleet."""
 
     def ready(address: str) -> None:
         typer.echo(f"{folder}: {address} (Ctrl-C ends it)")

@@ -20,7 +20,7 @@ from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError, said
 from twin_master.fleet.flight import source_of
 from twin_master.mission.preparation import prepare_knowledge
-from twin_master.mission.turns import Plant, decided_to_end
+from twin_master.mission.steps import Plant, decided_to_end
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 
 try:
@@ -168,7 +168,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
 
     def _fly(self, control: int, before: int | None) -> tuple[Float, float, dict[str, Any]]:
         assert self._plant is not None
-        reading = self._plant.turn(control, before)
+        reading = self._plant.fly_step(control, before)
         sensed, happened = reading.observed, reading.happened
         assert happened is not None
         rewards, weights = self.knowledge.rewards, self.scenario.rewards

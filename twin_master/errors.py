@@ -32,7 +32,7 @@ class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the 
     twin : str
         Name of the twin.
     step : int
-        Step (turn) of the observation.
+        Step of the observation.
     worst_residuals : dict of str to float
         The sensors that fit worst, with their standardised residuals; empty if unknown.
     """

@@ -31,11 +31,11 @@ def watch(
     out: Path | None = None,
     seed: int | None = None,
     follow: bool = False,
-    turns: int | None = None,
+    steps: int | None = None,
     ca_file: Path | None = None,
     view: bool = False,
 ) -> None:
-    """Watch many real assets: observations in, a decision for each turn of each asset out, as a line of JSON.
+    """Watch many real assets: observations in, a decision for each step of each asset out, as a line of JSON.
 
     Each asset has a folder DIR/GROUP/NAME, which is that of `uav-twin watch`.
 
@@ -47,7 +47,7 @@ def watch(
     folder = out if out is not None else Path("runs") / fleet.head.name
     console = _Console()
     watched = parts.FleetWatch(
-        fleet, folder, console.tell, console.say, follow=follow, turns=turns, authority=ca_file
+        fleet, folder, console.tell, console.say, follow=follow, steps=steps, authority=ca_file
     )
 
     fleet_view = parts.is_fleet, parts.serve_fleet
@@ -123,8 +123,8 @@ def _watched_table(standing: Mapping[str, Any]) -> "parts.Table":
         last, health = asset["last"], parts.health_in_words(asset["last"])
         cells = [health.get(state, "") for state in states]
         alarms = str(asset["alarms"] or "")
-        rows.append((name, str(last["turn"]), last["control"], *cells, last["next_control"], alarms))
-    headings = "asset", "turn", "control", *states, "next", "alarms"
+        rows.append((name, str(last["step"]), last["control"], *cells, last["next_control"], alarms))
+    headings = "asset", "step", "control", *states, "next", "alarms"
     table = terminal.console_table(headings, rows, terminal.console().width)
     table.title = _heading(standing)
     return table

@@ -30,7 +30,7 @@ from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile
 from twin_master.mission.planning import policy_file, read_policy
 from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_knowledge
-from twin_master.mission.turns import History
+from twin_master.mission.steps import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
@@ -214,17 +214,17 @@ def _known(
     if told is not None:
         progress.note(told)
     keep_knowledge(folder, knowledge)
-    # Turns without observations on a twin of its own compile the inner loops before the flight.
+    # Steps without observations on a twin of its own compile the inner loops before the flight.
     compiling = knowledge.twin()
     for _ in range(2):
-        compiling.turn(np.full(scenario.observation.count, np.nan), 0)
+        compiling.step(np.full(scenario.observation.count, np.nan), 0)
     compiling.smoothed()
     return knowledge
 
 
 @contextmanager
 def _noted(folder: Path) -> Iterator[None]:
-    """Add to any error how the run can be continued, or begun anew before its first turn."""
+    """Add to any error how the run can be continued, or begun anew before its first step."""
     try:
         yield
     except NotResumableError:
@@ -264,7 +264,7 @@ def _misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
 
 def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path], object]:
     """Return what writes the field under the last estimate and the last control."""
-    last, scenario = result.flight.turns[-1].concluded, result.scenario
+    last, scenario = result.flight.steps[-1].concluded, result.scenario
     estimate = result.knowledge.model.states.mean(last.filtered).tolist()
     # A belief that is sure of the last level may round to a little beyond it, where no model holds.
     state = {
@@ -276,9 +276,9 @@ def _field_writer(source: AssetSource, result: MissionResult) -> Callable[[Path]
 
 
 def _timing(flight: History) -> dict[str, Any]:
-    """Return the seconds of the turns flown by this process."""
+    """Return the seconds of the steps flown by this process."""
     seconds = flight.seconds[flight.resumed_at :]
-    record: dict[str, Any] = {"resumed_at": flight.resumed_at, "turns": len(seconds)}
+    record: dict[str, Any] = {"resumed_at": flight.resumed_at, "steps": len(seconds)}
     for name, values in zip(("asset", "twin", "checkpoint"), seconds.T if len(seconds) else (), strict=False):
         record[f"{name}_seconds"] = {
             "total": float(values.sum()),
@@ -329,7 +329,7 @@ def check_scenario(
         "states": prod(levels.values()),
         "controls": scenario.control_names,
         "sensors": scenario.observation.count,
-        "turns": mission.steps,
+        "steps": mission.steps,
         "prediction_steps": mission.prediction_steps,
         "step_name": mission.step_name,
         "memory": sum(scenario_bytes(scenario).values()),

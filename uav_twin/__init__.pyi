@@ -1,4 +1,4 @@
-"""The names of `uav_twin`: this one list is read by type checkers, by editors and by `__init__.py`."""
+"""The names of `uav_twin`: type checkers, editors and `__init__.py` read this one list."""
 
 from calibration.dynamics.modal_identification import identify_modes as identify_modes
 from calibration.result.file import load_calibration as load_calibration

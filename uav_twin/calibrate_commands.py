@@ -1,10 +1,10 @@
-"""`uav-twin calibrate`, all three steps of a wing in order, and `ringdown`, `simulate` and `campaign`."""
+"""`uav-twin calibrate`: all three steps of a wing; `ringdown`, `simulate` and `campaign`."""
 
 import json as json_text
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import typer
 
@@ -35,20 +35,45 @@ def calibrate_campaign(
         parts.check_folder(out, name, wing=False)
     chosen = parts.choose_model(model)
     result = parts.calibrate_parameters(data, chosen, asset=name, samples=samples, seed=seed)
-    written = None if out is None else parts.write_calibration_folder(result, out, report=not no_report)
+    written = None
+    if out is not None:
+        written = parts.write_calibration_folder(result, out, report=not no_report)
     conclude(result, written, json=json, report=not no_report)
 
 
-def conclude(result: "parts.Calibration", written: Path | None, *, json: bool, report: bool) -> None:
-    """Say what a calibration found, and where it was written."""
+def conclude(
+    result: "parts.Calibration", written: Path | None, *, json: bool, report: bool
+) -> None:
+    """Print the result of a calibration, and where it was written.
+
+    Parameters
+    ----------
+    result : Calibration
+        The calibration.
+    written : Path or None
+        Its file, if one was written.
+    json : bool
+        Whether to print JSON.
+    report : bool
+        Whether a report stands beside the file.
+    """
     if json:
-        terminal.print_json({"calibration": None if written is None else str(written)} | _record(result))
+        file = None if written is None else str(written)
+        terminal.print_json({"calibration": file} | _record(result))
         return
     from calibration.result import text
 
-    headline, correlations = text.headline(result), text.correlation_lines(result)
-    show("calibration", words=text.WORDS, result=result, headline=headline, correlations=correlations)
-    show("calibration", written=written, report=report and written and written.with_name(parts.REPORT_NAME))
+    show(
+        "calibration",
+        words=text.WORDS,
+        result=result,
+        headline=text.headline(result),
+        correlations=text.correlation_lines(result),
+    )
+    report_file = None
+    if report and written is not None:
+        report_file = written.with_name(parts.REPORT_NAME)
+    show("calibration", written=written, report=report_file)
 
 
 def _record(result: "parts.Calibration") -> dict[str, Any]:
@@ -96,15 +121,17 @@ def calibrate_wing(
 ) -> None:
     """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
 
-    A lab folder may hold one step alone; the sub-commands fit ring-downs, make a lab folder of a virtual
-    wing, and calibrate any model from a campaign.
+    A lab folder may hold one step alone; the sub-commands fit ring-downs, make a lab folder of a
+    virtual wing, and calibrate any model from a campaign.
     """
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")
     if fitted and (data is None or measured is False):
-        raise typer.BadParameter("--fitted needs --data with ring-down records, and no --published.")
-    drawn = parts.load_design(design)
-    name = drawn.name if asset is None else asset
+        raise typer.BadParameter(
+            "--fitted needs --data with ring-down records, and no --published."
+        )
+    wing_design = parts.load_design(design)
+    name = wing_design.name if asset is None else asset
     if out is not None:
         parts.check_folder(out, name, wing=True)
     targets: Literal["measured", "published"] = "measured" if measured else "published"
@@ -115,13 +142,15 @@ def calibrate_wing(
     if not json:
         for origin in lab.origins:
             terminal.say(f"Step {origin.step}: {origin.text}.")
-    calibration = parts.calibrate(lab, drawn, asset=name, procedure=procedure, seed=seed)
+    calibration = parts.calibrate(lab, wing_design, asset=name, procedure=procedure, seed=seed)
     if not json:
         from calibration.paper.figures import WORDS
 
         columns, rows = WORDS.table("table_1", calibration.table_1)
         terminal.print_table([column.name for column in columns], rows)
-    written = None if out is None else parts.write_wing_folder(calibration, out, report=not no_report)
+    written = None
+    if out is not None:
+        written = parts.write_wing_folder(calibration, out, report=not no_report)
     conclude(calibration.result, written, json=json, report=not no_report)
 
 
@@ -138,25 +167,55 @@ def calibrate_ringdown(
     trials = parts.fit_trials(parts.read_records(data), free=fitted, start=start)
     if extremes:
         trials = parts.refine_by_extremes(trials)
-    kinds: tuple[tuple[str, str, Literal["frequency", "damping_ratio"], Any], ...] = (
-        ("natural frequency", "Hz", "frequency", parts.PUBLISHED_FREQUENCIES),
-        ("damping ratio", "1", "damping_ratio", parts.PUBLISHED_DAMPING_RATIOS),
-    )
-    rows = [
-        (f"mode {mode + 1}, {what}", unit, *parts.average(trials, name, mode), paper[mode])
-        for mode in (0, 1)
-        for what, unit, name, paper in kinds
-    ]
+    rows = []
+    for mode in (0, 1):
+        rows.append(
+            RingDownRow(
+                f"mode {mode + 1}, natural frequency",
+                "Hz",
+                parts.average(trials, "frequency", mode),
+                parts.PUBLISHED_FREQUENCIES[mode],
+            )
+        )
+        rows.append(
+            RingDownRow(
+                f"mode {mode + 1}, damping ratio",
+                "1",
+                parts.average(trials, "damping_ratio", mode),
+                parts.PUBLISHED_DAMPING_RATIOS[mode],
+            )
+        )
     headings = ("figure", "unit", "found", "between trials", "standard error", "paper")
-    printed, written = (
-        [(what, unit, *(format(value, digits) for value in values)) for what, unit, *values in rows]
-        for digits in (".5g", ".10g")
-    )
-    terminal.print_table(headings, printed)
+    terminal.print_table(headings, [row.cells(".5g") for row in rows])
     if out is not None:
-        columns = zip(*written, strict=True)
-        atomic_write_text(out / "ringdown.csv", parts.table_text(dict(zip(headings, columns, strict=True))))
+        columns = zip(*(row.cells(".10g") for row in rows), strict=True)
+        table = dict(zip(headings, columns, strict=True))
+        atomic_write_text(out / "ringdown.csv", parts.table_text(table))
         parts.save_figure(parts.ring_down_figure(trials), out / "figures", "ringdown")
+
+
+class RingDownRow(NamedTuple):
+    """A figure of a mode from ring-downs, beside the published one.
+
+    Attributes
+    ----------
+    figure, unit : str
+        The name of the figure, and its unit.
+    average : tuple of float
+        Mean, deviation between trials, and standard error of the mean.
+    paper : float
+        The published figure.
+    """
+
+    figure: str
+    unit: str
+    average: tuple[float, float, float]
+    paper: float
+
+    def cells(self, digits: str) -> tuple[str, ...]:
+        """Return the cells of a table, with numbers in a format such as ".5g"."""
+        numbers = [format(value, digits) for value in (*self.average, self.paper)]
+        return (self.figure, self.unit, *numbers)
 
 
 TRUTH_FILE = "truth.json"
@@ -180,28 +239,42 @@ def calibrate_simulate(
 ) -> None:
     """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it."""
     if fmu is not None and frequency_error != (0.0, 0.0):
-        raise typer.BadParameter("--frequency-error needs the reduced model; an FMU has its own frequencies.")
+        raise typer.BadParameter(
+            "--frequency-error needs the reduced model; an FMU has its own frequencies."
+        )
     if fmu is not None and design is not None:
         raise typer.BadParameter("--fmu and --design exclude each other: the FMU holds its wing.")
     refuse_filled(out)
-    drawn = parts.load_design(design)
-    state: dict[str, Any] = dict(zip(parts.STATE, (e, servo_mass, pitot_mass, alpha, beta), strict=True))
-    truth = DigitalState(drawn.geometry, **state)
+    wing_design = parts.load_design(design)
+    true_values = (e, servo_mass, pitot_mass, alpha, beta)
+    state: dict[str, float] = dict(zip(parts.STATE, true_values, strict=True))
+    truth = DigitalState(
+        wing_design.geometry,
+        young_modulus_factor=e,
+        servo_mass=servo_mass,
+        pitot_mass=pitot_mass,
+        damping_alpha=alpha,
+        damping_beta=beta,
+    )
     if fmu is not None:
-        opened: Any = parts.FmuTestBench(fmu, truth)
+        test_bench: Any = parts.FmuTestBench(fmu, truth)
     else:
-        opened = nullcontext(parts.VirtualWing(parts.reduced_model(drawn), truth, frequency_error))
-    with opened as bench:
-        recorder: Any = {"sampling_rate": sampling_rate, "noise": noise, "quantisation": quantisation}
-        designed = None if design is None else drawn.geometry
+        model = parts.reduced_model(wing_design)
+        test_bench = nullcontext(parts.VirtualWing(model, truth, frequency_error))
+    designed_geometry = None if design is None else wing_design.geometry
+    with test_bench as bench:
+        load_test = parts.measure_load_test(bench, seed)
+        records = parts.measure_ring_down(
+            bench, seed, sampling_rate=sampling_rate, noise=noise, quantisation=quantisation
+        )
         parts.write_lab_folder(
             out,
-            load_test=parts.measure_load_test(bench, seed),
-            records=parts.measure_ring_down(bench, seed, **recorder),
-            lengths=parts.measure_lengths(truth.geometry, seed, designed=designed),
+            load_test=load_test,
+            records=records,
+            lengths=parts.measure_lengths(truth.geometry, seed, designed=designed_geometry),
             total_mass=parts.weigh(truth, seed),
         )
-    known = asdict(drawn.geometry) | {
+    known = asdict(wing_design.geometry) | {
         **state,
         "frequency_error": list(frequency_error),
         "seed": seed,

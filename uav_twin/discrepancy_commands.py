@@ -1,7 +1,7 @@
 """`uav-twin discrepancy`: from a campaign to a verdict, with report, patch and patched FMU.
 
-`check` says what a campaign can decide before anything is fitted, `import` makes one of a laboratory's files,
-and the catalogue is at work in `effects`, `example`, `convert` and `apply`.
+`check` says what a campaign can decide before anything is fitted, `import` makes one of a
+laboratory's files, and the catalogue is at work in `effects`, `example`, `convert` and `apply`.
 """
 
 import dataclasses
@@ -21,17 +21,16 @@ from discrepancy.errors import CampaignFileError, CatalogueError, DiscrepancyErr
 from reporting import terminal
 from reporting.files import refuse_filled
 from reporting.progress import reporter, stage
-from reporting.words import counted
+from reporting.words import comma_list, counted
 from uav_twin import options, parts
-from uav_twin.options import said
 
 
 def run(
     campaign: Path | None = None,
     *,
     from_run: Path | None = None,
-    from_turn: int | None = None,
-    to_turn: int | None = None,
+    from_step: int | None = None,
+    to_step: int | None = None,
     model: str | None = None,
     out: Path | None = None,
     replace: bool = False,
@@ -44,81 +43,142 @@ def run(
     """Find out what the model lacks: verdict, report, patch, residuals."""
     one_thread()
     if (campaign is None) == (from_run is None):
-        raise CampaignFileError("Give either the folder of a campaign or --from-run with that of a mission.")
-    if from_run is None and (from_turn is not None or to_turn is not None):
-        raise CampaignFileError("--from-turn and --to-turn belong to --from-run.")
-    if from_turn is not None and to_turn is not None and to_turn < from_turn:
-        raise CampaignFileError(f"--to-turn {to_turn} lies before --from-turn {from_turn}: no turn is left.")
+        raise CampaignFileError(
+            "Give either the folder of a campaign or --from-run with that of a mission."
+        )
+    if from_run is None and (from_step is not None or to_step is not None):
+        raise CampaignFileError("--from-step and --to-step belong to --from-run.")
+    if from_step is not None and to_step is not None and to_step < from_step:
+        raise CampaignFileError(
+            f"--to-step {to_step} lies before --from-step {from_step}: no step is left."
+        )
     source = campaign or from_run
     assert source is not None
     folder = out if out is not None else Path("verdicts") / source.resolve().name
     parts.check_verdict_folder(folder, replace_it=replace)
     catalogue = parts.load_catalogue(effects or ())
-    data, choice = _compared(campaign, from_run, from_turn, to_turn, model)
+    data, choice = _compared(campaign, from_run, from_step, to_step, model)
     inputs = {"campaign": data.data_hash, "model": choice.source_hash}
     inputs |= {f"effects {path.name}": parts.hash_file(path) for path in effects or ()}
-    asked = {"from-turn": from_turn, "to-turn": to_turn, "model": model and choice.file, "seed": seed}
+    options_of_command = {
+        "from-step": from_step,
+        "to-step": to_step,
+        "model": model and choice.file,
+        "seed": seed,
+    }
     origin = parts.Origin(
         data.name,
         choice.model.name,
         data.data_hash,
         choice.source_hash,
-        _command(source, effects or [], from_run is not None, **asked, calibrate=calibrate),
+        _command(
+            source, effects or [], from_run is not None, **options_of_command, calibrate=calibrate
+        ),
         parts.collect_provenance(seed, input_hashes=inputs),
         choice.file,
     )
     in_progress = parts.SearchInProgress()
     with terminal.interruptible(lambda: _keep_so_far(folder, in_progress, origin)):
-        found = parts.investigate(data, choice.model, catalogue, seed=seed, on_search=in_progress.begin)
-    able, tried = None, None
-    if found.problem is not None:
+        investigation = parts.investigate(
+            data, choice.model, catalogue, seed=seed, on_search=in_progress.begin
+        )
+    separability = None
+    self_calibration = None
+    if investigation.problem is not None:
+        tested_campaign = investigation.campaign
+        setting = investigation.problem.setting
         with stage("What this campaign can decide"):
-            able = parts.separability(found.campaign, choice.model, found.problem.setting, catalogue)
+            separability = parts.separability(tested_campaign, choice.model, setting, catalogue)
         if calibrate is not None:
-            workers = 1 if choice.kind is parts.ModelKind.FMU else 2  # an FMU is a process of its own
-            with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as shown:
-                tried = parts.self_calibrate(
-                    found.campaign, choice.model, catalogue, calibrate,
-                    seed=seed, workers=workers, advance=shown.advance,
-                )  # fmt: skip
+            workers = 1 if choice.kind is parts.ModelKind.FMU else 2  # an FMU is its own process
+            title = "Trying the workflow on simulated campaigns"
+            with stage(title, calibrate, "campaigns") as progress:
+                self_calibration = parts.self_calibrate(
+                    tested_campaign,
+                    choice.model,
+                    catalogue,
+                    calibrate,
+                    seed=seed,
+                    workers=workers,
+                    advance=progress.advance,
+                )
     pack = None if choice.design is None else partial(parts.packed_beside, choice)
-    content = parts.ReportInput(found, origin, able, tried, choice.design, pack=pack)
+    content = parts.ReportInput(
+        investigation, origin, separability, self_calibration, choice.design, pack=pack
+    )
     with stage("Writing the verdict"):
-        place = parts.write_verdict_folder(folder, content, replace_it=replace, report=not no_report)
-    _conclude(content, folder, None if no_report else place, json=json)
+        report_file = parts.write_verdict_folder(
+            folder, content, replace_it=replace, report=not no_report
+        )
+    _conclude(content, folder, None if no_report else report_file, json=json)
 
 
-def _keep_so_far(folder: Path, in_progress: "parts.SearchInProgress", origin: "parts.Origin") -> str:
-    """Write what an interrupted search has found, and say where; empty where it has found nothing yet."""
+def _keep_so_far(
+    folder: Path, in_progress: "parts.SearchInProgress", origin: "parts.Origin"
+) -> str:
+    """Write the fits of an interrupted search, and return the sentence that says where.
+
+    The sentence is empty if there are none yet.
+    """
     path = parts.write_so_far(folder, in_progress.hypotheses(), origin)
     return "" if path is None else f"the hypotheses fitted until then are in {path}"
 
 
-def _conclude(content: "parts.ReportInput", folder: Path, report: Path | None, *, json: bool) -> None:
-    """Print the conclusion; data at fault end the command with 1."""
-    found = content.investigation
-    fault = found.verdict.kind is parts.VerdictKind.DATA_ERROR
+def _conclude(
+    content: "parts.ReportInput", folder: Path, report: Path | None, *, json: bool
+) -> None:
+    """Print the conclusion of an investigation; faulty data end the command with exit code 1.
+
+    Parameters
+    ----------
+    content : ReportInput
+        The investigation.
+    folder : Path
+        The folder of its verdict.
+    report : Path or None
+        Its report, if one was written.
+    json : bool
+        Whether to print JSON.
+    """
+    investigation = content.investigation
+    verdict = investigation.verdict
+    has_faulty_data = verdict.kind is parts.VerdictKind.DATA_ERROR
     if json:
         record = {"folder": str(folder), "report": None if report is None else str(report)}
         stored = (folder / parts.VERDICT_NAME).read_text(encoding="utf-8")
         terminal.print_json(record | loads(stored))
-    if fault:
-        for sentence in (found.verdict.sentence, *(fault.sentence for fault in found.faults[1:])):
+    if has_faulty_data:
+        further_faults = [fault.sentence for fault in investigation.faults[1:]]
+        for sentence in (verdict.sentence, *further_faults):
             typer.secho(sentence, fg="red", err=True)
     elif not json:
         _show_verdict(content, folder)
     if not json:
         terminal.say(f"Verdict: {folder}" if report is None else f"Report: {report}")
-    if fault:
+    if has_faulty_data:
         raise typer.Exit(1)
-    if not json and parts.gives(found.verdict, found.proof):
+    if not json and parts.gives(verdict, investigation.proof):
         terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 
 def _compared(
-    campaign: Path | None, from_run: Path | None, first: int | None, last: int | None, model: str | None
+    campaign: Path | None,
+    from_run: Path | None,
+    first: int | None,
+    last: int | None,
+    model: str | None,
 ) -> "tuple[parts.Campaign, parts.ModelChoice]":
-    """Return what is measured, and what it is compared with."""
+    """Return the campaign, and the model that it is compared with.
+
+    Parameters
+    ----------
+    campaign, from_run : Path or None
+        The folder of a campaign, or that of a mission's run.
+    first, last : int or None
+        The turns of the run.
+    model : str or None
+        The model; by default that of the twin of the run.
+    """
     if from_run is None:
         assert campaign is not None
         return parts.read_campaign(campaign), parts.choose_model(model)
@@ -127,16 +187,18 @@ def _compared(
             data = parts.run_campaign(folder, first, last)
             if model is not None:
                 return data, parts.choose_model(model)
-            return data, dataclasses.replace(parts.choice_of_run(folder), file=str(from_run.resolve()))
-        except DiscrepancyError as error:  # a watch was read from a copy, which is nothing to its user
+            return data, dataclasses.replace(
+                parts.choice_of_run(folder), file=str(from_run.resolve())
+            )
+        except DiscrepancyError as error:  # a watch is read from a copy that its user does not know
             raise type(error)(str(error).replace(str(folder), str(from_run))) from error
 
 
 def one_thread() -> None:
     """Hold the linear algebra of this process to one thread, for good.
 
-    Its matrices are small: more threads wait for each other, the longer the busier the machine is, and the
-    last bits of a sum would follow their number.
+    Its matrices are small: several threads would wait for each other, and the last bits of a sum
+    would depend on their number.
     """
     import scipy.linalg  # noqa: F401 - a library that is not loaded yet cannot be held
     from threadpoolctl import threadpool_limits
@@ -144,20 +206,38 @@ def one_thread() -> None:
     threadpool_limits(1)
 
 
-def _command(source: Path, effects: list[Path], from_run: bool, **given: Any) -> str:
-    """Return the command that does the same in any folder: with absolute paths."""
-    words = ["uav-twin", "discrepancy", "run", *["--from-run"] * from_run, str(source.resolve())]
-    for name, value in given.items():
-        words += [] if value is None else [f"--{name}", str(value)]
+def _command(source: Path, effects: list[Path], from_run: bool, **values: str | int | None) -> str:
+    """Return the command that does the same in any folder, with absolute paths.
+
+    Parameters
+    ----------
+    source : Path
+        The folder of the campaign, or of the run.
+    effects : list of Path
+        Files of further effects.
+    from_run : bool
+        Whether the source is a run.
+    **values : str, int or None
+        Values of further options by name; None for an option that was not given.
+    """
+    words = ["uav-twin", "discrepancy", "run"]
+    if from_run:
+        words.append("--from-run")
+    words.append(str(source.resolve()))
+    for name, value in values.items():
+        if value is not None:
+            words += [f"--{name}", str(value)]
     for path in effects:
         words += ["--effects", str(path.resolve())]
     return shlex.join(words)
 
 
 def _show_verdict(content: "parts.ReportInput", folder: Path) -> None:
+    """Print a verdict, with the intervals of its patch if there is one in the folder."""
     from discrepancy.report.text import WORDS
 
-    if (patch_file := folder / parts.PATCH_NAME).is_file():
+    patch_file = folder / parts.PATCH_NAME
+    if patch_file.is_file():
         intervals = [effect.intervals for effect in parts.read_patch(patch_file).effects]
         content = dataclasses.replace(content, intervals=intervals)
     terminal.say(f"Verdict: {content.investigation.verdict.kind.value}", bold=True)
@@ -165,50 +245,89 @@ def _show_verdict(content: "parts.ReportInput", folder: Path) -> None:
 
 
 def check(
-    campaign: Path, *, model: str | None = None, effects: list[Path] | None = None, json: bool = False
+    campaign: Path,
+    *,
+    model: str | None = None,
+    effects: list[Path] | None = None,
+    json: bool = False,
 ) -> None:
-    """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""
-    data, catalogue = parts.read_campaign(campaign), parts.load_catalogue(effects or ())
+    """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""  # noqa: E501
+    catalogue = parts.load_catalogue(effects or ())
     chosen = parts.choose_model(model).model
-    data, faults = parts.checked(data, chosen)
-    able = None
+    data, faults = parts.checked(parts.read_campaign(campaign), chosen)
+    separability = None
     if not any(fault.fatal for fault in faults):
         with stage("What this campaign can decide"):
             setting = parts.Setting(data, chosen, chosen.scales(data))
-            able = parts.separability(data, chosen, setting, catalogue)
+            separability = parts.separability(data, chosen, setting, catalogue)
     if json:
-        terminal.print_json(_record(data, chosen.name, faults, able))
+        terminal.print_json(_record(data, chosen.name, faults, separability))
     else:
         from discrepancy.report.text import WORDS
 
-        of_able = (parts.seen_of, parts.neighbours, parts.group_lines, parts.needs)
-        given: dict[str, Any] = {item.__name__: item for item in of_able}
-        given |= {"data": data, "model": chosen, "faults": faults, "catalogue": catalogue}
-        options.show("check", words=WORDS, able=able, **given)
-    if able is None:
-        raise terminal.error_exit("Mend the faults first: conclusions from these data would be wrong.")
+        options.show(
+            "check",
+            words=WORDS,
+            able=separability,
+            data=data,
+            model=chosen,
+            faults=faults,
+            catalogue=catalogue,
+            seen_of=parts.seen_of,
+            neighbours=parts.neighbours,
+            group_lines=parts.group_lines,
+            needs=parts.needs,
+        )
+    if separability is None:
+        raise terminal.error_exit(
+            "Mend the faults first: conclusions from these data would be wrong."
+        )
 
 
 def _record(
-    data: "parts.Campaign", model: str, faults: "Sequence[parts.DataFault]", able: "parts.Separability | None"
+    data: "parts.Campaign",
+    model: str,
+    faults: "Sequence[parts.DataFault]",
+    separability: "parts.Separability | None",
 ) -> dict[str, Any]:
-    """Return faults and what the campaign can decide as plain data; a size that is never seen is null."""
+    """Return the faults of a campaign, and what it can decide, as plain data.
+
+    Parameters
+    ----------
+    data : Campaign
+        The campaign.
+    model : str
+        Name of the model.
+    faults : sequence of DataFault
+        Faults of the data.
+    separability : Separability or None
+        What the campaign can decide; None where faults leave nothing. A magnitude that is never
+        seen is null.
+    """
+    detectability = () if separability is None else separability.detectability
     return {
         "campaign": data.name,
         "model": model,
         "trials": [{"name": trial.name, "held_out": trial.held_out} for trial in data.trials],
         "channels": list(data.channels),
-        "passed": able is not None,
+        "passed": separability is not None,
         "faults": [dataclasses.asdict(fault) | {"fatal": fault.fatal} for fault in faults],
         "remarks": data.remarks,
-        "effects": [] if able is None else [
-            {"effect": item.effect.identifier, "testable": not item.reason, "reason": item.reason,
-             "place": item.place, "parameter": item.parameter, "detectable_from": item.detectable,
-             "prior_median": item.typical, "unit": item.unit}
-            for item in able.detectability
+        "effects": [
+            {
+                "effect": detectable.effect.identifier,
+                "testable": not detectable.reason,
+                "reason": detectable.reason,
+                "place": detectable.place,
+                "parameter": detectable.parameter,
+                "detectable_from": detectable.detectable,
+                "prior_median": detectable.typical,
+                "unit": detectable.unit,
+            }
+            for detectable in detectability
         ],
-        "confusion_groups": [] if able is None else able.groups,
-    }  # fmt: skip
+        "confusion_groups": [] if separability is None else separability.groups,
+    }
 
 
 def import_files(
@@ -232,71 +351,100 @@ def import_files(
     reference_temperature: str | None = None,
     model: str | None = None,
 ) -> None:
-    """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say."""
+    """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say."""  # noqa: E501
     folder = out or Path(files[0].stem)
     refuse_filled(folder)
-    of_columns = (column, unit, quantity, scale, zero, gain, hold)
-    kept_for_proof = [f"{name}=yes" for name in held_out or ()]
-    of_files = (kind, release, load_place, decimal, interval, begins, kept_for_proof)
+    column_options = (column, unit, quantity, scale, zero, gain, hold)
+    held_out_option = [f"{name}=yes" for name in held_out or ()]
+    file_options = (kind, release, load_place, decimal, interval, begins, held_out_option)
+    names = (*parts.OF_COLUMNS, *parts.OF_FILES)
     answers = {
-        option: {about: value for about, _, value in (item.rpartition("=") for item in said or ())}
-        for option, said in zip((*parts.OF_COLUMNS, *parts.OF_FILES), (*of_columns, *of_files), strict=True)
+        name: _answers_by_subject(texts or ())
+        for name, texts in zip(names, (*column_options, *file_options), strict=True)
     }
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
-    found = parts.Understanding([*map(parts.read_sheet, files)], answers)
+    sheets = [parts.read_sheet(file) for file in files]
+    understanding = parts.Understanding(sheets, answers)
     if model is not None:
-        known = parts.choose_model(model).model.output_quantity
-        found = parts.Understanding(found.sheets, answers, known)
-    _show_understood(found)
-    asked = sys.stdin.isatty() and sys.stdout.isatty()
-    if asked and (found.questions or found.assumptions):
-        while found.questions or found.assumptions:
-            found = _asked(found)
-        _show_understood(found)
-    campaign = found.campaign(folder.resolve().name)
-    if asked and not typer.confirm(f"Write {folder}?", default=True):
+        quantity_of_output = parts.choose_model(model).model.output_quantity
+        understanding = parts.Understanding(understanding.sheets, answers, quantity_of_output)
+    _show_understanding(understanding)
+    is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
+    if is_interactive and (understanding.questions or understanding.assumptions):
+        while understanding.questions or understanding.assumptions:
+            understanding = _with_answer_of_user(understanding)
+        _show_understanding(understanding)
+    campaign = understanding.campaign(folder.resolve().name)
+    if is_interactive and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
         raise typer.Exit(1)
-    parts.write_campaign(campaign, folder, si=True, units=found.units(), left_out_as_empty=True)
-    assumed = []
-    if found.assumed:
-        remedy = "give --zero and --gain, or correct offset_deviation and gain_deviation"
-        assumed = [f"{found.assumed} Where you know better, {remedy} in {folder / 'campaign.toml'}."]
-    given = words_of(folder, model)
-    options.show("import", folder=folder, campaign=campaign, given=given, assumed=assumed)
+    parts.write_campaign(
+        campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True
+    )
+    assumptions = []
+    if understanding.assumed:
+        assumptions.append(
+            f"{understanding.assumed} Where you know better, give --zero and --gain, or correct "
+            f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
+        )
+    arguments = arguments_of(folder, model)
+    options.show("import", folder=folder, campaign=campaign, given=arguments, assumed=assumptions)
 
 
-def _asked(found: "parts.Understanding") -> "parts.Understanding":
-    """Return what is understood with one answer more; one that does not fit is told, and changes nothing.
+def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
+    """Return the values of an option, SUBJECT=VALUE or VALUE, by subject: a column or a file."""
+    answers = {}
+    for text in texts:
+        subject, _, value = text.rpartition("=")
+        answers[subject] = value
+    return answers
 
-    What must be said comes first, then what has a default, which an empty line takes.
+
+def _with_answer_of_user(understanding: "parts.Understanding") -> "parts.Understanding":
+    """Ask the user one question, and return the understanding with the answer.
+
+    Questions that must be answered come first, then those with a default, which an empty line
+    takes. An answer that does not fit is refused, and changes nothing.
     """
     default = None
-    if found.questions:
-        (option, expected), (about, *_) = next(iter(found.questions.items()))
+    if understanding.questions:
+        (option, expected), (subject, *_) = next(iter(understanding.questions.items()))
     else:
-        (option, expected), defaults = next(iter(found.assumptions.items()))
-        about, default = next(iter(defaults.items()))
-    question = f"{about}, {option} ({expected})" if about else f"{option} ({expected})"
-    said: str = typer.prompt(question, default=default)
+        (option, expected), defaults = next(iter(understanding.assumptions.items()))
+        subject, default = next(iter(defaults.items()))
+    question = f"{option} ({expected})"
+    if subject:
+        question = f"{subject}, {question}"
+    answer: str = typer.prompt(question, default=default)
     try:
-        return found.with_answer(option, about, said.strip())
+        return understanding.with_answer(option, subject, answer.strip())
     except CampaignFileError as error:
         typer.secho(str(error), fg="red", err=True)
-        return found
+        return understanding
 
 
-def _show_understood(found: "parts.Understanding") -> None:
+def _show_understanding(understanding: "parts.Understanding") -> None:
+    """Print how the columns of files are understood, each with a value that is not zero."""
     rows = []
-    for item in found.columns:
-        cells = item.sheet.columns[item.sheet.heads.index(item.head)]
-        told = next((row for row, cell in enumerate(cells) if re.search("[1-9]", cell)), -1)
-        si = item.in_si(found.decimals[item.sheet.name])[told]
-        value = f"{float(si):.6g} {item.si}" if si else ""
-        known = (item.unit or "?", item.role or "?", item.quantity or "")
-        rows.append((item.sheet.name, item.head, *known, cells[told], value))
-    options.show("understood", found=found, rows=rows)
+    for column in understanding.columns:
+        sheet = column.sheet
+        cells = sheet.columns[sheet.heads.index(column.head)]
+        nonzero_rows = [row for row, cell in enumerate(cells) if re.search("[1-9]", cell)]
+        row = nonzero_rows[0] if nonzero_rows else -1
+        si_value = column.in_si(understanding.decimals[sheet.name])[row]
+        rows.append(
+            (
+                sheet.name,
+                column.head,
+                column.unit or "?",
+                column.role or "?",
+                column.quantity or "",
+                cells[row],
+                f"{float(si_value):.6g} {column.si}" if si_value else "",
+            )
+        )
+    options.show("understood", found=understanding, rows=rows)
 
 
 def effects(*, show: str | None = None, add: list[Path] | None = None) -> None:
@@ -323,71 +471,126 @@ def _show_effect(effect: "parts.Effect") -> None:
 
 
 def example(
-    kind: str, out: Path, *, model: str | None = None, seed: int = 0, effect: list[str] | None = None
+    kind: str,
+    out: Path,
+    *,
+    model: str | None = None,
+    seed: int = 0,
+    effect: list[str] | None = None,
 ) -> None:
     """Write a simulated campaign, with an effect hidden in it if asked for."""
     refuse_filled(out, "folder")
     chosen = parts.choose_model(model).model
-    plan, patch = parts.plan_of(chosen), parts.ModelPatch()
+    plan = parts.plan_of(chosen)
+    patch = parts.ModelPatch()
     if effect:
-        bare = parts.example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # said by itself
+        plain = parts.example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # it checks
         for text in effect:
-            patch = patch + _hidden(text, chosen, bare)
+            patch = patch + _hidden_effect(text, chosen, plain)
     campaign = parts.write_example(chosen, out, kind, seed, plan, patch)  # type: ignore[arg-type]
     hidden = ", ".join(effect) if effect else "nothing"
-    options.show("example", out=out, campaign=campaign, hidden=hidden, given=words_of(out, model))
+    options.show(
+        "example", out=out, campaign=campaign, hidden=hidden, given=arguments_of(out, model)
+    )
 
 
-def words_of(campaign: Path, model: str | None) -> str:
-    """Return a campaign and its model as a further command takes them."""
-    return shlex.join([str(campaign), *([] if model is None else ["--model", model])])
+def arguments_of(campaign: Path, model: str | None) -> str:
+    """Return a campaign and its model as the arguments of a further command."""
+    model_option = [] if model is None else ["--model", model]
+    return shlex.join([str(campaign), *model_option])
 
 
-def _hidden(text: str, model: "parts.Model", campaign: "parts.Campaign") -> "parts.ModelPatch":
-    """Return the patch of ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,..; raises `CatalogueError`."""
-    head, named, numbers = text.partition(":")
-    if not named:
-        head, _, numbers = text.partition("=")
+def _hidden_effect(
+    text: str, model: "parts.Model", campaign: "parts.Campaign"
+) -> "parts.ModelPatch":
+    """Return the patch of an effect that is hidden in an example.
+
+    Parameters
+    ----------
+    text : str
+        ID[@PLACE][:NAME=VALUE,...] or ID[@PLACE]=VALUE,...; parameters without a value have the
+        median of their prior.
+    model : Model
+        The model of the example.
+    campaign : Campaign
+        The example without the effect.
+
+    Raises
+    ------
+    CatalogueError
+        If there is no such effect, place or parameter.
+    """
+    has_names = ":" in text
+    head, _, numbers = text.partition(":" if has_names else "=")
     identifier, at, place = head.partition("@")
-    found = parts.effect_by_identifier(identifier, parts.load_catalogue())
+    effect = parts.effect_by_identifier(identifier, parts.load_catalogue())
     setting = parts.Setting(campaign, model, model.scales(campaign))
-    reason = found.unavailable(setting)
+    reason = effect.unavailable(setting)
     if reason is not None:
         raise CatalogueError(f"{identifier} cannot be hidden in this example: {reason}")
-    places = found.places(setting)
+    places = effect.places(setting)
     if at and place not in places:
         known = ", ".join(repr(name) for name in places)
         raise CatalogueError(f"{identifier} cannot act at {place!r} here; its places are {known}.")
-    values = {item.name: item.prior.value(0.0) for item in found.parameters}
-    for item in found.parameters:
-        if item.magnitude and values[item.name] == 0.0:
-            values[item.name] = item.prior.value(1.0)  # the median of a signed size would hide nothing
-    if numbers or named:
-        values |= _values(text, identifier, numbers.split(","), list(values))
-    return found.patch(setting, values, place if at else places[0])
-
-
-def _values(text: str, identifier: str, given: list[str], names: list[str]) -> dict[str, float]:
-    """Return the values that are given, "VALUE" in the order of `names` or "NAME=VALUE"."""
-    if len(given) > len(names):
-        both = {"has": counted(len(names), "parameter"), "came": counted(len(given), "value")}
-        raise CatalogueError(said("effects.count", identifier=identifier, names=names, **both))
     values = {}
-    for position, part in enumerate(given):
-        name, equals, number = part.rpartition("=")
+    for parameter in effect.parameters:
+        value = parameter.prior.value(0.0)
+        if parameter.magnitude and value == 0.0:
+            # the median of a magnitude of either sign would hide nothing
+            value = parameter.prior.value(1.0)
+        values[parameter.name] = value
+    if numbers or has_names:
+        values |= _parameter_values(text, identifier, numbers.split(","), list(values))
+    return effect.patch(setting, values, place if at else places[0])
+
+
+def _parameter_values(
+    text: str, identifier: str, numbers: list[str], names: list[str]
+) -> dict[str, float]:
+    """Return the values of an effect's parameters by name.
+
+    Parameters
+    ----------
+    text : str
+        The option as the user wrote it.
+    identifier : str
+        The effect.
+    numbers : list of str
+        "VALUE" in the order of the names, or "NAME=VALUE".
+    names : list of str
+        Names of the parameters.
+
+    Raises
+    ------
+    CatalogueError
+        If there are too many values, a name is unknown, or a value is not a finite number.
+    """
+    if len(numbers) > len(names):
+        raise CatalogueError(
+            f"{identifier} has {counted(len(names), 'parameter')} ({comma_list(names)}), but "
+            f"{counted(len(numbers), 'value')} came."
+        )
+    values = {}
+    for position, number_text in enumerate(numbers):
+        name, equals, number = number_text.rpartition("=")
         if equals and name not in names:
-            raise CatalogueError(f"{identifier} has no parameter {name!r}; it has {', '.join(names)}.")
+            raise CatalogueError(
+                f"{identifier} has no parameter {name!r}; it has {', '.join(names)}."
+            )
         try:
-            value = values[name or names[position]] = float(number)
+            value = float(number)
         except ValueError:
             value = nan
         if not isfinite(value):
-            raise CatalogueError(said("effects.numbers", text=text, identifier=identifier, name=names[0]))
+            raise CatalogueError(
+                f"{text!r} must end with numbers, such as {identifier}:{names[0]}=0.1."
+            )
+        values[name or names[position]] = value
     return values
 
 
 def convert(out: Path, *, data: Path, rig: str = "real_wing") -> None:
-    """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""
+    """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""  # noqa: E501
     campaign = parts.read_campaign(parts.write_rig_campaign(rig, data, out))
     options.show("convert", campaign=campaign, out=out, modelled=(out / "model.toml").exists())
 

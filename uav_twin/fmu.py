@@ -3,10 +3,11 @@
 import gc
 import re
 import tempfile
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import typer
 
@@ -17,9 +18,12 @@ from reporting.files import atomic_write_bytes, atomic_write_text, refuse_existi
 from reporting.words import counted
 from scenarios import asset_scripts
 from uav_twin import parts
-from uav_twin.options import answer, said, show
+from uav_twin.options import answer, show
 from uav_twin.structure import fmu as build_structure
 from uav_twin.structure import names_structure
+
+if TYPE_CHECKING:
+    from fe.runtime.arrays import FloatArray
 
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
 """The switch of a missing effect among the variables of an FMU."""
@@ -30,7 +34,8 @@ def bind(
 ) -> None:
     """Draft a binding for an FMU: which variable is which role, in which unit."""
     refuse_existing(out, replace=replace)
-    gc.disable()  # of 100,000 variables nothing is garbage, and looking for it takes a third of the time
+    # nothing of 100,000 variables is garbage, and looking for it takes a third of the time
+    gc.disable()
     try:
         text = parts.draft_binding(parts.read_fmu(file), step_size=step_size)
     finally:
@@ -39,7 +44,9 @@ def bind(
         typer.echo(text, nl=False)
         return
     atomic_write_text(out, text)
-    terminal.say(f"{out}: drafted; correct the roles, then run `uav-twin fmu check {file} --binding {out}`.")
+    terminal.say(
+        f"{out}: drafted; correct the roles, then run `uav-twin fmu check {file} --binding {out}`."
+    )
 
 
 def check(
@@ -62,7 +69,11 @@ def check(
         memory_limit=memory_limit,
     )
     findings = [asdict(finding) for finding in result.findings]
-    answer("fmu check", record={"file": str(file), "passed": result.passed, "findings": findings}, json=json)
+    answer(
+        "fmu check",
+        record={"file": str(file), "passed": result.passed, "findings": findings},
+        json=json,
+    )
     if not result.passed:
         raise terminal.error_exit(f"{file}: {counted(len(result.problems), 'problem')}.")
 
@@ -84,57 +95,80 @@ def build(
     """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
     if script is None and calibration is None and design is not None and names_structure(design):
         if patch is not None or activate or interface != "co-simulation" or windows:
-            raise typer.BadParameter(said("fmu.of_wings"))
+            raise typer.BadParameter(
+                "--patch, --activate, --interface and --windows are for wings; the design is a "
+                "structure."
+            )
         build_structure(design, out=out, kind=kind, fmi=fmi, replace=replace)
         return
-    out = out or Path("uav_wing.fmu")
+    target = out or Path("uav_wing.fmu")
     if calibration is not None and design is not None:
         raise typer.BadParameter("the calibration holds its design: give either it or --design.")
     if activate and patch is None:
         raise typer.BadParameter("there is no --patch whose effects could be switched on.")
-    form: dict[str, Any] = {"kind": kind, "fmi": fmi, "interface": interface}
     if script is not None:
-        if any((design, calibration, patch, windows)) or [*form.values()] != ["python", 2, "co-simulation"]:
-            raise typer.BadParameter(said("fmu.of_the_wing"), param_hint="--script")
+        is_default_form = kind == "python" and fmi == 2 and interface == "co-simulation"
+        if any((design, calibration, patch, windows)) or not is_default_form:
+            raise typer.BadParameter(
+                "--design, --calibration, --patch, --kind, --fmi, --interface and --windows are "
+                "for the wing.",
+                param_hint="--script",
+            )
         source = asset_scripts().get(script, Path(script))
-        show("packed", info=parts.build_script_fmu(source, out, replace=replace))
+        show("packed", info=parts.build_script_fmu(source, target, replace=replace))
         return
-    out = parts.checked_target(out, replace=replace)
+    target = parts.checked_target(target, replace=replace)
     if windows and kind != "compiled":
         raise typer.BadParameter("--windows is for --kind compiled.")
-    form["platforms"] = ("linux64", "win64") if windows else ("linux64",)
+    form: dict[str, Any] = {
+        "kind": kind,
+        "fmi": fmi,
+        "interface": interface,
+        "platforms": ("linux64", "win64") if windows else ("linux64",),
+    }
     effects = None if patch is None else parts.load_patch(patch)
     parts.check_form(**form, patched=effects is not None)
-    if calibration is not None:
-        wing = parts.load_calibration(calibration)
-        shape, form = wing.wing_design, form | parts.tailoring(wing)
-        asset = wing.asset
+    asset = None
+    if calibration is None:
+        wing_design = parts.load_design(design)
     else:
-        shape, asset = parts.load_design(design), None
-    info = parts.pack_wing(shape, out, patch=effects, activate=activate, replace=replace, **form)
-    show("packed", info=info, asset=asset)
+        calibrated_wing = parts.load_calibration(calibration)
+        wing_design = calibrated_wing.wing_design
+        asset = calibrated_wing.asset
+        form |= parts.tailoring(calibrated_wing)
+    packed = parts.pack_wing(
+        wing_design, target, patch=effects, activate=activate, replace=replace, **form
+    )
+    show("packed", info=packed, asset=asset)
 
 
 def info(file: Path, *, variables: bool = True, json: bool = False) -> None:
     """Say what an FMU is: version, capabilities, variables with units and ranges."""
     description, obstacle = parts.inspect_fmu(file)
-    described = parts.describe_fmu(description)
+    fmu_record = parts.describe_fmu(description)
     facts = [
         (name.replace("_", " "), str(value))
-        for name, value in described.items()
+        for name, value in fmu_record.items()
         if isinstance(value, str | int | float | bool) and value != ""
     ]
-    facts.append(("platforms", ", ".join(described.get("platforms", ()))))
-    switches = [row for row in described["variables"] if _SWITCH.fullmatch(row["name"])]
-    effects = (f"{row['name'].split('.')[1]} ({'on' if float(row['start']) else 'off'})" for row in switches)
-    facts += [("effects", ", ".join(effects))] * bool(switches)
-    rows = [_variable_row(variable) for variable in description.variables]
-    record = {"file": str(file)} | described | {"obstacle": obstacle}
-    answer("fmu info", record=record, json=json, facts=facts, rows=rows if variables else ())
+    facts.append(("platforms", ", ".join(fmu_record.get("platforms", ()))))
+    effects = []
+    for row in fmu_record["variables"]:
+        if _SWITCH.fullmatch(row["name"]):
+            _, effect, _ = row["name"].split(".")
+            effects.append(f"{effect} ({'on' if float(row['start']) else 'off'})")
+    if effects:
+        facts.append(("effects", ", ".join(effects)))
+    rows = [_variable_row(variable) for variable in description.variables] if variables else []
+    record = {"file": str(file)} | fmu_record | {"obstacle": obstacle}
+    answer("fmu info", record=record, json=json, facts=facts, rows=rows)
 
 
 def _variable_row(variable: "parts.VariableInfo") -> list[str]:
-    """Return what the table of variables shows of one; an enumeration's items stand with its description."""
+    """Return the cells of a variable in the table of variables.
+
+    The items of an enumeration stand with its description.
+    """
     about = variable.description
     if variable.items:
         items = f"items: {variable.item_list}"
@@ -151,7 +185,10 @@ def _variable_row(variable: "parts.VariableInfo") -> list[str]:
     return ["" if cell is None else visible(str(cell)) for cell in cells]
 
 
-_MOST_PANELS, _MOST_LINES = 8, 10
+_MOST_PANELS = 8
+"""Largest number of panels of a plot."""
+_MOST_LINES = 10
+"""Largest number of lines in a panel."""
 
 
 def simulate(
@@ -172,26 +209,38 @@ def simulate(
     """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
     _refuse_files(out, plot, replace=replace)
     if (binding is None) != (inputs is None):
-        raise FmuInputError("--binding and --inputs go together: one names the columns of the other.")
-    if binding is not None and (stop_time is not None or step_size is not None or values):
-        raise FmuInputError(said("fmu.without_binding"))
-    if interpolation is not None and inputs is None:
-        raise FmuInputError("--interpolation says how inputs go on between the rows of --inputs: give these.")
-    if binding is None:
-        planned = parts.default_experiment(
-            parts.read_fmu(file), stop_time=stop_time, step_size=step_size, values=_values_of(values)
+        raise FmuInputError(
+            "--binding and --inputs go together: one names the columns of the other."
         )
-        bound = planned.binding
+    if binding is not None and (stop_time is not None or step_size is not None or values):
+        raise FmuInputError(
+            "--stop-time, --step-size and --set are for a simulation without --binding, which says "
+            "these itself."
+        )
+    if interpolation is not None and inputs is None:
+        raise FmuInputError(
+            "--interpolation says how inputs go on between the rows of --inputs: give these."
+        )
+    isolated = not in_process
+    if binding is None:
+        experiment = parts.default_experiment(
+            parts.read_fmu(file),
+            stop_time=stop_time,
+            step_size=step_size,
+            values=_values_by_name(values or ()),
+        )
         with closing(
-            parts.FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)
+            parts.FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
         ) as asset:
-            _finish(asset, parts.fly(asset, planned), file, out, plot)
+            _finish(asset, parts.fly(asset, experiment), file, out, plot)
         return
-    assert inputs is not None  # it goes with a binding
-    bound = _interpolated(parts.load_binding(binding), interpolation)
-    steps, histories = parts.read_histories(inputs, bound)
-    bound = parts.ending_with_histories(bound, steps)
-    with closing(parts.FmiAsset(file, bound, isolated=not in_process, step_timeout=step_timeout)) as asset:
+    assert inputs is not None  # they go with a binding
+    fmu_binding = _interpolated(parts.load_binding(binding), interpolation)
+    steps, histories = parts.read_histories(inputs, fmu_binding)
+    fmu_binding = parts.ending_with_histories(fmu_binding, steps)
+    with closing(
+        parts.FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
+    ) as asset:
         _finish(asset, parts.fly_histories(asset, steps, histories), file, out, plot)
 
 
@@ -210,54 +259,64 @@ def simulate_system(
     in_process: bool = False,
     replace: bool = False,
 ) -> None:
-    """Simulate the system of an SSP file from its start; all outputs of the system and its components."""
+    """Simulate the system of an SSP file from its start; all outputs of the system and its components."""  # noqa: E501
     _refuse_files(out, plot, replace=replace)
-    given = _values_of(values)
-    for name, value in given.items():
+    start_values = _values_by_name(values or ())
+    for name, value in start_values.items():
         count = len(value.split(","))
         if count > 1:
-            raise FmuInputError(f"--set {name} has {count} values; ends of a system take one number.")
+            raise FmuInputError(
+                f"--set {name} has {count} values; ends of a system take one number."
+            )
     with tempfile.TemporaryDirectory() as folder:
         wiring = parts.join_ssp(parts.read_ssp(file, folder), delay or ())
-        if left_out := parts.left_out_sentence(wiring, file):
-            terminal.say(f"warning: {left_out}")
-        described = parts.system_description(wiring)
-        planned = parts.default_experiment(described, stop_time=stop_time, step_size=step_size, values=given)
+        warning = parts.left_out_sentence(wiring, file)
+        if warning:
+            terminal.say(f"warning: {warning}")
+        experiment = parts.default_experiment(
+            parts.system_description(wiring),
+            stop_time=stop_time,
+            step_size=step_size,
+            values=start_values,
+        )
         with parts.CoupledAsset(
             wiring,
-            _interpolated(planned.binding, interpolation),
+            _interpolated(experiment.binding, interpolation),
             algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
             iterations=iterations,
             isolated=not in_process,
-            parameters=planned.parameters,
+            parameters=experiment.parameters,
         ) as asset:
-            _finish(asset, parts.fly(asset, planned), file, out, plot)
+            _finish(asset, parts.fly(asset, experiment), file, out, plot)
 
 
 def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
     """Refuse files that cannot be written, before anything is simulated."""
-    for path, suffixes, option in ((out, (".csv", ".nc"), "--out"), (plot, (".png", ".svg"), "--plot")):
+    targets = (("--out", out, (".csv", ".nc")), ("--plot", plot, (".png", ".svg")))
+    for option, path, suffixes in targets:
         if path is not None and path.suffix not in suffixes:
-            raise FmuInputError(f"{path} must end in {' or '.join(suffixes)}: choose another {option}.")
+            raise FmuInputError(
+                f"{path} must end in {' or '.join(suffixes)}: choose another {option}."
+            )
         refuse_existing(path, replace=replace, option=option)
 
 
-def _values_of(texts: list[str] | None) -> dict[str, str]:
-    """Return what `--set` gives, by name, as it is written: what it means depends on the variable."""
+def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
+    """Return the values of `--set NAME=VALUE` by name, as texts that the variables interpret."""
     values: dict[str, str] = {}
-    for text in texts or ():
+    for text in texts:
         name, equals, value = text.partition("=")
         if not (name and equals):
             raise FmuInputError(
-                f"--set {text} is not understood; write NAME=VALUE: a number, true or false, the name of an "
-                "enumeration's item, a text, or several values with commas between."
+                f"--set {text} is not understood; write NAME=VALUE: a number, true or false, the "
+                "name of an enumeration's item, a text, or several values with commas between."
             )
         values[name] = value
     return values
 
 
 def _interpolated(binding: "parts.Binding", kind: str | None) -> "parts.Binding":
-    """Return a binding with inputs that go on between communication points as `--interpolation` says."""
+    """Return a binding whose inputs are interpolated as `--interpolation` says, if it is given."""
     if kind is None:
         return binding
     if kind not in ("zero-order", "linear"):
@@ -272,13 +331,22 @@ def _finish(
     out: Path | None,
     plot: Path | None,
 ) -> None:
-    """Write and draw what was simulated, and say so; where nothing was written, what stands at the end."""
+    """Write and draw a simulated history, and print where it is; if nowhere, print its end.
+
+    Parameters
+    ----------
+    asset : FmiAsset
+        The FMU, at the end of the simulation.
+    history : ObservationHistory
+        Its outputs over time.
+    file : Path
+        The file of the FMU.
+    out, plot : Path or None
+        Files for the history and for its picture.
+    """
     if out is not None:
         parts.write_history(out, asset, (file.name, parts.hash_file(file)), history)
-    binding, units = asset.binding, asset.recorded_units
-    observed = [unit for vector in binding.observation.values() for unit in vector.units]
-    columns = [*zip(binding.observation_variables, observed, history.values.T, strict=True)]
-    columns += [(name, units[name], values) for name, values in history.extra.items()]
+    columns = _history_columns(asset, history)
     if plot is not None:
         _draw(plot, history, columns)
     show(
@@ -288,40 +356,75 @@ def _finish(
         written=[path for path in (out, plot) if path is not None],
         file=file,
         end=history.time[-1] if len(history.time) else asset.time,
-        # The start may be a row of its own.
-        steps=int((history.time > binding.binding.start_time).sum()),
+        # the start may be a row of its own
+        steps=int((history.time > asset.binding.binding.start_time).sum()),
         columns=columns,
     )
 
 
-def _draw(path: Path, history: "parts.ObservationHistory", columns: list[tuple[str, str, Any]]) -> None:
+class HistoryColumn(NamedTuple):
+    """An output over time: its name, its unit, and its values (N,)."""
+
+    name: str
+    unit: str
+    values: "FloatArray"
+
+
+def _history_columns(
+    asset: "parts.FmiAsset", history: "parts.ObservationHistory"
+) -> list[HistoryColumn]:
+    """Return the observed outputs of an asset over time, then what is recorded beside them."""
+    binding = asset.binding
+    units = [unit for vector in binding.observation.values() for unit in vector.units]
+    columns = [
+        HistoryColumn(name, unit, values)
+        for name, unit, values in zip(
+            binding.observation_variables, units, history.values.T, strict=True
+        )
+    ]
+    for name, values in history.extra.items():
+        columns.append(HistoryColumn(name, asset.recorded_units[name], values))
+    return columns
+
+
+def _draw(
+    path: Path, history: "parts.ObservationHistory", columns: Sequence[HistoryColumn]
+) -> None:
     """Draw the outputs over time, those of one unit in one panel, and write the picture."""
-    panels: dict[str, list[tuple[str, Any]]] = {}
-    for name, unit, values in columns:
-        panels.setdefault(unit, []).append((name, values))
-    shown = dict(list(panels.items())[:_MOST_PANELS])
+    columns_of_unit: dict[str, list[HistoryColumn]] = {}
+    for column in columns:
+        columns_of_unit.setdefault(column.unit, []).append(column)
+    panels = list(columns_of_unit.items())[:_MOST_PANELS]
     with parts.publication_style():
-        figure = parts.new_figure(0.5 + 1.5 * len(shown), parts.FULL_WIDTH)
-        axes = figure.subplots(len(shown), squeeze=False, sharex=True)[:, 0]
-        for panel, (unit, lines) in zip(axes, shown.items(), strict=True):
-            for name, values in lines[:_MOST_LINES]:
-                panel.plot(history.time, values, label=name)
-            more = f" and {len(lines) - _MOST_LINES} more" if len(lines) > _MOST_LINES else ""
-            panel.set_ylabel(lines[0][0] + f" [{unit}]" if len(lines) == 1 else f"[{unit}]")
-            if len(lines) > 1:
-                panel.legend(title=more or None, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        figure = parts.new_figure(0.5 + 1.5 * len(panels), parts.FULL_WIDTH)
+        axes = figure.subplots(len(panels), squeeze=False, sharex=True).ravel()
+        for panel_axes, (unit, lines) in zip(axes, panels, strict=True):
+            for line in lines[:_MOST_LINES]:
+                panel_axes.plot(history.time, line.values, label=line.name)
+            if len(lines) == 1:
+                panel_axes.set_ylabel(f"{lines[0].name} [{unit}]")
+                continue
+            panel_axes.set_ylabel(f"[{unit}]")
+            left_out = len(lines) - _MOST_LINES
+            title = f" and {left_out} more" if left_out > 0 else None
+            panel_axes.legend(title=title, loc="center left", bbox_to_anchor=(1.0, 0.5))
         axes[-1].set_xlabel("time [s]")
         figure.tight_layout()
-        atomic_write_bytes(path, (parts.to_svg if path.suffix == ".svg" else parts.to_png)(figure))
+        to_bytes = parts.to_svg if path.suffix == ".svg" else parts.to_png
+        atomic_write_bytes(path, to_bytes(figure))
 
 
 def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:
-    """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""
-    parts.checked_target(out, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError)
+    """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""  # noqa: E501
+    parts.checked_target(
+        out, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError
+    )
     if _is_design(what):
-        path = parts.export_design(None if what == "uav_wing" else Path(what), out, replace_file=replace)
+        design = None if what == "uav_wing" else Path(what)
+        path = parts.export_design(design, out, replace_file=replace)
     else:
-        path = parts.export_scenario(parts.load_scenario(what), out, seed=seed, replace_file=replace)
+        scenario = parts.load_scenario(what)
+        path = parts.export_scenario(scenario, out, seed=seed, replace_file=replace)
     terminal.say(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
 
 
@@ -334,11 +437,13 @@ def _is_design(what: str) -> bool:
 
 
 def check_system(file: Path, *, json: bool = False) -> None:
-    """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""
+    """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""  # noqa: E501
     result = parts.check_ssp(file)
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
-    answer("ssp check", record={"passed": not result.problems} | asdict(result), json=json, file=file)
+    answer(
+        "ssp check", record={"passed": not result.problems} | asdict(result), json=json, file=file
+    )
     if result.problems:
         raise typer.Exit(1)
 
@@ -357,23 +462,23 @@ def sample(
     resume: bool = False,
     replace: bool = False,
 ) -> None:
-    """Ask an FMU for its observation at every draw, state and control; write an observation library."""
+    """Ask an FMU for its observation at every draw, state and control; write an observation library."""  # noqa: E501
     if resume and replace:
         raise typer.BadParameter("give either --resume or --replace.", param_hint="--resume")
     if scenario is not None and role is not None:
         raise typer.BadParameter("the scenario says what is observed.", param_hint="--role")
 
-    def kept() -> str:
-        there = parts.blocks_folder(out).is_dir()
-        hint = "go on with the same command and --resume" if there else "nothing was sampled yet"
-        return f"finished blocks are kept: {hint}"
+    def sentence_when_interrupted() -> str:
+        if parts.blocks_folder(out).is_dir():
+            return "finished blocks are kept: go on with the same command and --resume"
+        return "finished blocks are kept: nothing was sampled yet"
 
     with (
-        terminal.interruptible(kept),
+        terminal.interruptible(sentence_when_interrupted),
         tempfile.TemporaryDirectory(prefix="uav_twin_library_") as folder,
     ):
         if scenario is not None:
-            wanted = parts.grid_of_scenario(
+            library_grid = parts.grid_of_scenario(
                 parts.load_scenario(scenario),
                 Path(folder),
                 grid or (),
@@ -381,8 +486,14 @@ def sample(
                 settling_steps=settle,
             )
         elif fmu is None or binding is None:
-            raise typer.BadParameter("give a scenario, or --fmu and --binding.", param_hint="SCENARIO")
+            raise typer.BadParameter(
+                "give a scenario, or --fmu and --binding.", param_hint="SCENARIO"
+            )
         else:
-            wanted = parts.grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
-        found = parts.sample_library(wanted, out, workers=workers, resume=resume, replace_existing=replace)
-    show("library", found=found, library=found.library)
+            library_grid = parts.grid_of_fmu(
+                fmu, binding, grid or (), role=role, settling_steps=settle
+            )
+        sampled = parts.sample_library(
+            library_grid, out, workers=workers, resume=resume, replace_existing=replace
+        )
+    show("library", found=sampled, library=sampled.library)

@@ -1,4 +1,4 @@
-"""What commands take from the other packages: read by type checkers, by editors and by `parts.py`."""
+"""What commands take from other packages: type checkers, editors and `parts.py` read this list."""
 
 from calibration.dynamics.extremes import refine_by_extremes as refine_by_extremes
 from calibration.dynamics.figures import ring_down_figure as ring_down_figure
@@ -81,6 +81,7 @@ from fe.reduction.model_cache import write_wing_vtu as write_wing_vtu
 from fe.reduction.reduced_basis import measured_errors as measured_errors
 from fe.runtime.patch import ModelPatch as ModelPatch
 from fe.runtime.reduced import ReducedModel as ReducedModel
+from fe.structure.affine import AffineResponse as AffineResponse
 from fe.structure.affine import AffineStructure as AffineStructure
 from fe.structure.affine import natural_frequencies as natural_frequencies
 from fe.structure.affine import static_responses as static_responses
@@ -97,6 +98,7 @@ from fe.verification.calculix_run import calculix_program as calculix_program
 from fe.verification.calculix_run import required_calculix as required_calculix
 from fe.verification.wing_checks import Check as Check
 from fe.verification.wing_checks import all_checks as all_checks
+from fe.wing.design import WingDesign as WingDesign
 from fe.wing.design import load_design as load_design
 from fe.wing.operators import assemble as assemble
 from fe.wing.operators import structural_mass as structural_mass

@@ -1,4 +1,4 @@
-"""Files of the user that hide a package of this project, because Python finds them first, are refused."""
+"""Refuse files of the user that hide a package of this project, because Python finds them first."""
 
 from functools import cache
 from importlib.util import find_spec
@@ -27,25 +27,25 @@ def refuse_shadowing() -> None:
     Raises
     ------
     ShadowedPackageError
-        One is not: a file of that name lies beside the user's script, or was imported before.
+        If one is not: such a file lies beside the user's script, or was imported before.
     """
-    beside = Path(__file__).resolve().parent.parent
+    project = Path(__file__).resolve().parent.parent
     for name in PACKAGES:
-        place = _place(name)
-        if place is not None and place.resolve() != beside / name:
+        location = _import_location(name)
+        if location is not None and location.resolve() != project / name:
             raise ShadowedPackageError(
-                f"{place} hides the package `{name}` of uav-twin, because Python finds it first: "
-                "rename it, or move it out of the folder of the script.",
+                f"{location} hides the package `{name}` of uav-twin, because Python finds it "
+                "first: rename it, or move it out of the folder of the script.",
                 name=name,
-                path=str(place),
+                path=str(location),
             )
 
 
-def _place(name: str) -> Path | None:
-    """Return the file or folder that an import of a name would take, None where there is nothing."""
+def _import_location(name: str) -> Path | None:
+    """Return the file or folder that Python would import for a name; None if it finds nothing."""
     try:
         spec = find_spec(name)
-    except ValueError:  # a module that was put together without a file
+    except ValueError:  # a module that was made without a file
         return None
     if spec is None:
         return None

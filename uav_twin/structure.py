@@ -2,8 +2,8 @@
 
 import json
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from math import inf, nan
 from os.path import relpath
 from pathlib import Path
@@ -17,50 +17,71 @@ from reporting import terminal
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text, refuse_existing, refuse_filled
 from reporting.progress import stage
+from reporting.words import comma_list
 from scenarios import structure_files
 from uav_twin import parts
-from uav_twin.options import answer, said, show
+from uav_twin.options import answer, show
 
 
 def wing(*, design: Path | None = None, vtu: Path | None = None, as_json: bool = False) -> None:
     """Say what the wing weighs, how it vibrates and how stiff its tip is."""
-    drawn, state, written = parts.load_design(design), DigitalState(), list[Path]()
-    model = parts.reduced_model(drawn)
-    modes, structure = model.modes(state.values, state.stiffness_loss), parts.structural_mass(drawn)
-    shapes = dict(zip(modes.followed, ("first flapwise bending", "second flapwise bending"), strict=True))
-    if vtu is not None:
-        fields = parts.wing_fields(drawn)
-        vector = fields.vector(state.values, state.stiffness_loss, load_factor=3.0)
-        written = [vtu, vtu.with_name(f"{vtu.stem}-modes{vtu.suffix}")]
-        parts.write_wing_vtu(written[0], fields, vector)
-        parts.write_modes_vtu(written[1], fields, vector)
+    wing_design = parts.load_design(design)
+    state = DigitalState()
+    model = parts.reduced_model(wing_design)
+    modes = model.modes(state.values, state.stiffness_loss)
+    bendings = ("first flapwise bending", "second flapwise bending")
+    name_of_mode = dict(zip(modes.followed, bendings, strict=True))
+    structural_mass = parts.structural_mass(wing_design)
+    written = [] if vtu is None else _write_wing_fields(vtu, wing_design, state)
     record = {
-        "design": drawn.name,
-        "design_hash": drawn.hash,
-        "structural_mass": structure,
-        "mass": structure + 2 * state.servo_mass + state.pitot_mass,
+        "design": wing_design.name,
+        "design_hash": wing_design.hash,
+        "structural_mass": structural_mass,
+        "mass": structural_mass + 2 * state.servo_mass + state.pitot_mass,
         "tip_stiffness": float(model.tip_stiffness(state.young_modulus_factor)),
         "modes": [
-            {"number": index + 1, "frequency": float(frequency), "shape": shapes.get(index, "")}
+            {
+                "number": index + 1,
+                "frequency": float(frequency),
+                "shape": name_of_mode.get(index, ""),
+            }
             for index, frequency in enumerate(modes.frequency)
         ],
-        "written": [*map(str, written)],
+        "written": [str(path) for path in written],
     }
     answer("wing", record=record, json=as_json)
 
 
-def verify_wing(*, design: Path | None = None, out: Path | None = None, quick: bool = False) -> None:
-    """Check a wing's finite element model: balances, convergence, and CalculiX where it is installed."""
-    drawn = parts.load_design(design)
+def _write_wing_fields(
+    path: Path, wing_design: "parts.WingDesign", state: DigitalState
+) -> tuple[Path, Path]:
+    """Write the fields of a wing in a 3 g turn, and its modes beside them; return both files."""
+    fields = parts.wing_fields(wing_design)
+    vector = fields.vector(state.values, state.stiffness_loss, load_factor=3.0)
+    path_of_modes = path.with_name(f"{path.stem}-modes{path.suffix}")
+    parts.write_wing_vtu(path, fields, vector)
+    parts.write_modes_vtu(path_of_modes, fields, vector)
+    return path, path_of_modes
+
+
+def verify_wing(
+    *, design: Path | None = None, out: Path | None = None, quick: bool = False
+) -> None:
+    """Check a wing's finite element model: balances, convergence, and CalculiX where it is installed."""  # noqa: E501
+    wing_design = parts.load_design(design)
     refuse_filled(out)
     with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch:
-        checks = parts.all_checks(drawn, (out or Path(scratch)) / "calculix", quick=quick)
+        checks = parts.all_checks(wing_design, (out or Path(scratch)) / "calculix", quick=quick)
     show("checks", checks=checks)
     if parts.calculix_program() is None:
-        terminal.say("CalculiX is not installed (apt-get install calculix-ccx): its checks are left out.")
+        terminal.say(
+            "CalculiX is not installed (apt-get install calculix-ccx): its checks are left out."
+        )
     if out is not None:
         rows = [asdict(check) | {"passed": check.passed} for check in checks]
-        record = parts.plain({"design": drawn.name, "design_hash": drawn.hash, "checks": rows})
+        record = parts.plain(
+            {"design": wing_design.name, "design_hash": wing_design.hash, "checks": rows}
+        )
         path = atomic_write_text(out / "verification.json", json.dumps(record, indent=2) + "\n")
         terminal.say(f"Wrote {path}")
     end_with(checks)
@@ -109,24 +130,41 @@ def assembled_of_any(file: Path, memory_limit: float | None) -> "parts.AffineStr
         return parts.assemble(located(file), in_bytes(memory_limit))
 
 
-def info(file: Path, *, modes: int = 6, memory_limit: float | None = None, json: bool = False) -> None:
-    """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""
+def info(
+    file: Path, *, modes: int = 6, memory_limit: float | None = None, json: bool = False
+) -> None:
+    """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""  # noqa: E501
     structure = assembled_of_any(file, memory_limit)
     with stage("Solving the loads and the modes"):
         record = structure_record(structure, modes)
     answer("structure info", record=record, json=json)
-    for load in () if json else record["loads"]:
-        outputs = [("gauge", name, 1e6 * value, "microstrain") for name, value in load["strain"].items()]
-        outputs += [("displacement", name, 1e3 * value, "mm") for name, value in load["output"].items()]
-        show("load of a structure", load=load, outputs=outputs)
+    if json:
+        return
+    for load in record["loads"]:
+        strains = [
+            ("gauge", name, 1e6 * value, "microstrain") for name, value in load["strain"].items()
+        ]
+        displacements = [
+            ("displacement", name, 1e3 * value, "mm") for name, value in load["output"].items()
+        ]
+        show("load of a structure", load=load, outputs=strains + displacements)
 
 
 def structure_record(structure: "parts.AffineStructure", modes: int) -> dict[str, Any]:
-    """Return what is known of a structure without damage, at nominal values, by name.
+    """Return the facts about a structure without damage, at nominal values, by name.
 
-    Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in SI units.
+    Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in
+    SI units.
     """
-    design, heavy = structure.design, structure.mass().diagonal().any()
+    design = structure.design
+    if isinstance(structure, parts.Structure):
+        facts_of_kind = _mesh_facts(structure)
+    else:
+        facts_of_kind = {"matrices": [*design.files]}
+    frequencies: list[float] = []
+    if structure.mass().diagonal().any():
+        frequencies = parts.natural_frequencies(structure, modes).frequency.tolist()
+    responses = parts.static_responses(structure)
     return {
         "name": design.name,
         "design_hash": structure.design_hash,
@@ -134,23 +172,30 @@ def structure_record(structure: "parts.AffineStructure", modes: int) -> dict[str
         "length_unit": design.length_unit,
         "remarks": [],
         "parts": [],
-        **(_of_mesh(structure) if isinstance(structure, parts.Structure) else {"matrices": [*design.files]}),
-        "frequencies": parts.natural_frequencies(structure, modes)[0].tolist() if heavy else [],
-        "loads": [
-            {
-                "name": name,
-                "control": structure.loads[name],
-                "value": structure.control_value_alone(name),
-                "largest_displacement": found.largest,
-                "strain": dict(zip(structure.gauges, map(float, found.strain), strict=True)),
-                "output": dict(zip(structure.displacements, map(float, found.output), strict=True)),
-            }
-            for name, found in parts.static_responses(structure).items()
-        ],
+        **facts_of_kind,
+        "frequencies": frequencies,
+        "loads": [_load_facts(structure, name, response) for name, response in responses.items()],
     }
 
 
-def _of_mesh(structure: "parts.Structure") -> dict[str, Any]:
+def _load_facts(
+    structure: "parts.AffineStructure", name: str, response: "parts.AffineResponse"
+) -> dict[str, Any]:
+    """Return the facts about a load and the response to it alone, by name."""
+    strains = response.strain.tolist()
+    displacements = response.output.tolist()
+    return {
+        "name": name,
+        "control": structure.loads[name],
+        "value": structure.control_value_alone(name),
+        "largest_displacement": response.largest,
+        "strain": dict(zip(structure.gauges, strains, strict=True)),
+        "output": dict(zip(structure.displacements, displacements, strict=True)),
+    }
+
+
+def _mesh_facts(structure: "parts.Structure") -> dict[str, Any]:
+    """Return the facts about a structure from a mesh, by name."""
     mesh = structure.mesh
     mass, centre = parts.mass_and_centre(structure)
     return {
@@ -167,40 +212,74 @@ def _of_mesh(structure: "parts.Structure") -> dict[str, Any]:
         "centre_of_gravity": (centre / mesh.unit).tolist(),
         "lower": (mesh.points.min(axis=0) / mesh.unit).tolist(),
         "upper": (mesh.points.max(axis=0) / mesh.unit).tolist(),
-        "parts": [
-            dict(zip(("what", "name", "set", "count", "of", "note"), row, strict=True))
-            for row in _parts(structure)
-        ],
+        "parts": [asdict(part) for part in _structure_parts(structure)],
     }
 
 
-def _parts(structure: "parts.Structure") -> Iterator[tuple[str, str, str | None, int, str, str]]:
-    """Yield what each part is, its name, its set, how much of what it holds, and a note."""
-    design, mesh = structure.design, structure.mesh
+@dataclass(frozen=True)
+class StructurePart:
+    """A part of a structure, as it is listed.
+
+    Attributes
+    ----------
+    what : str
+        The kind of part.
+    name : str
+        Its name.
+    set : str or None
+        The set of the mesh that it is on.
+    count : int
+        How many elements, nodes or faces it has.
+    of : str
+        Which of these are counted.
+    note : str
+        A remark.
+    """
+
+    what: str
+    name: str
+    set: str | None
+    count: int
+    of: str
+    note: str = ""
+
+
+def _structure_parts(structure: "parts.Structure") -> Iterator[StructurePart]:
+    """Yield materials, damage regions, supports, loads, ports and gauges of a structure."""
+    design = structure.design
+    mesh = structure.mesh
     for number, material in enumerate(design.material):
         count = int((structure.material_of == number).sum())
         note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
-        yield "material", material.name, material.set, count, "elements", note
+        yield StructurePart("material", material.name, material.set, count, "elements", note)
     for number, damage in enumerate(design.damage):
         count = int((structure.region_of == number).sum())
-        yield "damage region", damage.name, damage.set, count, "elements", ""
+        yield StructurePart("damage region", damage.name, damage.set, count, "elements")
     for number, support in enumerate(design.support, start=1):
         count = len(mesh.nodes_of(support.set, f"support[{number}]"))
-        notes = ["rigid"] * (support.rigid_about is not None)
-        notes += [f"holds {', '.join(support.hold)}"] * bool(support.hold)
-        notes += ["springs"] * bool(support.springs)
-        yield "support", str(number), support.set, count, "nodes", ", ".join(notes)
+        notes = []
+        if support.rigid_about is not None:
+            notes.append("rigid")
+        if support.hold:
+            notes.append(f"holds {', '.join(support.hold)}")
+        if support.springs:
+            notes.append("springs")
+        yield StructurePart("support", str(number), support.set, count, "nodes", ", ".join(notes))
     for load in design.load:
         if load.set is not None:
             nodes = mesh.nodes_of(load.set, load.name)
             faces = len(mesh.faces_between(load.set, nodes))
-            yield "load", load.name, load.set, faces or len(nodes), "faces" if faces else "nodes", ""
+            count, counted = (faces, "faces") if faces else (len(nodes), "nodes")
+            yield StructurePart("load", load.name, load.set, count, counted)
     for port in design.port:
         if port.set is not None:
-            yield "port", port.name, port.set, len(mesh.nodes_of(port.set, port.name)), "nodes", ""
+            count = len(mesh.nodes_of(port.set, port.name))
+            yield StructurePart("port", port.name, port.set, count, "nodes")
     for gauge, distance in zip(design.gauge, structure.gauges_moved.tolist(), strict=True):
-        moved = f"put onto the surface, {distance / mesh.unit:.3g} {mesh.unit_name} away"
-        yield "gauge", gauge.name, "", 1, "place", moved if distance > 1e-6 * mesh.size else ""
+        note = ""
+        if distance > 1e-6 * mesh.size:
+            note = f"put onto the surface, {distance / mesh.unit:.3g} {mesh.unit_name} away"
+        yield StructurePart("gauge", gauge.name, "", 1, "place", note)
 
 
 def verify(
@@ -215,18 +294,33 @@ def verify(
     parts.required_calculix()
     refuse_filled(out)
     structure = assembled(file, memory_limit, mass_as_stiffness=True)
-    with tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch, stage("CalculiX on the same mesh"):
-        found = parts.agreement(parts.structure_deck(structure), out or Path(scratch), modes)
-    checks = [
-        parts.Check(f"load {load}", what, value, RESPONSE_LIMIT)
-        for load, differences in found.loads.items()
-        for what, value in differences.items()
-    ]
-    checks.append(parts.Check(f"{len(found.ours)} modes", "frequencies", found.modal, FREQUENCY_LIMIT))
-    keys = {"of": "group", "what": "name", "difference": "value", "limit": "limit"}
+    with (
+        tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch,
+        stage("CalculiX on the same mesh"),
+    ):
+        agreement = parts.agreement(parts.structure_deck(structure), out or Path(scratch), modes)
+    checks = []
+    for load, differences in agreement.loads.items():
+        for response, difference in differences.items():
+            checks.append(parts.Check(f"load {load}", response, difference, RESPONSE_LIMIT))
+    mode_count = len(agreement.ours)
+    checks.append(
+        parts.Check(f"{mode_count} modes", "frequencies", agreement.modal, FREQUENCY_LIMIT)
+    )
     record = {
-        "checks": [{key: getattr(check, own) for key, own in keys.items()} for check in checks],
-        "frequencies": {key: getattr(found, key).tolist() for key in ("ours", "calculix")},
+        "checks": [
+            {
+                "of": check.group,
+                "what": check.name,
+                "difference": check.value,
+                "limit": check.limit,
+            }
+            for check in checks
+        ],
+        "frequencies": {
+            "ours": agreement.ours.tolist(),
+            "calculix": agreement.calculix.tolist(),
+        },
         "passed": all(check.passed for check in checks),
     }
     answer("checks", record=record, json=json, checks=checks)
@@ -246,27 +340,55 @@ def field(
     """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
     refuse_existing(out, replace=replace)
     structure = assembled(file, memory_limit)
+    values = _values_at(at or (), structure.ranges)
+    with stage("Solving and writing the field"):
+        parts.write_structure_vtu(out, structure, values)
+    terminal.say(
+        f"{out}: {len(structure.mesh.cells):,} cells, displacement, strain, material, region, loss"
+    )
+
+
+def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Return the values that `--at` sets, by name.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        NAME=VALUE, each name once.
+    ranges : mapping of str to (float, float)
+        Least and largest value of each name.
+
+    Raises
+    ------
+    BadParameter
+        If a text is not of this form, or a value lies outside its range.
+    """
     values: dict[str, float] = {}
-    for text in at or ():
+    for text in texts:
         name, _, number = text.partition("=")
-        low, high = structure.ranges.get(name, (inf, -inf))
+        low, high = ranges.get(name, (inf, -inf))
         try:
             value = float(number)
         except ValueError:
             value = nan
         if name in values or not low <= value <= high:
-            ranges = structure.ranges.items()
-            known = [f"{own} from {low:g} to {high:g}" for own, (low, high) in ranges]
-            raise typer.BadParameter(said("structure.at", text=text, known=known), param_hint="--at")
+            known = [f"{name} from {low:g} to {high:g}" for name, (low, high) in ranges.items()]
+            raise typer.BadParameter(
+                f"NAME=VALUE is expected, each name once, but {text!r} came; there are "
+                f"{comma_list(known)}. Give a value inside, or widen its range in the structure "
+                "file.",
+                param_hint="--at",
+            )
         values[name] = value
-    with stage("Solving and writing the field"):
-        parts.write_structure_vtu(out, structure, values)
-    terminal.say(f"{out}: {len(structure.mesh.cells):,} cells, displacement, strain, material, region, loss")
+    return values
 
 
-def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, json: bool = False) -> None:
+def reduce(
+    file: Path, *, states: int = 4, memory_limit: float | None = None, json: bool = False
+) -> None:
     """Make the reduced model of a structure, keep it in the cache, and measure its errors."""
-    model, errors = parts.reduced_model(located(file), memory_limit=in_bytes(memory_limit)), None
+    model = parts.reduced_model(located(file), memory_limit=in_bytes(memory_limit))
+    errors = None
     if states:
         structure = assembled_of_any(file, memory_limit)
         with stage("Comparing it with the full model"):
@@ -276,17 +398,20 @@ def reduce(file: Path, *, states: int = 4, memory_limit: float | None = None, js
         "design_hash": model.design_hash,
         "static_basis": len(model.static_load.T),
         "modal_basis": len(model.modal_load.T),
-        "ranges": {name: list(ends) for name, ends in model.validity.items()},
+        "ranges": {name: list(limits) for name, limits in model.validity.items()},
         "errors": None if errors is None else asdict(errors),
     }
-    answer("structure reduce", record=record, json=json, model=model, kinds=_kinds(model))
+    answer("structure reduce", record=record, json=json, model=model, kinds=_input_kinds(model))
 
 
-def _kinds(model: "parts.ReducedModel") -> dict[str, str]:
-    """Return what each of the names is that a reduced model holds for."""
-    kinds = dict.fromkeys(model.parameters, "parameter") | dict.fromkeys(model.regions, "stiffness loss")
-    controls = zip(model.controls, model.control_units, strict=True)
-    return kinds | dict.fromkeys(model.masses, "mass [kg]") | {n: f"control [{unit}]" for n, unit in controls}
+def _input_kinds(model: "parts.ReducedModel") -> dict[str, str]:
+    """Return the kind of each input of a reduced model, by its name."""
+    kinds = dict.fromkeys(model.parameters, "parameter")
+    kinds |= dict.fromkeys(model.regions, "stiffness loss")
+    kinds |= dict.fromkeys(model.masses, "mass [kg]")
+    for name, unit in zip(model.controls, model.control_units, strict=True):
+        kinds[name] = f"control [{unit}]"
+    return kinds
 
 
 def fmu(
@@ -304,24 +429,34 @@ def fmu(
     version: Literal[2, 3] = 3 if fmi == 3 else 2
     parts.check_form(kind, version)
     if version == 3 and (binding is not None or rig is not None):
-        raise typer.BadParameter("--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding.")
+        raise typer.BadParameter(
+            "--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding."
+        )
     source = located(file)
     target = parts.checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
-    taken = {source.resolve(): "the structure file", target.resolve(): "the FMU"}
+    used_paths = {source.resolve(): "the structure file", target.resolve(): "the FMU"}
     for option, path in (("--binding", binding), ("--rig", rig)):
-        if path is not None:
-            if path.resolve() in taken:
-                raise FileNotWrittenError(f"{path} is {taken[path.resolve()]}: choose another {option}.")
-            taken[path.resolve()] = f"the file of {option}"
-            refuse_existing(path, replace=replace, option=option)
-    design, others = parts.load_structure(source), list[tuple[Path, str, str]]()
-    if binding is not None:
-        others.append((binding, parts.structure_binding_text(design), "its binding"))
-    if rig is not None:
-        use = f"the model of `uav-twin calibrate campaign` and `discrepancy run CAMPAIGN --model {rig}`"
-        others.append((rig, parts.rig_text(design, relpath(target, rig.parent)), use))
+        if path is None:
+            continue
+        if path.resolve() in used_paths:
+            raise FileNotWrittenError(
+                f"{path} is {used_paths[path.resolve()]}: choose another {option}."
+            )
+        used_paths[path.resolve()] = f"the file of {option}"
+        refuse_existing(path, replace=replace, option=option)
+    # texts of further files, before anything is built or written
+    design = parts.load_structure(source)
+    binding_text = parts.structure_binding_text(design) if binding is not None else ""
+    rig_text = parts.rig_text(design, relpath(target, rig.parent)) if rig is not None else ""
     model = parts.reduced_model(source, memory_limit=in_bytes(memory_limit))
-    show("packed", info=parts.build_fmu(model, target, kind=kind, fmi=version, replace=replace))
-    for path, text, what in others:
-        atomic_write_text(path, text)
-        terminal.say(f"{path}: {what}")
+    packed = parts.build_fmu(model, target, kind=kind, fmi=version, replace=replace)
+    show("packed", info=packed)
+    if binding is not None:
+        atomic_write_text(binding, binding_text)
+        terminal.say(f"{binding}: its binding")
+    if rig is not None:
+        atomic_write_text(rig, rig_text)
+        terminal.say(
+            f"{rig}: the model of `uav-twin calibrate campaign` and "
+            f"`discrepancy run CAMPAIGN --model {rig}`"
+        )

@@ -68,8 +68,8 @@ def generate(arguments: argparse.Namespace) -> int:
         ):
             list(pool.map(partial(_build_region, arguments.cache), range(len(REGION_LINES))))
         prepared = time.perf_counter() - begin
-        made = pool.map(partial(_make, arguments.out, arguments.cache), wanted, chunksize=2)
-        for _ in track(made, description="campaigns", total=len(wanted), console=console):
+        written = pool.map(partial(_make, arguments.out, arguments.cache), wanted, chunksize=2)
+        for _ in track(written, description="campaigns", total=len(wanted), console=console):
             pass
     elapsed = time.perf_counter() - begin
     console.print(

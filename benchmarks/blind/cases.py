@@ -225,12 +225,12 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
     work = workbench(order.rig, folder)
     generator = np.random.default_rng([order.seed, 20211])
     chance = draw_chance(generator, work.plan)
-    known = reference(work.rig, work.plan, chance)
+    nominal = reference(work.rig, work.plan, chance)
     if order.kind == "trap":
-        return _trap(order, work, generator, chance, known)
+        return _trap(order, work, generator, chance, nominal)
     for _ in range(ATTEMPTS):
-        hidden, changes, distances = _drawn(order.identifiers, work, generator, known)
-        signals = finite_signals(work, chance, changes) if hidden else known.nominal
+        hidden, changes, distances = _drawn(order.identifiers, work, generator, nominal)
+        signals = finite_signals(work, chance, changes) if hidden else nominal.nominal
         if signals is not None:
             break
     else:  # together they may take more stiffness from a joint than it has
@@ -240,7 +240,7 @@ def make_case(order: Order, folder: Path | None = None) -> Case:
 
 
 def finite_signals(work: Workbench, chance: Chance, changes: Changes) -> Signals | None:
-    """Return readings without noise, None if it diverges or a load has no equilibrium."""
+    """Return readings without noise; None if the motion diverges or there is no equilibrium."""
     try:
         with np.errstate(invalid="ignore", over="ignore"):
             signals = true_signals(work.rig, work.plan, chance, changes)
@@ -387,7 +387,7 @@ def orders(
         for number in range(trap_count):
             rig = trap.rigs[number % len(trap.rigs)]
             wanted.append(("trap", rig, (), name))
-    wanted = [item for item in wanted if item[0] in kinds and item[1] in rigs]
+    wanted = [order for order in wanted if order[0] in kinds and order[1] in rigs]
     shuffled = [wanted[k] for k in generator.permutation(len(wanted))]
     return [
         Order(f"case-{number:04d}", kind, rig, names, seed * 100003 + number, trap)

@@ -92,12 +92,12 @@ class Changes:
         """Both together; where both set the same number, the other's holds."""
         empty = Changes()
         values: dict[str, Any] = {}
-        for item in fields(Changes):
-            mine, its = getattr(self, item.name), getattr(other, item.name)
+        for attribute in fields(Changes):
+            mine, its = getattr(self, attribute.name), getattr(other, attribute.name)
             if isinstance(mine, tuple):
-                values[item.name] = mine + its
-            elif its != getattr(empty, item.name):
-                values[item.name] = its
+                values[attribute.name] = mine + its
+            elif its != getattr(empty, attribute.name):
+                values[attribute.name] = its
         return replace(self, **values)
 
     @property

@@ -62,12 +62,12 @@ class Reference:
         residual = self._residual(signals, moved)
         cost = float(residual @ residual)
         for first in STARTS if cost > 100.0 else ():
-            there = np.zeros(len(moved))
-            there[0] = first
-            after = self._residual(signals, there)
+            start = np.zeros(len(moved))
+            start[0] = first
+            after = self._residual(signals, start)
             reached = float(after @ after + first**2)
             if reached < cost:
-                moved = there
+                moved = start
                 residual = after
                 cost = reached
                 fresh = False
@@ -82,12 +82,12 @@ class Reference:
                 normal + damping * np.diag(np.diag(normal)), matrix.T @ residual - moved
             )
             longest = float(np.abs(step[: len(self.plan.priors)]).max())
-            there = moved + step * min(1.0, LONGEST / longest)
-            after = self._residual(signals, there)
-            reached = float(after @ after + there @ there)
+            start = moved + step * min(1.0, LONGEST / longest)
+            after = self._residual(signals, start)
+            reached = float(after @ after + start @ start)
             if reached < cost:
                 gain = 1.0 - reached / cost
-                moved = there
+                moved = start
                 residual = after
                 cost = reached
                 damping = 0.1 * damping
@@ -106,11 +106,11 @@ class Reference:
 
     def _residual(self, signals: Signals, moved: FloatArray) -> FloatArray:
         plan = self.plan
-        there = self._moved(moved, len(plan.priors))
+        parameters = self._moved(moved, len(plan.priors))
         gains = dict(zip(plan.channels, moved[len(plan.priors) :], strict=False))
         difference = {
             t.name: signals[t.name]
-            - there[t.name] * [1.0 + plan.channels[c].gain * gains[c] for c in t.channels]
+            - parameters[t.name] * [1.0 + plan.channels[c].gain * gains[c] for c in t.channels]
             for t in plan.trials
         }
         return whitened(plan, difference)

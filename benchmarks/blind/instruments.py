@@ -150,9 +150,9 @@ def _apply(
         values += amplitude * np.exp(-ratio * w * times) * wave
     elif fault.kind == "high_pass" and ring:
         step = (times[-1] - times[0]) / (len(times) - 1)
-        kept = float(np.exp(-step / first))
-        rise = np.diff(values, prepend=values[0]) * first / step * (1.0 - kept)
-        values[:] = lfilter([1.0], [1.0, -kept], rise)
+        memory = float(np.exp(-step / first))
+        rise = np.diff(values, prepend=values[0]) * first / step * (1.0 - memory)
+        values[:] = lfilter([1.0], [1.0, -memory], rise)
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ def measure(
         clean = signals[trial.name]
         noise = np.empty_like(clean)
         for column in range(clean.shape[1]):
-            own = correlation if trial.kind == "ringdown" else 0.0
-            noise[:, column] = coloured(generator, len(clean), own)
+            noise_correlation = correlation if trial.kind == "ringdown" else 0.0
+            noise[:, column] = coloured(generator, len(clean), noise_correlation)
         zero = np.array([c.offset for c in channels]) * generator.standard_normal(len(channels))
         deviation = noise_factor * np.array([c.noise for c in channels])
         values[trial.name] = clean * [gain[c.name] for c in channels] + zero + noise * deviation

@@ -29,6 +29,17 @@ K x; Bouc-Wen (k, yield displacement, order): k (z - x); viscous (c): c v.
 """
 
 
+SIZE = 0
+"""Column of the coefficient of a law: F0, c, k."""
+EXPONENT = 1
+HALF_WIDTH = 1
+YIELD = 1
+"""Column of the second number of friction and power, of a gap, and of Bouc-Wen."""
+SIDE = 2
+ORDER = 2
+"""Column of the third number of power, and of Bouc-Wen."""
+
+
 @dataclass(frozen=True)
 class Law:
     """A law at a port.
@@ -206,15 +217,14 @@ def elastic_force(
         Value of the Bouc-Wen variable.
     """
     kind = laws.kinds[port]
-    first = laws.numbers[port, 0]
-    second = laws.numbers[port, 1]
+    size = laws.numbers[port, SIZE]
     if kind == POWER:
-        side = laws.numbers[port, 2]
-        if side * displacement < 0.0:
+        if laws.numbers[port, SIDE] * displacement < 0.0:
             return 0.0
-        return first * abs(displacement) ** second * np.sign(displacement)
+        return size * abs(displacement) ** laws.numbers[port, EXPONENT] * np.sign(displacement)
     if kind == GAP:
-        return -first * min(max(displacement, -second), second)
+        half_width = laws.numbers[port, HALF_WIDTH]
+        return -size * min(max(displacement, -half_width), half_width)
     if kind == JENKINS:
         total = 0.0
         for e in range(laws.slip.shape[1]):
@@ -225,7 +235,7 @@ def elastic_force(
                 total += stiffness * (deflection - displacement)
         return total
     if kind == BOUC_WEN:
-        return first * (bouc_wen - displacement)
+        return size * (bouc_wen - displacement)
     return 0.0
 
 
@@ -280,9 +290,9 @@ def _force_without_friction(
     kind = laws.kinds[port]
     if kind == DRAG:
         v = _modal_velocity(state, structure, port)
-        return laws.numbers[port, 0] * abs(v) * v
+        return laws.numbers[port, SIZE] * abs(v) * v
     if kind == VISCOUS:
-        return laws.numbers[port, 0] * _modal_velocity(state, structure, port)
+        return laws.numbers[port, SIZE] * _modal_velocity(state, structure, port)
     if kind == FRICTION:
         return 0.0
     ports, modes = structure.ports.shape
@@ -302,7 +312,7 @@ def _friction_limit(
 ) -> float:
     """Return the largest friction force F0 |x|^a of a port."""
     x = _port_displacement(state, structure, port)
-    return laws.numbers[port, 0] * abs(x) ** laws.numbers[port, 1]
+    return laws.numbers[port, SIZE] * abs(x) ** laws.numbers[port, EXPONENT]
 
 
 @compiled
@@ -376,7 +386,9 @@ def _fill_rates(
         rate[row] = 0.0
         if laws.kinds[j] == BOUC_WEN:
             v = _port_velocity(state, rate, structure, j)
-            rate[row] = v * bouc_wen_rate(state[row], v, laws.numbers[j, 1], laws.numbers[j, 2])
+            rate[row] = v * bouc_wen_rate(
+                state[row], v, laws.numbers[j, YIELD], laws.numbers[j, ORDER]
+            )
 
 
 @compiled
@@ -507,21 +519,21 @@ def _advance(
     while remaining > 0.0:
         _fill_port_displacements(state, structure, history.displacement)
         new = _runge_kutta_step(state, time, remaining, structure, laws, history, force)
-        taken = remaining
+        step = remaining
         has_stopped = False
 
         # Does the sliding port stop within the step?
         may_stop = rigid >= 0 and history.sliding[rigid] != 0.0 and stops < MOST_STOPS
         if may_stop and _modal_velocity(new, structure, rigid) * history.sliding[rigid] < 0.0:
-            taken = _time_until_stop(state, time, remaining, structure, laws, history, force, rigid)
-            new = _runge_kutta_step(state, time, taken, structure, laws, history, force)
+            step = _time_until_stop(state, time, remaining, structure, laws, history, force, rigid)
+            new = _runge_kutta_step(state, time, step, structure, laws, history, force)
             stops += 1
             has_stopped = True
 
         _advance_play(new, structure, laws, history)
         state = new
-        time += taken
-        remaining = remaining - taken if has_stopped else 0.0
+        time += step
+        remaining = remaining - step if has_stopped else 0.0
 
         # From rest the port sticks or slides anew
         if rigid >= 0:
@@ -562,7 +574,7 @@ def integrate(
         Kept states.
     """
     ports = len(laws.kinds)
-    kept = np.empty((sampling.states, len(state)))
+    states = np.empty((sampling.states, len(state)))
     force = np.zeros(ports)
     history = History(np.zeros(ports), play, np.zeros(ports))
     rigid = _port_with_rigid_friction(structure, laws)
@@ -576,10 +588,10 @@ def integrate(
     row = 0
     for step in range(total + 1):
         if step >= lead_steps and (step - lead_steps) % sampling.steps_between == 0:
-            kept[row] = state
+            states[row] = state
             row += 1
         if step == total:
             break
         length = sampling.lead / lead_steps if step < lead_steps else sampling.step
         state, time = _advance(state, time, length, structure, laws, history, force, rigid)
-    return kept
+    return states

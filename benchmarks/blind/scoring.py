@@ -96,8 +96,8 @@ def outcome(truth: Mapping[str, Any], verdict: Mapping[str, Any]) -> Outcome:
             return Outcome.OPEN
         # members may be sets, written "one + other": none of a set's effects may be foreign to the
         # truth
-        members = [set(str(item).split(" + ")) for item in verdict.get("group") or ()]
-        members += [{item} for item in named]
+        members = [set(str(effects).split(" + ")) for effects in verdict.get("group") or ()]
+        members += [{effects} for effects in named]
         return Outcome.GROUP if any(member <= hidden for member in members) else Outcome.WRONG
     if kind == "family":
         word = str(verdict.get("family", ""))
@@ -115,16 +115,16 @@ def coverage(truth: Mapping[str, Any], verdict: Mapping[str, Any]) -> dict[str, 
     covered: dict[str, bool | None] = {}
     for name, (low, _, high) in estimates.items():
         identifier = name.split(".")[0]
-        own, port = truth["places"].get(identifier), places.get(identifier, "")
-        known = truth["truth"].get(f"{name}@{port}", truth["truth"].get(name))
+        true_place, port = truth["places"].get(identifier), places.get(identifier, "")
+        true_value = truth["truth"].get(f"{name}@{port}", truth["truth"].get(name))
         if identifier not in truth["identifiers"]:
             continue
-        if known is None or (
-            f"{name}@{port}" not in truth["truth"] and own and port and own != port
+        if true_value is None or (
+            f"{name}@{port}" not in truth["truth"] and true_place and port and true_place != port
         ):
             covered[name] = None
             continue
-        covered[name] = low <= known <= high
+        covered[name] = low <= true_value <= high
     return covered
 
 
@@ -139,9 +139,11 @@ def load_cases(folder: Path) -> tuple[list[Scored], int]:
             continue
         truth = json.loads(file.read_text(encoding="utf-8"))
         verdict = json.loads(path.read_text(encoding="utf-8"))
-        came = outcome(truth, verdict)
-        covered = coverage(truth, verdict) if came is Outcome.RIGHT and truth["identifiers"] else {}
-        cases.append(Scored(truth, verdict, came, covered))
+        result = outcome(truth, verdict)
+        covered = (
+            coverage(truth, verdict) if result is Outcome.RIGHT and truth["identifiers"] else {}
+        )
+        cases.append(Scored(truth, verdict, result, covered))
     return cases, missing
 
 

@@ -13,6 +13,8 @@ from benchmarks.blind.laws import (
     BOUC_WEN,
     JENKINS,
     NO_FORCE,
+    ORDER,
+    YIELD,
     Law,
     LawArrays,
     ModalStructure,
@@ -42,8 +44,8 @@ def _bouc_wen_after(
     """Return the Bouc-Wen variable of a port after a motion, by the midpoint rule."""
     increment = displacement - start
     sign = np.sign(increment)
-    yield_displacement = laws.numbers[port, 1]
-    order = laws.numbers[port, 2]
+    yield_displacement = laws.numbers[port, YIELD]
+    order = laws.numbers[port, ORDER]
     middle = bouc_wen + 0.5 * increment * bouc_wen_rate(bouc_wen, sign, yield_displacement, order)
     return bouc_wen + increment * bouc_wen_rate(middle, sign, yield_displacement, order)
 
@@ -414,7 +416,7 @@ class Structure:
         times = release.times
         interval = (times[-1] - times[0]) / (len(times) - 1)
         steps = int(np.ceil(interval / (split * STEP) - 1e-9)) * refinement
-        kept = integrate(
+        states = integrate(
             state,
             np.vstack([held.play, np.zeros((1, held.play.shape[1]))]),
             ModalStructure(
@@ -435,9 +437,9 @@ class Structure:
         )
 
         # Outputs of the modes and of the flexibility
-        outputs = kept[:, :modes] @ (self.outputs @ shapes).T
-        outputs += kept[:, 2 * modes : 2 * modes + len(ports)] @ (self.outputs @ higher).T
-        fine_times = times[0] + interval / split * np.arange(len(kept))
+        outputs = states[:, :modes] @ (self.outputs @ shapes).T
+        outputs += states[:, 2 * modes : 2 * modes + len(ports)] @ (self.outputs @ higher).T
+        fine_times = times[0] + interval / split * np.arange(len(states))
         return np.asarray(outputs), fine_times
 
     def free_ringdown(self, release: Release) -> FloatArray:

@@ -54,10 +54,10 @@ def _outcomes(cases: Sequence[Scored], label: str, key: str) -> list[str]:
 
 
 def _median(values: Iterable[float | None]) -> str:
-    known = [value for value in values if value is not None and np.isfinite(value)]
-    if not known:
+    finite = [value for value in values if value is not None and np.isfinite(value)]
+    if not finite:
         return ""
-    low, middle, high = np.quantile(known, [0.05, 0.5, 0.95])
+    low, middle, high = np.quantile(finite, [0.05, 0.5, 0.95])
     return f"{middle:.3g} ({low:.3g} to {high:.3g})"
 
 
@@ -83,9 +83,10 @@ def report(cases: Sequence[Scored], missing: int = 0) -> str:
     lines += ["## Shares, with 95 % intervals", ""]
     lines += _table(["cases", "rig", "number", *(o.value for o in Outcome)], rows)
     lines += [
-        "right: exactly what is hidden (a trap: also an accepted verdict); group: a group or "
-        "family that holds it; open: unexplained, below detectability or data error; missed: "
-        "'nothing missing'; part: one of two; wrong: anything else.",
+        "right: exactly what is hidden (a trap: also an accepted verdict); "
+        "group: a group or family that holds it; "
+        "open: unexplained, below detectability or data error; "
+        "missed: 'nothing missing'; part: one of two; wrong: anything else.",
         "",
     ]
     for kind, title in TITLES.items():

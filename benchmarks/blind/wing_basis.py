@@ -292,14 +292,14 @@ def _build(operators: AffineOperators, snapshots: FloatArray, region: int) -> Wi
     place = np.full(2, np.nan)
     if region >= 0:
         parts, place = _region_stiffness(operators, region)
-        found = [snapshots]
+        vectors = [snapshots]
         loads = np.vstack([f.displacement, f.corner, f.lift.sum(axis=0), f.weight, f.root]).T
         for loss in REGION_LOSSES:
             stiffness = (nominal - loss * (1.0073 * parts[0] + parts[1] + parts[2])).tocsr()
-            found.append(Factorisation(stiffness).solve(loads))
+            vectors.append(Factorisation(stiffness).solve(loads))
             mass = operators.mass(point_masses(*MASSES[0]))
-            found.append(lowest_eigenpairs(stiffness, mass, MODE_COUNT)[1])
-        snapshots = np.hstack(found)
+            vectors.append(lowest_eigenpairs(stiffness, mass, MODE_COUNT)[1])
+        snapshots = np.hstack(vectors)
     basis = _orthonormal(snapshots)
 
     def projected(matrix: sparse.sparray) -> FloatArray:

@@ -18,7 +18,7 @@ def _text(value: str | float | tuple[float, float] | bool) -> str:
     if isinstance(value, str):
         return json.dumps(value)
     if isinstance(value, tuple):
-        return "[" + ", ".join(_text(item) for item in value) + "]"
+        return "[" + ", ".join(_text(element) for element in value) + "]"
     return repr(float(value))
 
 

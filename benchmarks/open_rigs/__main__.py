@@ -48,16 +48,18 @@ def judge(out: Path, seed: int, number: int, variant: str) -> dict[str, Any]:
     facts |= {"number": number, "variant": variant, "size": truth.size, "amount": truth.amount}
     began = time.process_time()
     try:
-        found = investigate(read_campaign(folder), folder / "model.toml", library(), thorough=False)
+        investigation = investigate(
+            read_campaign(folder), folder / "model.toml", library(), thorough=False
+        )
     except DiscrepancyError as error:
         return facts | {"kind": "error", "sentence": str(error), "outcome": "error", "seconds": 0.0}
-    row = scored(found.verdict, facts["identifiers"], found.proof) | {
-        "family": found.verdict.family
+    row = scored(investigation.verdict, facts["identifiers"], investigation.proof) | {
+        "family": investigation.verdict.family
     }
     row["outcome"] = outcome_of(row, facts)
-    row["places"] = sorted({item.place for item in found.verdict.effects})
-    right = row["outcome"] in ("named", "named in part") and not found.verdict.family
-    row["estimates"] = estimates(found) if right else {}
+    row["places"] = sorted({effect.place for effect in investigation.verdict.effects})
+    right = row["outcome"] in ("named", "named in part") and not investigation.verdict.family
+    row["estimates"] = estimates(investigation) if right else {}
     return facts | row | {"seconds": time.process_time() - began}
 
 
@@ -66,7 +68,7 @@ def outcome_of(row: Mapping[str, Any], facts: Mapping[str, Any]) -> str:
     if facts["identifiers"] or facts["left"] != "law" or row["outcome"] != "wrong":
         return str(row["outcome"])
     lost = "outflow" if facts["rig"] in ("stores", "heated") else "cubic_stiffness"
-    (family,) = (item.family for item in library() if item.identifier == lost)
+    (family,) = (effect.family for effect in library() if effect.identifier == lost)
     return "family" if row["family"] == family else "wrong"
 
 
@@ -101,10 +103,10 @@ def main() -> None:
 
 def tell(rows: Sequence[Mapping[str, Any]]) -> None:
     """Print how often a verdict, its port and its intervals are right."""
-    for what in ("an effect", "a remainder alone", "nothing"):
-        ours = [row for row in rows if what == hides(row)]
+    for group in ("an effect", "a remainder alone", "nothing"):
+        ours = [row for row in rows if group == hides(row)]
         if ours:
-            print(f"{what} hidden:", dict(Counter(row["outcome"] for row in ours)))
+            print(f"{group} hidden:", dict(Counter(row["outcome"] for row in ours)))
     effects = [row for row in rows if row.get("places") and hides(row) == "an effect"]
     right = sum(row["place"] in row["places"] for row in effects)
     held = [

@@ -27,17 +27,17 @@ HIDDEN = {
     "stores": ("outflow", "overflow", "outflow", "natural_convection"),
 }
 """Natural convection is an outflow of the exponent 5/4: its family."""
-LEFT = ("push", "loose", "law")
+DISTURBANCES = ("push", "loose", "law")
 GAPS = (10.0, 50.0)
 SHARES = (0.03, 0.10)
 ALONE = (2.0, 6.0)
 SIZES = (1.0, 1.5, 1.2)
-"""Of what drives in each trial; the last is held out."""
+"""Size of the excitation in each trial; the last trial is held out."""
 SAMPLES = 128
 NOISE_SAMPLES = 400
 STEP = 8
 TONES = (0.5, 0.9, 1.6)
-"""Lowest and highest frequency that drives bodies [Hz]; stores are driven 200 times slower."""
+"""Frequencies of the tones that drive bodies [Hz]; stores are driven 200 times slower."""
 ZERO = 5.0
 """Deviation of a zero over the noise."""
 COLOUR = 0.5
@@ -46,7 +46,7 @@ OFFSET = 0.05
 """Deviation of a constant of the drive over the amplitude of a tone."""
 
 
-def course_of(rig: Rig, generator: np.random.Generator, size: float) -> Course:
+def draw_course(rig: Rig, generator: np.random.Generator, size: float) -> Course:
     """Return the excitation of a trial: tones (from rest if a motion), or steps of a pump."""
     slow = 200.0 if rig.drive.endswith("zero_order") else 1.0
     f = np.exp(generator.uniform(np.log(0.1), np.log(4.0), 12)) / slow
@@ -63,16 +63,17 @@ def course_of(rig: Rig, generator: np.random.Generator, size: float) -> Course:
         breaks = rig.interval * STEP * np.arange(1.0, count)
         return Course.stepped(tuple(steps.tolist()), tuple(breaks.tolist()), push)
     tones = 2.0 * np.pi * np.array(TONES)
-    heights = (
+    amplitudes = (
         size * rig.amplitude * generator.uniform(0.6, 1.4, 3) * generator.choice((-1.0, 1.0), 3)
     )
-    rest = rig.drive.startswith("displacement")  # 1 - cos: neither place nor speed jumps
-    phases = np.full(3, 0.5 * np.pi) if rest else generator.uniform(0.0, 2.0 * np.pi, 3)
-    begin = float(heights.sum()) if rest else 0.0
+    # A prescribed motion is a sum of 1 - cos, so that neither position nor speed jumps at the start
+    from_rest = rig.drive.startswith("displacement")
+    phases = np.full(3, 0.5 * np.pi) if from_rest else generator.uniform(0.0, 2.0 * np.pi, 3)
+    begin = float(amplitudes.sum()) if from_rest else 0.0
 
     def value(t: float, order: int) -> float:
-        found = heights * tones**order @ np.sin(tones * t + phases + 0.5 * np.pi * order)
-        return float(found) - (begin if order == 0 else 0.0)
+        derivative = amplitudes * tones**order @ np.sin(tones * t + phases + 0.5 * np.pi * order)
+        return float(derivative) - (begin if order == 0 else 0.0)
 
     return Course(value, push)
 
@@ -85,99 +86,181 @@ def simulate(
 
 
 class Bench:
-    """A rig with its trials, and what calibration and zeros can do there."""
+    """A rig with trials and true parameters, which sizes effects by what they leave unexplained.
+
+    Parameters
+    ----------
+    rig : Rig
+        The rig.
+    generator : numpy.random.Generator
+        Random numbers.
+    samples : int
+        Samples of a trial.
+
+    Attributes
+    ----------
+    noise : (C,) array
+        Standard deviations of the channels.
+    courses, stamps : list
+        Excitation and sample times of each trial.
+    factors : dict of str to float
+        True parameters over nominal ones.
+    bare : (N,) array
+        Readings without a hidden effect, over the noise.
+    nuisances : (N, K) array
+        Changes of the readings by one prior deviation of each parameter and each zero.
+    """
 
     def __init__(self, rig: Rig, generator: np.random.Generator, samples: int) -> None:
         self.rig = rig
-        self.noise = np.array([channel[3] for channel in rig.channels])
-        self.courses = [course_of(rig, generator, size) for size in SIZES]
+        self.noise = np.array([channel.noise for channel in rig.channels])
+        self.courses = [draw_course(rig, generator, size) for size in SIZES]
         self.stamps = [rig.interval * np.arange(float(samples))] * len(SIZES)
         self.factors = {
             name: 1.0 + deviation * float(np.clip(generator.standard_normal(), -2.0, 2.0))
             for name, (_, deviation) in rig.parameters.items()
         }
-        self.bare = self.stacked(Truth(self.factors))
-        taken = [
-            self.stacked(Truth(self.factors | {name: self.factors[name] + deviation})) - self.bare
-            for name, (_, deviation) in rig.parameters.items()
-        ]
-        wide, count = len(self.noise), len(SIZES)
-        for number in range(count * wide):
-            zero = np.zeros((count, samples, wide))
-            zero[number // wide, :, number % wide] = ZERO
-            taken.append(zero.ravel())
-        self.taken = np.column_stack(taken)
+        self.bare = self.readings_over_noise(Truth(self.factors))
+        self.nuisances = np.column_stack([*self._parameter_changes(), *self._zeros(samples)])
 
-    def stacked(self, truth: Truth) -> FloatArray:
-        """Return all readings in units of the noise."""
-        parts = simulate(self.rig, truth, self.courses, self.stamps)
-        return np.concatenate([(part / self.noise).ravel() for part in parts])
+    def _parameter_changes(self) -> list[FloatArray]:
+        """Return the changes of the readings by one prior deviation of each parameter."""
+        changes = []
+        for name, (_, deviation) in self.rig.parameters.items():
+            moved = self.factors | {name: self.factors[name] + deviation}
+            changes.append(self.readings_over_noise(Truth(moved)) - self.bare)
+        return changes
 
-    def left(self, truth: Truth, beside: FloatArray) -> float:
-        """Return the rms over the noise of what nuisances within their priors leave of a change."""
-        change = self.stacked(truth) - beside
-        size = self.taken.shape[1]
-        found = np.linalg.lstsq(
-            np.vstack((self.taken, np.eye(size))),
-            np.concatenate((change, np.zeros(size))),
+    def _zeros(self, samples: int) -> list[FloatArray]:
+        """Return the changes of the readings by one prior deviation of each zero."""
+        trials = len(SIZES)
+        channels = len(self.noise)
+        zeros = []
+        for trial in range(trials):
+            for channel in range(channels):
+                change = np.zeros((trials, samples, channels))
+                change[trial, :, channel] = ZERO
+                zeros.append(change.ravel())
+        return zeros
+
+    def readings_over_noise(self, truth: Truth) -> FloatArray:
+        """Return the readings (N,) of all trials without errors, in units of the noise."""
+        readings = simulate(self.rig, truth, self.courses, self.stamps)
+        return np.concatenate([(values / self.noise).ravel() for values in readings])
+
+    def unexplained(self, truth: Truth, reference: FloatArray) -> float:
+        """Return the rms over the noise of a change that nuisances within their priors leave.
+
+        Parameters
+        ----------
+        truth : Truth
+            The rig with the change.
+        reference : (N,) array
+            Readings over the noise without it.
+        """
+        change = self.readings_over_noise(truth) - reference
+        count = self.nuisances.shape[1]
+        # Rows of the prior: each nuisance is zero with a unit deviation
+        explained = np.linalg.lstsq(
+            np.vstack((self.nuisances, np.eye(count))),
+            np.concatenate((change, np.zeros(count))),
             rcond=None,
         )[0]
-        return float(np.sqrt(np.mean((change - self.taken @ found) ** 2)))
+        return float(np.sqrt(np.mean((change - self.nuisances @ explained) ** 2)))
 
-    def sized(
+    def size_effect(
         self, truth: Truth, key: Literal["size", "amount"], wanted: float, largest: float
     ) -> tuple[Truth, float]:
-        """Return a truth whose effect leaves about `wanted` unexplained, and what it leaves."""
+        """Return a truth with an effect that leaves about `wanted` unexplained, and what it leaves.
 
-        def with_value(value: float) -> Truth:
+        Parameters
+        ----------
+        truth : Truth
+            The truth with an effect of any size.
+        key : str
+            The size to choose: that of the law, or the amount of the disturbance.
+        wanted : float
+            Rms over the noise.
+        largest : float
+            Largest size.
+        """
+
+        def with_size(value: float) -> Truth:
             return replace(truth, size=value) if key == "size" else replace(truth, amount=value)
 
-        beside = self.stacked(with_value(0.0))
-        size, found = 0.01, 0.0
+        reference = self.readings_over_noise(with_size(0.0))
+        size = 0.01
         for _ in range(8):
             size = min(size, largest)
-            truth = with_value(size)
-            found = self.left(truth, beside)
-            if abs(found / wanted - 1.0) < 0.1 or (size == largest and found < wanted):
+            sized = with_size(size)
+            unexplained = self.unexplained(sized, reference)
+            is_too_small = size == largest and unexplained < wanted
+            if abs(unexplained / wanted - 1.0) < 0.1 or is_too_small:
                 break
-            size *= float(np.clip(wanted / found, 0.1, 10.0))
-        return truth, found
+            size *= float(np.clip(wanted / unexplained, 0.1, 10.0))
+        return sized, unexplained
+
+
+def rig_name(kind: str, turn: int, seed: int, hidden: str) -> str:
+    """Return the rig of a kind in a turn of the kinds."""
+    if kind == "support":
+        return f"support {('moved', 'shaken')[turn % 2]}"
+    if kind == "stores" and (hidden == "natural_convection" or (not hidden and seed % 2)):
+        return "heated"
+    return kind
 
 
 def drawn(
     number: int, seed: int, samples: int = SAMPLES, turns: int = 5
 ) -> tuple[Bench, Truth, dict[str, Any]]:
-    """Return the rig of a campaign, its truth, and the truth in words."""
+    """Draw a campaign and return its rig, its truth, and the facts for scoring.
+
+    Parameters
+    ----------
+    number : int
+        Number of the campaign: kinds of rigs alternate, and effects within a kind.
+    seed : int
+        Seed of the set of campaigns.
+    samples : int
+        Samples of a trial.
+    turns : int
+        Turns of the kinds with a hidden effect; the next turn has a disturbance alone, and all
+        later ones have nothing.
+    """
     generator = np.random.default_rng([seed, number])
     kind = KINDS[number % 5]
     turn = number // 5
     hidden = "" if turn >= turns else HIDDEN[kind][turn % len(HIDDEN[kind])]
-    name = kind
-    if kind == "support":
-        name = f"support {('moved', 'shaken')[turn % 2]}"
-    if kind == "stores" and (hidden == "natural_convection" or (not hidden and seed % 2)):
-        name = "heated"
+    name = rig_name(kind, turn, seed, hidden)
     bench = Bench(RIGS[name], generator, samples)
+
+    # The hidden effect
     shape = generator.uniform(0.6, 0.85) if hidden == "overflow" else generator.uniform(0.1, 0.4)
-    at = 0 if hidden == "overflow" else turn // 2 % 2
-    truth = Truth(bench.factors, hidden, 0.0, float(shape), at)
+    store = 0 if hidden == "overflow" else turn // 2 % 2
+    truth = Truth(bench.factors, hidden, 0.0, float(shape), store)
     gap = 0.0
     if hidden:
         wanted = float(np.exp(generator.uniform(*np.log(GAPS))))
-        truth, gap = bench.sized(truth, "size", wanted, 0.6)
+        truth, gap = bench.size_effect(truth, "size", wanted, 0.6)
     if turn > turns:
-        return (
-            bench,
-            truth,
-            {"rig": name, "identifiers": [], "gap": 0.0, "left": "", "remainder": 0.0},
-        )
-    left = LEFT[number % 3]
+        facts = {"rig": name, "identifiers": [], "gap": 0.0, "left": "", "remainder": 0.0}
+        return bench, truth, facts
+
+    # The disturbance
+    disturbance = DISTURBANCES[number % 3]
     pitch = float(np.exp(generator.uniform(*np.log((1.5, 6.0)))))
     wanted = gap * float(generator.uniform(*SHARES)) if hidden else float(generator.uniform(*ALONE))
-    truth, rest = bench.sized(replace(truth, left=left, pitch=pitch), "amount", wanted, 0.5)
-    effect = {"": [], "natural_convection": ["outflow"]}.get(hidden, [hidden])
-    told = {"rig": name, "identifiers": effect, "gap": gap, "left": left, "remainder": rest}
-    return bench, truth, told | hidden_values(name, truth)
+    disturbed = replace(truth, disturbance=disturbance, pitch=pitch)
+    truth, remainder = bench.size_effect(disturbed, "amount", wanted, 0.5)
+    named = "outflow" if hidden == "natural_convection" else hidden
+    facts = {
+        "rig": name,
+        "identifiers": [named] if named else [],
+        "gap": gap,
+        "left": disturbance,
+        "remainder": remainder,
+    }
+    return bench, truth, facts | hidden_values(name, truth)
 
 
 def hidden_values(name: str, truth: Truth) -> dict[str, Any]:
@@ -188,7 +271,7 @@ def hidden_values(name: str, truth: Truth) -> dict[str, Any]:
         values = {"outflow": {"coefficient": size}, "natural_convection": {"coefficient": size}}
         # the excess is told over the threshold, as the catalogue does
         values["overflow"] = {"level": truth.shape}
-        port = ("upper outlet", "lower outlet")[truth.at] if name == "stores" else ports[name]
+        port = ("upper outlet", "lower outlet")[truth.store] if name == "stores" else ports[name]
     else:
         force, length, speed = SCALES[name.split()[0]]
         size = truth.size * force
@@ -201,11 +284,11 @@ def hidden_values(name: str, truth: Truth) -> dict[str, Any]:
             "free_play": {"stiffness": size / length, "half_width": truth.shape * length},
             "bouc_wen_hysteresis": yields,
         }
-    known = values.get(truth.law, {})
+    true_values = values.get(truth.law, {})
     identifier = "outflow" if truth.law == "natural_convection" else truth.law
     return {
         "place": port if truth.law else "",
-        "values": {f"{identifier}.{key}": value for key, value in known.items()},
+        "values": {f"{identifier}.{key}": value for key, value in true_values.items()},
     }
 
 
@@ -219,9 +302,11 @@ def varied(
     if variant == "held" and bench.rig.drive.startswith(("force", "angle", "acceleration")):
         courses = [
             Course.stepped(
-                tuple(one.value(float(t), 0) for t in time), tuple(time[1:].tolist()), one.push
+                tuple(course.value(float(t), 0) for t in time),
+                tuple(time[1:].tolist()),
+                course.push,
             )
-            for one, time in zip(courses, stamps, strict=True)
+            for course, time in zip(courses, stamps, strict=True)
         ]
     if variant in ("jitter", "all"):
         interval = bench.rig.interval
@@ -231,10 +316,10 @@ def varied(
         ]
         stamps = [time - time[0] for time in stamps]
         courses = [
-            Course.stepped(one.steps, tuple(time[STEP::STEP].tolist()), one.push)
-            if one.steps
-            else one
-            for one, time in zip(courses, stamps, strict=True)
+            Course.stepped(course.steps, tuple(time[STEP::STEP].tolist()), course.push)
+            if course.steps
+            else course
+            for course, time in zip(courses, stamps, strict=True)
         ]
     return courses, stamps, OFFSET * bench.rig.amplitude if variant in ("offset", "all") else offset
 
@@ -276,29 +361,31 @@ def write(folder: Path, bench: Bench, truth: Truth, variant: str, seed: Sequence
         shifted(course, offset * float(change.standard_normal())) if offset else course
         for course in courses
     ]
-    names = [channel[0] for channel in rig.channels]
+    names = [channel.name for channel in rig.channels]
     quantity, unit, hold = rig.drive.split()
     hold = "zero_order" if courses[0].steps else hold
     text = f'format = 1\nname = "{folder.name}"\n\n[noise]\nfile = "rest.csv"\n'
-    for name, of, in_unit, deviation in rig.channels:
+    for name, channel_quantity, in_unit, deviation in rig.channels:
         text += entry(
             "channel",
             name=name,
-            quantity=of,
+            quantity=channel_quantity,
             unit=in_unit,
             output=name,
             offset_deviation=ZERO * deviation,
         )
-    more: dict[str, bool | float] = {"reference": True} if "[[controller]]" in rig.model else {}
-    more |= {"offset_deviation": offset} if offset else {}
-    text += entry("input", name="drive", quantity=quantity, unit=unit, hold=hold, **more)
+    drive_keys: dict[str, bool | float] = (
+        {"reference": True} if "[[controller]]" in rig.model else {}
+    )
+    drive_keys |= {"offset_deviation": offset} if offset else {}
+    text += entry("input", name="drive", quantity=quantity, unit=unit, hold=hold, **drive_keys)
     folder.mkdir(parents=True)
     colour = COLOUR if variant == "colour" else 0.0
-    rest = bench.noise * noise_of(noise, (NOISE_SAMPLES, len(names)), colour)
+    noise_record = bench.noise * noise_of(noise, (NOISE_SAMPLES, len(names)), colour)
     table(
         folder / "rest.csv",
         ["time", *names],
-        np.column_stack((rig.interval * np.arange(NOISE_SAMPLES), rest)),
+        np.column_stack((rig.interval * np.arange(NOISE_SAMPLES), noise_record)),
     )
     readings = simulate(rig, truth, driven, stamps)
     for number, (course, time_, values) in enumerate(

@@ -15,9 +15,9 @@ PICTURES = {
             "front_mission",
             front.draw_mission,
             (
-                Statement("README.md", "falls back to a gentle turn at turn {change}"),
+                Statement("README.md", "falls back to a gentle turn at step {change}"),
                 Statement(
-                    "README.md", "the damage that calls for it is there from turn {damage} on"
+                    "README.md", "the damage that calls for it is there from step {damage} on"
                 ),
             ),
         ),
@@ -51,7 +51,7 @@ PICTURES = {
         Picture(
             "front_watch",
             front.draw_watch,
-            (Statement("README.md", "at turn 10: alarm at turn {alarm},"),),
+            (Statement("README.md", "at step 10: alarm at step {alarm},"),),
         ),
         Picture(
             "front_fleet",
@@ -75,7 +75,7 @@ PICTURES = {
         Picture(
             "three_regions",
             missions.draw_three_regions,
-            (Statement("docs/scenarios.md", "![Beliefs in three regions at turn {turn}]"),),
+            (Statement("docs/scenarios.md", "![Beliefs in three regions at step {step}]"),),
             minutes=True,
         ),
         Picture(
@@ -84,7 +84,7 @@ PICTURES = {
             (
                 Statement(
                     "docs/learning.md",
-                    "![What was learnt in {turns} turns of the shipped scenario]",
+                    "![What was learnt in {steps} steps of the shipped scenario]",
                 ),
             ),
         ),
@@ -113,7 +113,7 @@ PICTURES = {
         Picture(
             "view",
             missions.draw_view,
-            (Statement("docs/view.md", "![The page at turn {turn} of the paper's mission]"),),
+            (Statement("docs/view.md", "![The page at step {step} of the paper's mission]"),),
             browser=True,
         ),
         Picture(

@@ -52,7 +52,7 @@ def belief_drawing(run: Any, x_label: str, y_label: str) -> Drawing:
 def draw_mission() -> Drawing:
     """Draw region 1 of the paper's mission."""
     run = notebook("fly_the_mission", "open_run").names["run"]
-    return belief_drawing(run, "turn", "stiffness loss, %")
+    return belief_drawing(run, "step", "stiffness loss, %")
 
 
 def draw_structure() -> Drawing:
@@ -107,9 +107,9 @@ def draw_watch() -> Drawing:
     learnt = [decision["learnt"]["young_modulus_factor"] for decision in decisions]
     low = [interval["lower"] for interval in learnt]
     high = [interval["upper"] for interval in learnt]
-    alarm = min(decision["turn"] for decision in decisions if decision["notices"])
+    alarm = min(decision["step"] for decision in decisions if decision["notices"])
     with publication_style():
-        figure, axes = small_axes("turn", "factor on Young's modulus")
+        figure, axes = small_axes("step", "factor on Young's modulus")
         axes.fill_between(range(len(learnt)), low, high, color=PAST, alpha=0.2, lw=0)
         axes.plot([interval["mean"] for interval in learnt], color=PAST)
         axes.axhline(0.97, color="k", ls="--", lw=1)

@@ -21,13 +21,13 @@ from benchmarks.pictures.notebooks import folder_until_exit, notebook
 from benchmarks.pictures.picture import Drawing
 from reporting.figures import to_png
 from twin_master.fleet.flight import KIND, fleet_config
-from twin_master.fleet.reading import last_turns
+from twin_master.fleet.reading import last_steps
 from twin_master.fleet.report import course_figure, map_figure
 from twin_master.fleet.store import FAILED, has_flown, open_group
 from twin_master.scenario.schema import Scenario
 
 RESOLUTION = 150.0
-VIEWED_TURN = 28
+VIEWED_STEP = 28
 
 
 @contextmanager
@@ -62,16 +62,16 @@ def report_drawing(scenario: str, figure: str, now: int | None = None) -> bytes:
 
 
 def draw_three_regions() -> Drawing:
-    """Draw the mission of the wing with three regions at one turn."""
-    png = report_drawing("three_regions", "mission_now", now=VIEWED_TURN)
-    return Drawing(png, {"turn": VIEWED_TURN})
+    """Draw the mission of the wing with three regions at one step."""
+    png = report_drawing("three_regions", "mission_now", now=VIEWED_STEP)
+    return Drawing(png, {"step": VIEWED_STEP})
 
 
 def draw_learnt() -> Drawing:
     """Draw what is learnt in the mission of a wing that was never tested."""
     png = report_drawing("level_turns_learning", "learnt")
-    turns = uav_twin.open_run(flown("level_turns_learning"))["filtered"].sizes["step"]
-    return Drawing(png, {"turns": turns})
+    steps = uav_twin.open_run(flown("level_turns_learning"))["filtered"].sizes["step"]
+    return Drawing(png, {"steps": steps})
 
 
 def draw_bracket() -> Drawing:
@@ -93,7 +93,7 @@ def draw_fleet() -> Drawing:
     status = group["status"].values
     assets = has_flown(status)
     mean = group["mean"].values
-    last_mean = mean[assets, last_turns(group)[assets]]
+    last_mean = mean[assets, last_steps(group)[assets]]
     failed = int(np.sum(status == FAILED))
     pictures = (
         map_figure(scenario, last_mean, failed),
@@ -137,18 +137,18 @@ def draw_design() -> Drawing:
 
 
 def draw_view() -> Drawing:
-    """Draw the live view of the paper's mission at one turn, as Chromium shows it."""
-    tens, ones = divmod(VIEWED_TURN, 10)
+    """Draw the live view of the paper's mission at one step, as Chromium shows it."""
+    tens, ones = divmod(VIEWED_STEP, 10)
     keys = ["Home", *["PageDown"] * tens, *["ArrowRight"] * ones]
-    steps = [0, *[10] * tens, *[1] * ones]
-    turns = np.cumsum(steps).tolist()
+    strides = [0, *[10] * tens, *[1] * ones]
+    steps = np.cumsum(strides).tolist()
     with served_view(flown("level_turns")) as address, open_browser() as browser:
         tab = browser.tab()
         tab.go(address, width=1265, height=1300)
         tab.wait("window.painted.length > 0")
-        for key, turn in zip(keys, turns, strict=True):
+        for key, step in zip(keys, steps, strict=True):
             tab.press(key)
-            tab.wait(f"state.shown === {turn} && window.painted.at(-1)[0] === {turn}")
+            tab.wait(f"state.shown === {step} && window.painted.at(-1)[0] === {step}")
         with TemporaryDirectory(prefix="uav_twin_pictures_") as folder:
             png = tab.picture(Path(folder) / "view.png")
-    return Drawing(png, {"turn": VIEWED_TURN})
+    return Drawing(png, {"step": VIEWED_STEP})

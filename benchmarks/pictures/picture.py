@@ -43,7 +43,7 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Statement:
-    """A sentence of a page with the names of numbers in braces: `alarm at turn {alarm}`."""
+    """A sentence of a page with the names of numbers in braces: `alarm at step {alarm}`."""
 
     page: str
     text: str

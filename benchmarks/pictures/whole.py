@@ -9,8 +9,13 @@ from html import escape
 
 NAME = "whole"
 WIDTH, HEIGHT = 1100, 600
-INK, QUIET, GROUND = "#1f2933", "#52606d", "#ffffff"
-BLUE, GREEN, ORANGE, PURPLE = "#0072b2", "#007a5a", "#b35900", "#8e4585"
+INK = "#1f2933"
+QUIET = "#52606d"
+GROUND = "#ffffff"
+BLUE = "#0072b2"
+GREEN = "#007a5a"
+ORANGE = "#b35900"
+PURPLE = "#8e4585"
 """Colours of the lanes model, calibration, flight and discrepancy (darker Okabe-Ito colours)."""
 TINTS = {BLUE: "#eaf4fb", GREEN: "#e8f6f1", ORANGE: "#fdf1e3", PURPLE: "#f7eef6"}
 
@@ -18,10 +23,11 @@ TINTS = {BLUE: "#eaf4fb", GREEN: "#e8f6f1", ORANGE: "#fdf1e3", PURPLE: "#f7eef6"
 def text(x: float, y: float, words: str, size: int = 14, colour: str = INK, **style: str) -> str:
     """Return words, centred unless told otherwise; `style` holds SVG attributes, `_` for `-`."""
     attributes = {"text_anchor": "middle", **style}
-    rest = "".join(f' {name.replace("_", "-")}="{value}"' for name, value in attributes.items())
-    return (
-        f'<text x="{x:g}" y="{y:g}" font-size="{size}" fill="{colour}"{rest}>{escape(words)}</text>'
+    attribute_text = "".join(
+        f' {name.replace("_", "-")}="{value}"' for name, value in attributes.items()
     )
+    position = f'x="{x:g}" y="{y:g}" font-size="{size}" fill="{colour}"'
+    return f"<text {position}{attribute_text}>{escape(words)}</text>"
 
 
 def lane(x: float, y: float, width: float, height: float, colour: str) -> str:
@@ -144,10 +150,10 @@ def discrepancy_lane() -> list[str]:
         heading(44, 453, "What the model lacks", 258, "uav-twin discrepancy run", PURPLE),
     ]
     for number, (title, lines) in enumerate(steps):
-        left = 44 + 202 * number
-        parts.append(box(left, row, 164, title, lines, PURPLE))
+        x = 44 + 202 * number
+        parts.append(box(x, row, 164, title, lines, PURPLE))
         if number:
-            parts.append(arrow((left - 38, row + 39), (left - 2, row + 39)))
+            parts.append(arrow((x - 38, row + 39), (x - 2, row + 39)))
     return [
         *parts,
         arrow((656, 352), (656, 403), (31, 403), (31, 519), (42, 519)),
@@ -175,5 +181,5 @@ def draw() -> str:
     lanes = [*model_lane(), *calibration_lane(), *flight_lane(), *discrepancy_lane()]
     # Fields first, so that no arrow between lanes is covered.
     fields = [part for part in lanes if 'rx="12"' in part]
-    rest = [part for part in lanes if 'rx="12"' not in part]
-    return head + "\n".join([*fields, *rest]) + "\n</svg>\n"
+    shapes = [part for part in lanes if 'rx="12"' not in part]
+    return head + "\n".join([*fields, *shapes]) + "\n</svg>\n"

@@ -37,8 +37,8 @@ def cooling(data: FloatArray) -> FloatArray:
 def swing(data: FloatArray) -> FloatArray:
     """Return times [s] and averaged positions [V] of the seismometer after it was blown at."""
     data = data[data[:, 0] >= BLOWN]
-    whole = len(data) // JOINED * JOINED
-    means = data[:whole].reshape(-1, JOINED, 2).mean(axis=1)
+    count = len(data) // JOINED * JOINED
+    means = data[:count].reshape(-1, JOINED, 2).mean(axis=1)
     return np.asarray(means - [means[0, 0], 0.0])
 
 
@@ -52,9 +52,9 @@ RIGS: dict[str, tuple[str, int, str, str, Callable[[FloatArray], FloatArray]]] =
 
 def write(rig: str, data: Path, folder: Path) -> Path:
     """Write a campaign and `model.toml` from a published record; return the folder."""
-    name, heading, table, column, made = RIGS[rig]
+    name, heading, table, column, convert = RIGS[rig]
     separator = "," if name.endswith(".csv") else None
-    values = made(np.genfromtxt(data / name, delimiter=separator, skip_header=heading))
+    values = convert(np.genfromtxt(data / name, delimiter=separator, skip_header=heading))
     folder.mkdir(parents=True, exist_ok=True)
     for file in ("campaign.toml", "model.toml"):
         (folder / file).write_text(

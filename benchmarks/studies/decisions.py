@@ -3,8 +3,8 @@
 `python -m benchmarks.studies.decisions --flights 300` flies the mission of level_turns with a wing
 whose gauges or skin are not as the model says. Each seed is flown twice: by the twin of the
 scenario, and by the plain filter (`notice = false`). The table shows for each fault the rms error
-of z1 and z2 from the turn of the fault on, the turns flown at 3g with z1 truly at or above the
-limit, and the turns at 2g below the limit, which were needless.
+of z1 and z2 from the step of the fault on, the steps flown at 3g with z1 truly at or above the
+limit, and the steps at 2g below the limit, which were needless.
 """
 
 import argparse
@@ -26,11 +26,11 @@ from twin_master.scenario.reading import load_scenario
 
 Float = NDArray[np.float64]
 FaultFactor = Callable[[int, int], Float]
-"""(seed, turn) -> factors (G,) of the gauges in a turn of the flight with a seed."""
+"""(seed, step) -> factors (G,) of the gauges in a step of the flight with a seed."""
 
 SCENARIO = "level_turns"
 BEGINS = 10
-"""First turn with a fault."""
+"""First step with a fault."""
 MOST_STRAINED = 16
 """Index of gauge 17, whose strain is the largest."""
 
@@ -42,13 +42,13 @@ class FlightErrors:
     Attributes
     ----------
     rms : (2,) array
-        Rms error of z1 and z2 from the turn of the fault on [percentage points].
+        Rms error of z1 and z2 from the step of the fault on [percentage points].
     beyond : int
-        Turns with z1 at or above the limit.
+        Steps with z1 at or above the limit.
     sharp_beyond : int
         Those of them that are flown at 3g.
     below : int
-        Turns with z1 below the limit.
+        Steps with z1 below the limit.
     gentle_below : int
         Those of them after which 2g is flown, which was needless.
     """
@@ -60,10 +60,10 @@ class FlightErrors:
     gentle_below: int
 
 
-def factor_of_drawn_gauges(count: int, gain: float, sensors: int, seed: int, turn: int) -> Float:
+def factor_of_drawn_gauges(count: int, gain: float, sensors: int, seed: int, step: int) -> Float:
     """Return factors (G,) of the gauges; `count` of them, drawn for a flight, have a gain error."""
     drawn = np.random.default_rng([seed, 2]).permutation(sensors)[:count]
-    is_faulty = np.isin(np.arange(sensors), drawn) & (turn >= BEGINS)
+    is_faulty = np.isin(np.arange(sensors), drawn) & (step >= BEGINS)
     return np.where(is_faulty, 1.0 + gain, 1.0)
 
 
@@ -72,12 +72,12 @@ def fault_factors(sensors: int) -> dict[str, FaultFactor]:
     third_region_factor = third_region()
     begin, rate, limit = SOFTENING
 
-    def of_most_strained(_seed: int, turn: int) -> Float:
-        is_faulty = (np.arange(sensors) == MOST_STRAINED) & (turn >= BEGINS)
+    def of_most_strained(_seed: int, step: int) -> Float:
+        is_faulty = (np.arange(sensors) == MOST_STRAINED) & (step >= BEGINS)
         return np.where(is_faulty, 2.0 / 3.0, 1.0)
 
-    def of_softening_skin(_seed: int, turn: int) -> Float:
-        return third_region_factor(min(rate * max(turn - begin + 1, 0), limit))
+    def of_softening_skin(_seed: int, step: int) -> Float:
+        return third_region_factor(min(rate * max(step - begin + 1, 0), limit))
 
     return {
         "nothing": partial(factor_of_drawn_gauges, 0, 0.0, sensors),
@@ -87,7 +87,7 @@ def fault_factors(sensors: int) -> dict[str, FaultFactor]:
         "half of the gauges show 33 % too little": partial(
             factor_of_drawn_gauges, sensors // 2, -0.33, sensors
         ),
-        "skin between the regions softens, a point a turn": of_softening_skin,
+        "skin between the regions softens, a point a step": of_softening_skin,
     }
 
 
@@ -151,7 +151,7 @@ def main() -> int:
     if arguments.only is not None:
         faults = [faults[int(number)] for number in arguments.only.split(",")]
     print(
-        "| wrong from turn 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|"
+        "| wrong from step 10 on | twin | rms z1, z2 | 3g beyond the limit | needless 2g |\n|"
         + " --- |" * 5
     )
     for name, fault in faults:

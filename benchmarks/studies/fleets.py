@@ -75,8 +75,10 @@ def coverage(fleets: int, twins: int) -> None:
     inside = np.zeros((fleets, 2), dtype=bool)
     for fleet in range(fleets):
         rates = np.exp(generator.uniform(np.log(0.02), np.log(0.2), 2))
-        known = knowledge(dict(zip(ASSUMED, rates.tolist(), strict=True)), ASSUMED, fixed=True)
-        grid = learnt(known, flights(known, 1000 * fleet, twins))
+        fleet_knowledge = knowledge(
+            dict(zip(ASSUMED, rates.tolist(), strict=True)), ASSUMED, fixed=True
+        )
+        grid = learnt(fleet_knowledge, flights(fleet_knowledge, 1000 * fleet, twins))
         for number, (marginal, rate) in enumerate(zip(grid.marginals, rates.tolist(), strict=True)):
             low, high = marginal.interval()
             inside[fleet, number] = low <= rate <= high
@@ -104,20 +106,26 @@ def groups(fleets: int, twins: int) -> None:
         grids, rates = [], []
         for group in range(12):
             true = generator.beta(0.08 * 60.0, 0.92 * 60.0, 2)
-            known = knowledge(dict(zip(ASSUMED, true.tolist(), strict=True)), ASSUMED, fixed=True)
-            grids.append(learnt(known, flights(known, 10_000 * fleet + 100 * group, twins)))
+            group_knowledge = knowledge(
+                dict(zip(ASSUMED, true.tolist(), strict=True)), ASSUMED, fixed=True
+            )
+            grids.append(
+                learnt(
+                    group_knowledge, flights(group_knowledge, 10_000 * fleet + 100 * group, twins)
+                )
+            )
             rates.append(true)
         marginals_of = {"alone": [grid.marginals for grid in grids], "shared": shared(grids)[1]}
-        for what, found in marginals_of.items():
-            for true, marginals in zip(rates, found, strict=True):
+        for way, posteriors in marginals_of.items():
+            for true, marginals in zip(rates, posteriors, strict=True):
                 for rate, marginal in zip(true.tolist(), marginals, strict=True):
                     low, high = marginal.interval()
-                    errors[what].append(marginal.mean - rate)
-                    inside[what].append(low <= rate <= high)
-    for what, deviations in errors.items():
+                    errors[way].append(marginal.mean - rate)
+                    inside[way].append(low <= rate <= high)
+    for way, deviations in errors.items():
         rms = float(np.sqrt(np.mean(np.square(deviations))))
-        share = float(np.mean(inside[what]))
-        print(f"| {what} | {rms:.4f} | {100 * share:.1f} ± {error(share, len(deviations)):.1f} % |")
+        share = float(np.mean(inside[way]))
+        print(f"| {way} | {rms:.4f} | {100 * share:.1f} ± {error(share, len(deviations)):.1f} % |")
 
 
 def half(twins: int) -> None:
@@ -126,29 +134,29 @@ def half(twins: int) -> None:
     teacher = knowledge(true, ASSUMED, fixed=False)
     flown = flights(teacher, 0, twins)
     means = [marginal.mean for marginal in learnt(teacher, flown).marginals]
-    found = dict(zip(ASSUMED, means, strict=True))
-    print("learnt", {name: round(rate, 4) for name, rate in found.items()})
+    learnt_rates = dict(zip(ASSUMED, means, strict=True))
+    print("learnt", {name: round(rate, 4) for name, rate in learnt_rates.items()})
     scores = {}
-    for what, believed in (("assumed", ASSUMED), ("learnt", found), ("known", true)):
-        known = knowledge(true, believed, fixed=False)
-        later = flights(known, 100_000, twins)
+    for twin, believed in (("assumed", ASSUMED), ("learnt", learnt_rates), ("known", true)):
+        twin_knowledge = knowledge(true, believed, fixed=False)
+        later = flights(twin_knowledge, 100_000, twins)
         members = [Member(row, "", 0, {}) for row in range(twins)]
-        early = float(outcomes_of(known, later, members)["early"].mean())
-        scores[what] = score(known, later)
+        early = float(outcomes_of(twin_knowledge, later, members)["early"].mean())
+        scores[twin] = score(twin_knowledge, later)
         print(
-            f"| {what} | {100 * early:.1f} ± {error(early, twins):.1f} % "
-            f"| {scores[what].mean():.3f} |"
+            f"| {twin} | {100 * early:.1f} ± {error(early, twins):.1f} % "
+            f"| {scores[twin].mean():.3f} |"
         )
-    for what in ("assumed", "known"):
-        gain = scores["learnt"] - scores[what]
+    for twin in ("assumed", "known"):
+        gain = scores["learnt"] - scores[twin]
         print(
-            f"learnt against {what}: {gain.mean():.3f} "
+            f"learnt against {twin}: {gain.mean():.3f} "
             f"± {gain.std(ddof=1) / np.sqrt(twins):.3f} a prediction"
         )
 
 
 def score(known: Knowledge, flown: Flights) -> Float:
-    """Return the mean log probability of the true state ten turns ahead, of each twin: (B,)."""
+    """Return the mean log probability of the true state ten steps ahead, of each twin: (B,)."""
     model = known.model
     steps = flown.state.shape[1]
     result = np.zeros(len(flown.state))

@@ -6,8 +6,8 @@ and investigated. The named effect, or the most probable member of a group, goes
 model, and the mission is flown again with the same seed. A drift cannot stand in a table of
 predicted strains; there the readings are corrected before the twin sees them, with the temperature
 that the run recorded. Printed are the verdict of each mission and, before and after: the rms error
-of the health estimate in points, the share of turns whose 90 % set of states holds the truth, and
-the turns at 3g with z1 truly at or above the limit. The table compares the missions that were
+of the health estimate in points, the share of steps whose 90 % set of states holds the truth, and
+the steps at 3g with z1 truly at or above the limit. The table compares the missions that were
 flown again.
 """
 
@@ -62,25 +62,25 @@ from twin_master.store.mission_result import MissionResult
 from twin_master.store.results import groups_of
 from twin_master.store.writing import write_run
 
-TURNS = 50
+STEPS = 50
 LIMIT = 0.6 - 1e-9
 """z1 from which on the policy of the wing without an effect leaves 3g."""
 
 
 @dataclass(frozen=True)
-class Hidden:
+class MissionEffect:
     """An effect that a mission hides.
 
     Attributes
     ----------
     identifier : str
-        Of the catalogue; empty: nothing is hidden.
+        Identifier in the catalogue; empty if nothing is hidden.
     place : str
-        Channel that it acts on; empty where there is no choice.
+        Channel that the effect acts on; empty where there is no choice.
     primitives : tuple of Primitive
-        What the FMU carries.
+        Primitives in the FMU of the wing.
     text : str
-        For people.
+        Description for the table.
     """
 
     identifier: str
@@ -89,70 +89,89 @@ class Hidden:
     text: str
 
 
-HIDDEN = (
-    Hidden("", "", (), "nothing"),
-    Hidden(
+HIDDEN: tuple[MissionEffect, ...] = (
+    MissionEffect("", "", (), "nothing"),
+    MissionEffect(
         "gauge_zero_drift",
         "g17",
-        (SensorDrift("strain[17]", -8e-4, float(TURNS)),),
+        (SensorDrift("strain[17]", -8e-4, float(STEPS)),),
         "gauge 17 drifts to -800 microstrain",
     ),
-    Hidden(
+    MissionEffect(
         "gauge_gain", "g17", (SensorGain("strain[17]", -0.12),), "gauge 17 shows 12 % too little"
     ),
-    Hidden("washout", "", (Washout(0.08, 1.0),), "washout of 8 % per g at the tip"),
-    Hidden(
+    MissionEffect("washout", "", (Washout(0.08, 1.0),), "washout of 8 % per g at the tip"),
+    MissionEffect(
         "local_stiffness_loss",
         "",
         (LocalStiffnessLoss(0.15, 0.45, 0.4),),
         "skin from 0.45 to 0.85 m has lost 15 %",
     ),
-    Hidden(
+    MissionEffect(
         "thermal_strain",
         "*",
         (ThermalStrain("*", 15e-6),),
         "all gauges show 15 microstrain/K, swing of 20 K",
     ),
-    Hidden(
+    MissionEffect(
         "inertia_relief",
         "",
         (InertiaRelief(0.25),),
         "structure's weight relieves the lift by 25 % more",
     ),
-    Hidden("point_mass", "", (PointMass(0.2, 2.0),), "0.2 kg at 2 m"),
-    Hidden("point_mass", "", (PointMass(0.5, 2.0),), "0.5 kg at 2 m"),
+    MissionEffect("point_mass", "", (PointMass(0.2, 2.0),), "0.2 kg at 2 m"),
+    MissionEffect("point_mass", "", (PointMass(0.5, 2.0),), "0.5 kg at 2 m"),
 )
 
 
 @dataclass(frozen=True)
-class Flown:
-    """How well a twin knew its wing in one mission.
+class MissionErrors:
+    """Errors and decisions of a twin in one mission.
 
     Attributes
     ----------
-    rms : (2,) ndarray
-        Of the mean of z1, z2 less the truth [1].
+    rms : (2,) array
+        Rms error of the mean of z1 and z2 [1].
     coverage : float
-        Share of turns whose 90 % set of states holds the truth.
-    decided : (2,) ndarray
-        Turns flown at 3g with z1 truly at or above the limit, behind the first of them, and turns
-        beyond it.
+        Share of steps whose 90 % set of states holds the truth.
+    sharp_beyond, beyond : int
+        Steps at 3g with z1 truly at or above the limit, and all steps with z1 there.
     """
 
     rms: NDArray[np.float64]
     coverage: float
-    decided: NDArray[np.int64]
+    sharp_beyond: int
+    beyond: int
+
+    def __str__(self) -> str:
+        """Return the errors for a line of the study."""
+        return f"{100 * self.rms} {self.coverage:.2f} [{self.sharp_beyond} {self.beyond}]"
 
 
 @dataclass(frozen=True)
 class Case:
-    """One mission with one hidden effect."""
+    """A hidden effect, the verdict on its mission, and the errors before and after its adoption.
 
-    hidden: Hidden
+    Attributes
+    ----------
+    hidden : MissionEffect
+        The hidden effect.
+    seed : int
+        Seed of the mission.
+    verdict : Verdict
+        Verdict on the run.
+    before, after : MissionErrors
+        Errors without and with the named effect in the twin's model; `after` is None if nothing
+        was named.
+    seconds : float
+        Time of missions and search [s].
+    """
+
+    hidden: MissionEffect
     seed: int
     verdict: Verdict
-    before: Flown
-    after: Flown | None
+    before: MissionErrors
+    after: MissionErrors | None
     seconds: float
 
 
@@ -162,49 +181,57 @@ def patch_text(primitives: Sequence[Primitive], channels: dict[str, str] | None 
     return json.dumps({"schema": SCHEMA, "effects": effects, "channels": channels or {}})
 
 
+def scenario_text(
+    folder: Path,
+    hidden: Sequence[Primitive],
+    known: Sequence[Primitive],
+    scenario: str,
+    steps: int,
+    draws: int,
+) -> str:
+    """Return a shipped scenario with patches of asset and belief; see `fly_mission`."""
+    text = scenario_files()[scenario].read_text(encoding="utf-8")
+    text = text.replace("steps = 50", f"steps = {steps}", 1)
+    text = text.replace("draws = 100", f"draws = {draws}", 1)
+    if depends_on_temperature(hidden):
+        return scenario_in_air(text, folder.parent, f"{folder.name}_wing", patch_text(hidden))
+    for table, primitives in (("asset", hidden), ("belief", known)):
+        if primitives:
+            patch = folder.with_name(f"{folder.name}_{table}.json")
+            file = atomic_write_text(patch, patch_text(primitives))
+            text = text.replace(f"[{table}]\n", f'[{table}]\npatch = "{file.name}"\n', 1)
+    return text
+
+
 def fly_mission(
     folder: Path,
     seed: int,
     hidden: Sequence[Primitive] = (),
     known: Sequence[Primitive] = (),
     scenario: str = "growing_damage",
-    turns: int = TURNS,
+    steps: int = STEPS,
     draws: int = 100,
-) -> Flown:
+) -> MissionErrors:
     """Fly a mission into a run folder, without its report.
 
     Parameters
     ----------
     folder : Path
-        Made; the scenario is written beside it.
+        Run folder to make; the scenario is written beside it.
     seed : int
-        Of the run.
+        Seed of the run.
     hidden : sequence of Primitive
-        What the wing has and its readings show; channels are outputs of the FMU.
+        Effects of the wing and its readings; channels are outputs of the FMU.
     known : sequence of Primitive
-        What the twin's model has.
+        Effects in the twin's model.
     scenario : str
-        A shipped one.
-    turns : int
+        Name of a shipped scenario.
+    steps : int
         Length of the mission.
     draws : int
-        Of the calibrated parameter.
+        Draws of the calibrated parameter.
     """
-    lines = {}
-    for name, primitives in (("asset", hidden), ("belief", known)):
-        if primitives and not depends_on_temperature(hidden):
-            file = atomic_write_text(
-                folder.with_name(f"{folder.name}_{name}.json"), patch_text(primitives)
-            )
-            lines[name] = f'patch = "{file.name}"\n'
-    text = scenario_files()[scenario].read_text(encoding="utf-8")
-    text = text.replace("steps = 50", f"steps = {turns}", 1)
-    text = text.replace("draws = 100", f"draws = {draws}", 1)
-    if depends_on_temperature(hidden):
-        text = scenario_in_air(text, folder.parent, f"{folder.name}_wing", patch_text(hidden))
-    else:
-        for name, line in lines.items():
-            text = text.replace(f"[{name}]\n", f"[{name}]\n{line}", 1)
+    text = scenario_text(folder, hidden, known, scenario, steps, draws)
     loaded = load_scenario(atomic_write_text(folder.with_name(f"{folder.name}.toml"), text))
     resolved = resolve_scenario(loaded, Overrides(seed=seed, in_process=True))
     source = asset_source(resolved)
@@ -222,7 +249,8 @@ def fly_mission(
     return _fly(folder, portable.moved(folder), source, seed)
 
 
-def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Flown:
+def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> MissionErrors:
+    """Fly a prepared mission, store its run in a folder, and return the errors of the twin."""
     knowledge = prepare_knowledge(scenario, source, seed)
     truth = knowledge.truth(seed)
     asset = source.open()
@@ -239,51 +267,59 @@ def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> Fl
         "parameter": knowledge.draws.name,
     }
     write_run(folder, groups_of(result), attributes)
-    state = flight.state
-    error = flight.filtered @ knowledge.model.states.coordinates - state
-    held = in_credible_set(knowledge.model, flight.filtered, state, 0.9)
-    sharp = flight.control_index == scenario.control_names.index("3g")
-    return Flown(
-        np.sqrt(np.mean(error**2, axis=0)),
-        float(np.mean(held)),
-        beyond_the_limit(sharp, state[:, 0]),
+    error = flight.filtered @ knowledge.model.states.coordinates - flight.state
+    is_covered = in_credible_set(knowledge.model, flight.filtered, flight.state, 0.9)
+    is_sharp = flight.control_index == scenario.control_names.index("3g")
+    sharp_beyond, beyond = beyond_the_limit(is_sharp, flight.state[:, 0])
+    return MissionErrors(
+        rms=np.sqrt(np.mean(error**2, axis=0)),
+        coverage=float(np.mean(is_covered)),
+        sharp_beyond=sharp_beyond,
+        beyond=beyond,
     )
 
 
-def beyond_the_limit(sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the turns at 3g with z1 at or above the limit, and all such turns.
+def beyond_the_limit(is_sharp: NDArray[np.bool_], z1: NDArray[np.float64]) -> tuple[int, int]:
+    """Return the numbers of steps at 3g with z1 at or above the limit, and of all such steps.
 
-    The first of them is left out: its control was decided before.
+    The first step with z1 there is left out, because its control was decided before.
+
+    Parameters
+    ----------
+    is_sharp : (T,) array
+        Whether a step is flown at 3g.
+    z1 : (T,) array
+        True loss of region 1.
     """
-    beyond = (z1 >= LIMIT)[:-1]
-    return np.array([np.sum(beyond & sharp[1:]), np.sum(beyond)])
+    is_beyond = (z1 >= LIMIT)[:-1]
+    return int(np.sum(is_beyond & is_sharp[1:])), int(np.sum(is_beyond))
 
 
 def outputs_of(patch: ModelPatch) -> tuple[Primitive, ...]:
     """Return primitives whose channels g1, g2, ... are renamed to FMU outputs strain[1], ..."""
-    found = []
-    for item in patch:
-        channel = getattr(item, "channel", "")
+    primitives = []
+    for primitive in patch:
+        channel = getattr(primitive, "channel", "")
         if channel.startswith("g"):
-            item = replace(item, channel=f"strain[{channel[1:]}]")  # type: ignore[call-arg]
-        found.append(item)
-    return tuple(found)
+            primitive = replace(primitive, channel=f"strain[{channel[1:]}]")  # type: ignore[call-arg]
+        primitives.append(primitive)
+    return tuple(primitives)
 
 
-def undone(item: Primitive) -> Primitive | None:
-    """Return a correction of readings for an effect that drifts with time; None for others."""
-    if isinstance(item, SensorDrift):
-        return replace(item, amplitude=-item.amplitude)
-    if isinstance(item, ThermalStrain):
-        return replace(item, coefficient=-item.coefficient)
+def correction(primitive: Primitive) -> Primitive | None:
+    """Return a primitive that undoes an effect which drifts with time; None for other effects."""
+    if isinstance(primitive, SensorDrift):
+        return replace(primitive, amplitude=-primitive.amplitude)
+    if isinstance(primitive, ThermalStrain):
+        return replace(primitive, coefficient=-primitive.coefficient)
     return None
 
 
-def investigated(folder: Path, seed: int, effects: Sequence[Effect] | None = None) -> Verdict:
+def investigate_run(folder: Path, seed: int, effects: Sequence[Effect] | None = None) -> Verdict:
     """Return the verdict on the run in a folder, by the whole catalogue or some of its effects."""
-    return investigate(
-        run_campaign(folder), run_model(folder)[0], effects, seed=seed, thorough=False
-    ).verdict
+    campaign = run_campaign(folder)
+    model = run_model(folder)[0]
+    return investigate(campaign, model, effects, seed=seed, thorough=False).verdict
 
 
 def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
@@ -295,38 +331,66 @@ def believed(verdict: Verdict) -> tuple[NamedEffect, ...]:
     return ()
 
 
+def fly_with_named_effects(
+    folder: Path,
+    seed: int,
+    hidden: MissionEffect,
+    named: Sequence[NamedEffect],
+    steps: int,
+) -> MissionErrors:
+    """Fly the mission of a hidden effect again with the named effects in the twin's model.
+
+    Effects that drift with time are corrected in the readings instead.
+    """
+    patch = sum((effect.patch for effect in named), ModelPatch())
+    known = []
+    corrections = []
+    for primitive in outputs_of(patch):
+        undone = correction(primitive)
+        if undone is None:
+            known.append(primitive)
+        else:
+            corrections.append(undone)
+    return fly_mission(folder, seed, (*hidden.primitives, *corrections), known, steps=steps)
+
+
 def study(
-    hidden: Hidden,
+    hidden: MissionEffect,
     seed: int,
     work: Path,
-    turns: int = TURNS,
+    steps: int = STEPS,
     effects: Sequence[Effect] | None = None,
     again: bool = True,
 ) -> Case:
-    """Fly with a hidden effect, find it, and fly again with what was found if that is asked for."""
-    began = perf_counter()
-    place = work / f"{HIDDEN.index(hidden)}_{seed}"
-    before = fly_mission(
-        place.with_name(place.name + "_before"), seed, hidden.primitives, turns=turns
-    )
-    verdict = investigated(place.with_name(place.name + "_before"), seed, effects)
+    """Fly with a hidden effect, investigate the run, and fly again with the named effects.
+
+    Parameters
+    ----------
+    hidden : MissionEffect
+        The hidden effect.
+    seed : int
+        Seed of the mission.
+    work : Path
+        Folder for the runs.
+    steps : int
+        Length of the mission.
+    effects : sequence of Effect, optional
+        Effects of the search; the whole catalogue by default.
+    again : bool
+        Whether to fly again.
+    """
+    begin = perf_counter()
+    name = f"{HIDDEN.index(hidden)}_{seed}"
+    before = fly_mission(work / f"{name}_before", seed, hidden.primitives, steps=steps)
+    verdict = investigate_run(work / f"{name}_before", seed, effects)
     after = None
-    chosen = believed(verdict)
-    if chosen and again:
-        found = outputs_of(sum((effect.patch for effect in chosen), ModelPatch()))
-        corrections = tuple(item for item in map(undone, found) if item is not None)
-        known = tuple(item for item in found if undone(item) is None)
-        after = fly_mission(
-            place.with_name(place.name + "_after"),
-            seed,
-            (*hidden.primitives, *corrections),
-            known,
-            turns=turns,
-        )
-    return Case(hidden, seed, verdict, before, after, perf_counter() - began)
+    named = believed(verdict)
+    if named and again:
+        after = fly_with_named_effects(work / f"{name}_after", seed, hidden, named, steps)
+    return Case(hidden, seed, verdict, before, after, perf_counter() - begin)
 
 
-def outcome(hidden: Hidden, verdict: Verdict) -> str:
+def outcome(hidden: MissionEffect, verdict: Verdict) -> str:
     """Return "named", "in the group", "wrong" if another is named, or the kind of the verdict."""
     if not hidden.identifier:
         return "none" if verdict.kind is VerdictKind.NOTHING_MISSING else verdict.kind.value
@@ -334,82 +398,80 @@ def outcome(hidden: Hidden, verdict: Verdict) -> str:
         names = [(effect.identifier, effect.place) for effect in verdict.effects]
         return "named" if names == [(hidden.identifier, hidden.place)] else f"wrong: {names}"
     if verdict.kind is VerdictKind.GROUP:
-        return (
-            "in the group"
-            if hidden.identifier in verdict.group
-            else f"wrong group: {verdict.group}"
-        )
+        is_member = hidden.identifier in verdict.group
+        return "in the group" if is_member else f"wrong group: {verdict.group}"
     return verdict.kind.value
 
 
 def main() -> int:
+    """Print the verdict on each mission, and a table of the hidden effects."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--first-seed", type=int, default=2021)
     parser.add_argument("--only", help="identifiers of hidden effects, with commas")
-    parser.add_argument("--turns", type=int, default=TURNS)
+    parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--once", action="store_true", help="do not fly again with what was found")
     parser.add_argument(
         "--catalogue", help="identifiers of effects that are looked for, with commas"
     )
     arguments = parser.parse_args()
-    effects = [
-        effect_by_identifier(item, library())
-        for item in (arguments.catalogue or "").split(",")
-        if item
-    ]
-    console = Console(width=150)
-    heads = ("rms z1, z2 {}", "90 % sets", "3g beyond the limit")
+    effects = None
+    if arguments.catalogue:
+        names = arguments.catalogue.split(",")
+        effects = [effect_by_identifier(name, library()) for name in names if name]
+    chosen = HIDDEN
+    if arguments.only is not None:
+        names = arguments.only.split(",")
+        chosen = tuple(hidden for hidden in HIDDEN if hidden.identifier in names)
     table = Table(
-        "hidden", "verdicts", *(head.format(when) for when in ("before", "after") for head in heads)
+        "hidden",
+        "verdicts",
+        "rms z1, z2 before",
+        "90 % sets",
+        "3g beyond the limit",
+        "rms z1, z2 after",
+        "90 % sets",
+        "3g beyond the limit",
     )
-    chosen = [
-        item
-        for item in HIDDEN
-        if arguments.only is None or item.identifier in arguments.only.split(",")
-    ]
+    console = Console(width=150)
+    seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
     with tempfile.TemporaryDirectory() as folder:
         for hidden in chosen:
             cases = []
-            for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
+            for seed in seeds:
                 case = study(
-                    hidden, seed, Path(folder), arguments.turns, effects or None, not arguments.once
+                    hidden, seed, Path(folder), arguments.steps, effects, not arguments.once
                 )
                 cases.append(case)
-                after = (
-                    ""
-                    if case.after is None
-                    else f"{100 * case.after.rms} {case.after.coverage:.2f} {case.after.decided}"
-                )
                 console.print(
                     f"{hidden.text}, seed {seed}: {case.verdict.kind.value}: "
-                    f"{case.verdict.sentence} rms {100 * case.before.rms} "
-                    f"{case.before.coverage:.2f} {case.before.decided}; "
-                    f"after {after} ({case.seconds:.1f} s)"
+                    f"{case.verdict.sentence} rms {case.before}; "
+                    f"after {case.after or ''} ({case.seconds:.1f} s)"
                 )
             table.add_row(*_row(hidden, cases))
     console.print(table)
     return 0
 
 
-def _row(hidden: Hidden, cases: Sequence[Case]) -> tuple[str, ...]:
+def _row(hidden: MissionEffect, cases: Sequence[Case]) -> tuple[str, ...]:
+    """Return the row of a hidden effect; its errors are those of missions flown again."""
     counts = Counter(outcome(hidden, case.verdict) for case in cases)
-    again = [case for case in cases if case.after is not None]
-    before, after = (
-        [case.before for case in again or cases],
-        [case.after for case in again if case.after],
-    )
     verdicts = ", ".join(f"{name} {count}" for name, count in counts.most_common())
-    return (hidden.text, verdicts, *_shown(before), *_shown(after))
+    flown_again = [case for case in cases if case.after is not None]
+    before = [case.before for case in flown_again or cases]
+    after = [case.after for case in flown_again if case.after is not None]
+    return (hidden.text, verdicts, *_cells(before), *_cells(after))
 
 
-def _shown(flown: Sequence[Flown]) -> tuple[str, str, str]:
-    if not flown:
+def _cells(missions: Sequence[MissionErrors]) -> tuple[str, str, str]:
+    """Return rms error, coverage and decisions of missions, as cells of the table."""
+    if not missions:
         return "", "", ""
-    values = 100.0 * np.sqrt(np.mean([item.rms**2 for item in flown], axis=0))
-    sharp, beyond = np.sum([item.decided for item in flown], axis=0)
-    coverage = np.mean([item.coverage for item in flown])
-    return f"{values[0]:.1f}, {values[1]:.1f} points", f"{coverage:.2f}", f"{sharp} of {beyond}"
+    z1, z2 = 100.0 * np.sqrt(np.mean([mission.rms**2 for mission in missions], axis=0))
+    coverage = np.mean([mission.coverage for mission in missions])
+    sharp_beyond = sum(mission.sharp_beyond for mission in missions)
+    beyond = sum(mission.beyond for mission in missions)
+    return f"{z1:.1f}, {z2:.1f} points", f"{coverage:.2f}", f"{sharp_beyond} of {beyond}"
 
 
 if __name__ == "__main__":

@@ -84,19 +84,19 @@ def main() -> int:
     moment = random.Random(arguments.seed)
     different = 0
     with tempfile.TemporaryDirectory() as place:
-        whole = Path(place) / "whole"
+        uninterrupted = Path(place) / "whole"
         begin = time.monotonic()
         subprocess.run(
-            command(arguments.scenario, "--out", str(whole), *arguments.options), check=True
+            command(arguments.scenario, "--out", str(uninterrupted), *arguments.options), check=True
         )
         seconds = time.monotonic() - begin
-        expected = contents(whole)
+        expected = contents(uninterrupted)
         for number in range(arguments.trials):
             folder = Path(place) / f"trial-{number}"
             kills = trial(arguments.scenario, arguments.options, folder, moment, seconds)
-            found = contents(folder)
+            files = contents(folder)
             unequal = sorted(
-                name for name in {*expected, *found} if expected.get(name) != found.get(name)
+                name for name in {*expected, *files} if expected.get(name) != files.get(name)
             )
             leftovers = [str(path.relative_to(folder)) for path in folder.rglob(".*")]
             different += bool(unequal or leftovers)
@@ -105,7 +105,7 @@ def main() -> int:
                 if unequal or leftovers
                 else "identical"
             )
-            print(f"trial {number + 1}: {kills} kills, {len(found)} files, {outcome}", flush=True)
+            print(f"trial {number + 1}: {kills} kills, {len(files)} files, {outcome}", flush=True)
     print(f"{arguments.trials - different} of {arguments.trials} trials bit-identical")
     return 1 if different else 0
 

@@ -2,7 +2,7 @@
 
 `python -m benchmarks.studies.learning --missions 3000 --first-seed 0` draws e of each wing from
 the prior of the scenario `level_turns_learning` and flies its mission twice from the same seed: by
-a twin that learns, and by one that averages over e anew in each turn. Then it counts alarms in
+a twin that learns, and by one that averages over e anew in each step. Then it counts alarms in
 `--notices` (200) missions of a healthy wing, in as many with a gauge whose gain is off by 20 %,
 and in half as many with skin that softens where the model has no region. The exit code is 1 if a
 target is missed.
@@ -31,7 +31,7 @@ from twin_master.fleet.reading import Estimated, Outcomes
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights
-from twin_master.mission.turns import History
+from twin_master.mission.steps import History
 from twin_master.network.estimator import Notice
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
@@ -42,7 +42,7 @@ REACH = (0.9, 1.1)
 THIRD_REGION = {"span_start": 0.5, "span_end": 0.9, "chord_start": 0.1, "chord_end": 0.3}
 """Skin between the two regions of the model [m]."""
 SOFTENING = (10, 0.01, 0.4)
-"""First turn, loss of stiffness per turn, and the loss before which it is to be found."""
+"""First step, loss of stiffness per step, and the loss before which it is to be found."""
 GAIN = 0.2
 NOTICE_TARGETS = {"healthy": 0.01, "gauge": 0.99, "third region": 0.9}
 MOST_EARLY = 0.08
@@ -64,14 +64,14 @@ class TwinResult:
         Share of the missions whose 90 % interval of e holds its true value.
     factor_rms : float
         Rms error of the learnt e.
-    seconds_per_turn : float
-        Processor time of a turn [s].
+    seconds_per_step : float
+        Processor time of a step [s].
     """
 
     outcomes: Outcomes
     coverage: Estimated
     factor_rms: float
-    seconds_per_turn: float
+    seconds_per_step: float
 
 
 def factor_of(scenario: Scenario, seed: int) -> float:
@@ -105,9 +105,9 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> TwinRes
         flight = fly(scenario, twin, plant)
         seconds += time.process_time() - begin
         flights.put(number, flight)
-        # Revising the last turn with its own observation changes nothing, and returns the learnt e
-        last_turn = twin.turns - 1
-        learnt = twin.revise(last_turn, twin.observed(last_turn)).learnt
+        # Revising the last step with its own observation changes nothing, and returns the learnt e
+        last_step = twin.steps - 1
+        learnt = twin.revise(last_step, twin.observed(last_step)).learnt
         if scenario.calibration.parameter in learnt:
             estimate = learnt[scenario.calibration.parameter]
             covered.append(estimate.lower <= e <= estimate.upper)
@@ -118,7 +118,7 @@ def fly_wings(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> TwinRes
         outcomes=outcomes(knowledge, flights),
         coverage=Estimated(share, standard_error),
         factor_rms=float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan"),
-        seconds_per_turn=seconds / (len(seeds) * scenario.mission.steps),
+        seconds_per_step=seconds / (len(seeds) * scenario.mission.steps),
     )
 
 
@@ -129,7 +129,7 @@ class GaugeFault:
     Attributes
     ----------
     factor : callable
-        (seed, turn) -> factors (G,) of the gauges.
+        (seed, step) -> factors (G,) of the gauges.
     gauge : callable
         seed -> index of the faulty gauge, or None if no gauge is faulty.
     """
@@ -144,8 +144,8 @@ class Alarms:
 
     Attributes
     ----------
-    turn : (N,) array
-        Turn of the first alarm; infinite where there was none.
+    step : (N,) array
+        Step of the first alarm; infinite where there was none.
     named : (N,) array
         Whether the alarm named the fault.
     detectable : (N,) array
@@ -153,7 +153,7 @@ class Alarms:
         a test that knows the fault, the state, e and the noise.
     """
 
-    turn: NDArray[np.float64]
+    step: NDArray[np.float64]
     named: NDArray[np.bool_]
     detectable: NDArray[np.bool_]
 
@@ -172,12 +172,12 @@ def third_region() -> Callable[[float], NDArray[np.float64]]:
 
 
 def spoiled(asset: Asset, factor: Callable[[int], NDArray[np.float64]]) -> Asset:
-    """Return an asset whose gauge readings are multiplied by factors (G,) of the turn."""
-    turns = itertools.count()
+    """Return an asset whose gauge readings are multiplied by factors (G,) of the step."""
+    steps = itertools.count()
 
     def observe(control: object, health: object) -> AssetReading:
         reading = asset.step(control, health)  # type: ignore[arg-type]
-        return replace(reading, values=reading.values * factor(next(turns)))
+        return replace(reading, values=reading.values * factor(next(steps)))
 
     return StatelessAsset(observe)
 
@@ -201,12 +201,12 @@ def largest_evidence(
     flight : Flight
         A mission with the fault.
     factor : callable
-        turn -> factors (G,) of the gauges.
+        step -> factors (G,) of the gauges.
     noise : (G,) array
         Standard deviations of the gauges.
     """
     with_fault = flight.observation
-    factors = np.array([factor(turn) for turn in range(len(with_fault))])
+    factors = np.array([factor(step) for step in range(len(with_fault))])
     healthy = with_fault / factors
     residual_healthy = (flight.observed - healthy) ** 2
     residual_fault = (flight.observed - with_fault) ** 2
@@ -222,7 +222,7 @@ def fly_for_alarms(
     assert scenario.notice is not None
     threshold = np.log(scenario.notice.threshold)
     noise = np.asarray(scenario.truth.noise.standard_deviation)
-    turns = []
+    steps = []
     named = []
     detectable = []
     for seed in seeds:
@@ -230,12 +230,12 @@ def fly_for_alarms(
         factor = partial(fault.factor, seed)
         plant = knowledge.plant(knowledge.truth(seed), spoiled(asset, factor))
         flight = fly(scenario, knowledge.twin(lag=1), plant)
-        alarms = [(turn, notice) for turn, notice in flight.notices if notice.kind == "alarm"]
-        first_turn, first_alarm = alarms[0] if alarms else (np.inf, None)
-        turns.append(first_turn)
+        alarms = [(step, notice) for step, notice in flight.notices if notice.kind == "alarm"]
+        first_step, first_alarm = alarms[0] if alarms else (np.inf, None)
+        steps.append(first_step)
         named.append(is_named(first_alarm, fault.gauge(seed)))
         detectable.append(bool(largest_evidence(flight, factor, noise) >= threshold))
-    return Alarms(np.array(turns), np.array(named), np.array(detectable))
+    return Alarms(np.array(steps), np.array(named), np.array(detectable))
 
 
 def gauge_faults(gauges: int) -> dict[str, GaugeFault]:
@@ -246,17 +246,17 @@ def gauge_faults(gauges: int) -> dict[str, GaugeFault]:
     def faulty_gauge(seed: int) -> int:
         return int(np.random.default_rng([seed, 2]).integers(gauges))
 
-    def factor_of_gain(seed: int, _turn: int) -> NDArray[np.float64]:
+    def factor_of_gain(seed: int, _step: int) -> NDArray[np.float64]:
         return np.where(np.arange(gauges) == faulty_gauge(seed), 1.0 + GAIN, 1.0)
 
-    def factor_of_region(_seed: int, turn: int) -> NDArray[np.float64]:
-        return third_region_factor(min(rate * max(turn - begin + 1, 0), limit))
+    def factor_of_region(_seed: int, step: int) -> NDArray[np.float64]:
+        return third_region_factor(min(rate * max(step - begin + 1, 0), limit))
 
     def no_gauge(_seed: int) -> None:
         return None
 
     return {
-        "healthy": GaugeFault(lambda _seed, _turn: np.ones(gauges), no_gauge),
+        "healthy": GaugeFault(lambda _seed, _step: np.ones(gauges), no_gauge),
         "gauge": GaugeFault(factor_of_gain, faulty_gauge),
         "third region": GaugeFault(factor_of_region, no_gauge),
     }
@@ -265,24 +265,24 @@ def gauge_faults(gauges: int) -> dict[str, GaugeFault]:
 def study_notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> bool:
     """Print how many faults raise an alarm; return whether every target is reached."""
     begin, rate, limit = SOFTENING
-    turn_of_limit = begin - 1 + limit / rate
+    step_of_limit = begin - 1 + limit / rate
     print(
-        "\n| mission | alarm | turn, median | named | a test that knows all but whether |\n|"
+        "\n| mission | alarm | step, median | named | a test that knows all but whether |\n|"
         + " --- |" * 5
     )
     passes = True
     for name, fault in gauge_faults(knowledge.scenario.observation.count).items():
         flown = seeds[: max(len(seeds) // 2, 1)] if name == "third region" else seeds
-        latest = turn_of_limit if name == "third region" else np.inf
+        latest = step_of_limit if name == "third region" else np.inf
         alarms = fly_for_alarms(knowledge, wing, flown, fault)
-        in_time = alarms.turn < latest
+        in_time = alarms.step < latest
         share = float(in_time.mean())
         standard_error = np.sqrt(share * (1.0 - share) / len(flown))
-        median_turn = np.median(alarms.turn[in_time]) if in_time.any() else np.nan
+        median_step = np.median(alarms.step[in_time]) if in_time.any() else np.nan
         named = 100 * alarms.named[in_time].mean() if in_time.any() else 0
         print(
             f"| {name} | {in_time.sum()} of {len(flown)}, "
-            f"{100 * share:.1f} ± {100 * standard_error:.1f} % | {median_turn:.0f} "
+            f"{100 * share:.1f} ± {100 * standard_error:.1f} % | {median_step:.0f} "
             f"| {named:.0f} % | {100 * float(alarms.detectable.mean()):.1f} % |",
             flush=True,
         )
@@ -305,7 +305,7 @@ def print_row(name: str, result: TwinResult) -> None:
         f"{100 * z2.value:.2f} ± {100 * z2.error:.2f}",
         f"{100 * coverage.value:.1f} ± {100 * coverage.error:.1f} %",
         f"{100 * result.factor_rms:.2f} %",
-        f"{1.0 / result.seconds_per_turn:.0f}",
+        f"{1.0 / result.seconds_per_step:.0f}",
     ]
     print("| " + " | ".join(cells) + " |", flush=True)
 
@@ -329,12 +329,12 @@ def study_learning(
     headings = (
         "twin",
         "early 2g",
-        "2g within 2 turns",
+        "2g within 2 steps",
         "rms z1, points",
         "rms z2, points",
         "90 % interval holds e",
         "rms of e",
-        "turns a second",
+        "steps a second",
     )
     print("| " + " | ".join(headings) + f" |\n|{' --- |' * len(headings)}")
     learning = fly_wings(knowledge, wing, seeds)

@@ -60,8 +60,8 @@ class ScaledSource(PairedSource):
         table = super().observation_table(draws, model)
         controls = load_scenario("paper_level_turns").scenario.control
         undamaged = dict(zip(model.states.names, model.states.coordinates[0].tolist(), strict=True))
-        shown = self.open().step(controls[-1].values, undamaged).values
-        return np.asarray(table * (shown / table[:, 0, -1].mean(axis=0)))
+        readings = self.open().step(controls[-1].values, undamaged).values
+        return np.asarray(table * (readings / table[:, 0, -1].mean(axis=0)))
 
 
 @dataclass(frozen=True)
@@ -98,13 +98,13 @@ HEADINGS = (
     "twin's model",
     "model error",
     "first seed",
-    "2g within 2 turns",
+    "2g within 2 steps",
     "early 2g",
     "rms z1, points",
     "rms z2, points",
     "bias z1, points",
     "bias z2, points",
-    "log evidence per turn",
+    "log evidence per step",
     "true state in 90 % set",
 )
 
@@ -163,8 +163,12 @@ def misfit_rows(
     rows = [
         row(f"{gauge + 1}", misfit.per_sensor[gauge], np.array([gauge])) for gauge in order[:SHOWN]
     ]
-    rest = order[SHOWN:]
-    return [*rows, row("the others", rms(rest), rest), row("all", rms(order), order)]
+    other_gauges = order[SHOWN:]
+    return [
+        *rows,
+        row("the others", rms(other_gauges), other_gauges),
+        row("all", rms(order), order),
+    ]
 
 
 def show_misfit(
@@ -181,7 +185,7 @@ def show_misfit(
     control = scenario.control_names.index(scenario.mission.first_control)
     title = (
         "our model less the library, "
-        "and what each gauge adds to the estimate of one turn (linearised)"
+        "and what each gauge adds to the estimate of one step (linearised)"
     )
     states = [knowledge.model.states.index(place) for place in places]
     show(title, headings, misfit_rows(misfit, control, states), page)
@@ -203,20 +207,26 @@ def combinations(given: argparse.Namespace, scenario: Scenario, seeds: Sequence[
         library = asset_source(chosen.model_copy(update=flown))
         return {"our wing": ReducedModelSource(chosen, wing_model), "library": library}
 
-    own = sources(scenario)
-    misfit = show_misfit(scenario, own["our wing"], own["library"], seeds[0], given.markdown)
+    asset_sources = sources(scenario)
+    misfit = show_misfit(
+        scenario, asset_sources["our wing"], asset_sources["library"], seeds[0], given.markdown
+    )
     rows = []
     for first in seeds:
         flown = range(first, first + given.missions)
         for name in given.model_error:
             error = model_error(name, misfit)
             chosen = with_model_error(scenario, error)
-            known = sources(chosen)
-            for asset, twin in product(known, known):
+            believed_sources = sources(chosen)
+            for asset, twin in product(believed_sources, believed_sources):
                 if name == SCALED and asset == twin:
                     continue
                 kind = ScaledSource if name == SCALED else PairedSource
-                source = known[asset] if asset == twin else kind(known[asset], known[twin])
+                source = (
+                    believed_sources[asset]
+                    if asset == twin
+                    else kind(believed_sources[asset], believed_sources[twin])
+                )
                 study = fly_seeds(chosen, source, flown, calibration_seed=first)
                 rows.append(
                     Row(asset, twin, LABELS.get(name) or f"{float(name):g} %", first, study)
@@ -387,7 +397,7 @@ def main() -> int:
         arguments.markdown,
     )
     print(
-        "targets of 300 missions: 2g within 2 turns >= 98 %, early 2g <= 8 %, "
+        "targets of 300 missions: 2g within 2 steps >= 98 %, early 2g <= 8 %, "
         "rms <= 4.5 and 13 points; "
         f"{arguments.missions} missions each, {seconds:.1f} s"
     )

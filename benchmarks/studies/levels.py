@@ -1,8 +1,8 @@
 """How well beliefs hold a truth between the levels of their states; docs/scenarios.md shows it.
 
 `python -m benchmarks.studies.levels --missions 300` flies the wing, the bracket and the stiffened
-panel with damage that grows between levels, at the mean rate of the twin: a little in every turn
-("creeps"), or in the turns in which the twin's damage grows, by anything up to two levels
+panel with damage that grows between levels, at the mean rate of the twin: a little in every step
+("creeps"), or in the steps in which the twin's damage grows, by anything up to two levels
 ("jumps"). The noise is what the twin assumes. A twin whose states stand for intervals
 (`observation.between_levels`) is compared with one whose states stand for the levels themselves:
 how often 90 % sets hold the level nearest to the truth, how many states they have, the rms error,
@@ -62,7 +62,7 @@ class Study:
 
     @property
     def held(self) -> tuple[float, float]:
-        """Share of turns whose 90 % set holds the nearest state, and the mean set size."""
+        """Share of steps whose 90 % set holds the nearest state, and the mean set size."""
         nearest = [
             np.abs(self.truth[..., f, None] - np.array(level)).argmin(axis=-1)
             for f, level in enumerate(self.levels)
@@ -86,7 +86,7 @@ class Study:
 def grown(
     law: str, probability: Float, factors: int, step: float, random: np.random.Generator
 ) -> Float:
-    """Return the growth of damage (B, F) in a turn, at the mean rate of the twin."""
+    """Return the growth of damage (B, F) in a step, at the mean rate of the twin."""
     shape = (len(probability), factors)
     if law == "creeps":
         return random.gamma(2.0, 0.5 * step * probability[:, None], shape)
@@ -133,7 +133,7 @@ def fly(
     random = np.random.default_rng(2021)
     levels = tuple(factor.levels for factor in model.states.factors)
     highest = np.array([level[-1] for level in levels])
-    step = levels[0][1] - levels[0][0]
+    spacing = levels[0][1] - levels[0][0]
     probability = np.array([float(p) for p in scenario.transition.probability.values()])  # type: ignore[arg-type]
     control = np.full(missions, scenario.control_names.index(scenario.mission.first_control))
     truth, belief = np.zeros((missions, len(levels))), np.tile(model.prior, (missions, 1))
@@ -141,19 +141,20 @@ def fly(
     carried: list[Carried | None] = [None] * watched
     alarmed = np.zeros(watched, dtype=bool)
     truths, beliefs = [], []
-    for turn in range(scenario.mission.steps):
-        if turn:
-            truth = np.minimum(
-                truth + grown(law, probability[control], len(levels), step, random), highest
-            )
+    for step in range(scenario.mission.steps):
+        if step:
+            growth = grown(law, probability[control], len(levels), spacing, random)
+            truth = np.minimum(truth + growth, highest)
             belief = np.einsum("bi,bij->bj", belief, model.transition.matrix[control])
-        seen = shown(truth)[np.arange(missions), control]
-        seen = seen + random.standard_normal(seen.shape) * sensors.standard_deviation
-        log_belief = np.log(belief.clip(1e-300)) + sensors.log_likelihood_sequence(seen, control)
+        observed = shown(truth)[np.arange(missions), control]
+        observed = observed + random.standard_normal(observed.shape) * sensors.standard_deviation
+        log_belief = np.log(belief.clip(1e-300)) + sensors.log_likelihood_sequence(
+            observed, control
+        )
         belief = np.exp(log_belief - log_belief.max(axis=1, keepdims=True))
         belief /= belief.sum(axis=1, keepdims=True)
         for b in range(watched):
-            estimate = estimator.turn(carried[b], seen[b], int(control[b]), turn)
+            estimate = estimator.step(carried[b], observed[b], int(control[b]), step)
             carried[b] = estimate.carried
             alarmed[b] |= any(notice.kind == "alarm" for notice in estimate.notices)
         truths.append(truth)

@@ -61,7 +61,7 @@ class Misfit:
 
     @property
     def bias_per_sensor(self) -> Float:
-        """What the misfit of each sensor adds to the estimate of one turn: (S, U, F, G), SI.
+        """What the misfit of each sensor adds to the estimate of one step: (S, U, F, G), SI.
 
         An asset that shows less than predicted looks less damaged, hence the sign.
         """
@@ -69,7 +69,7 @@ class Misfit:
 
     @property
     def bias(self) -> Float:
-        """What the misfit adds to the estimate of one turn, linearised: (S, U, F), SI."""
+        """What the misfit adds to the estimate of one step, linearised: (S, U, F), SI."""
         return np.asarray(self.bias_per_sensor.sum(axis=-1))
 
 

@@ -47,23 +47,24 @@ def maze(discount: float = 0.95) -> DecisionProblem:
         to = x + ways[way % 4][0], y + ways[way % 4][1]
         return cells.index(to if to in cells else (x, y))
 
-    moves, seen = np.zeros((4, 11, 11)), np.zeros((6, 11))
+    moves, likelihood = np.zeros((4, 11, 11)), np.zeros((6, 11))
     for number, (x, y) in enumerate(cells):
         for way in range(4):
             for turned, share in ((0, 0.8), (1, 0.1), (-1, 0.1)):
                 moves[way, number, reached(x, y, way + turned)] += share
-        left, right = (reached(x, y, way) == number for way in (3, 1))
-        seen[2 * left + right, number] = 1.0
-    for number, shown in ((good, 4), (bad, 5)):
+        wall_left, wall_right = (reached(x, y, way) == number for way in (3, 1))
+        likelihood[2 * wall_left + wall_right, number] = 1.0
+    for number, symbol in ((good, 4), (bad, 5)):
         moves[:, number] = start
-        seen[:, number] = np.eye(6)[shown]
+        likelihood[:, number] = np.eye(6)[symbol]
     reward = np.full((11, 4), -0.04)
-    reward[good], reward[bad] = 1.0, -1.0
+    reward[good] = 1.0
+    reward[bad] = -1.0
     return DecisionProblem(
         TransitionModel((moves,)),
         reward,
         np.full(4, discount),
-        (seen,) * 4,
+        (likelihood,) * 4,
         start,
         moves_first=True,
     )
@@ -76,25 +77,27 @@ def rock_sample(
     qualities = 2 ** len(rocks)
     end, controls = size * size * qualities, 5 + len(rocks)
     moves = np.zeros((controls, end + 1, end + 1))
-    reward, told = np.zeros((end + 1, controls)), np.zeros((len(rocks), end + 1))
+    reward, good_probability = np.zeros((end + 1, controls)), np.zeros((len(rocks), end + 1))
     moves[:, end, end] = 1.0
     for x, y, good in itertools.product(range(size), range(size), range(qualities)):
-        here = (y * size + x) * qualities + good
-        for control, (right, up) in enumerate([(0, 1), (1, 0), (0, -1), (-1, 0)]):
-            a, b = min(max(x + right, 0), size), min(max(y + up, 0), size - 1)
-            moves[control, here, end if a == size else (b * size + a) * qualities + good] = 1.0
-            reward[here, control] = 10.0 * (a == size)
+        state = (y * size + x) * qualities + good
+        for control, (rightwards, upwards) in enumerate([(0, 1), (1, 0), (0, -1), (-1, 0)]):
+            a, b = min(max(x + rightwards, 0), size), min(max(y + upwards, 0), size - 1)
+            moves[control, state, end if a == size else (b * size + a) * qualities + good] = 1.0
+            reward[state, control] = 10.0 * (a == size)
         rock = rocks.index((x, y)) if (x, y) in rocks else None
-        taken = good if rock is None else good & ~(1 << rock)
-        moves[4, here, here - good + taken] = 1.0
-        reward[here, 4] = 0.0 if rock is None else 10.0 if taken != good else -10.0
-        moves[5:, here, here] = 1.0
+        remaining = good if rock is None else good & ~(1 << rock)
+        moves[4, state, state - good + remaining] = 1.0
+        reward[state, 4] = 0.0 if rock is None else 10.0 if remaining != good else -10.0
+        moves[5:, state, state] = 1.0
         for number, (a, b) in enumerate(rocks):
             right_one = 0.5 + 0.5 * 2.0 ** (-np.hypot(x - a, y - b) / 20.0)
-            told[number, here] = right_one if good >> number & 1 else 1.0 - right_one
+            good_probability[number, state] = right_one if good >> number & 1 else 1.0 - right_one
     prior = np.zeros(end + 1)
     prior[(start[1] * size + start[0]) * qualities :][:qualities] = 1.0 / qualities
-    likelihood = (np.ones((1, end + 1)),) * 5 + tuple(np.array([row, 1.0 - row]) for row in told)
+    likelihood = (np.ones((1, end + 1)),) * 5 + tuple(
+        np.array([row, 1.0 - row]) for row in good_probability
+    )
     return DecisionProblem(
         TransitionModel((moves,)),
         reward,
@@ -149,20 +152,22 @@ def write_drn(problem: DecisionProblem, path: Path) -> float:
     text += [f"state 1 {{{most + 2}}} sink\n\taction a [0]\n\t\t1 : 1"]
     waiting = list(place)
     while len(text) < 2 + len(waiting):
-        state, seen = waiting[len(text) - 2]
-        lines = [f"state {len(text)} {{{seen}}}"]
+        state, symbol = waiting[len(text) - 2]
+        lines = [f"state {len(text)} {{{symbol}}}"]
         for control in range(controls):
             to = np.flatnonzero(table[control, state])
             likelihood = problem.likelihood[control]
-            shown = likelihood[:, to] if problem.moves_first else likelihood[:, [state] * len(to)]
+            symbol_likelihood = (
+                likelihood[:, to] if problem.moves_first else likelihood[:, [state] * len(to)]
+            )
             reached = {1: 1.0 - discount}
-            for k, column in zip(*np.nonzero(shown), strict=True):
+            for k, column in zip(*np.nonzero(symbol_likelihood), strict=True):
                 key = int(to[column]), int(k)
                 if key not in place:
                     place[key] = 2 + len(waiting)
                     waiting.append(key)
                 reached[place[key]] = float(
-                    discount * table[control, state, key[0]] * shown[k, column]
+                    discount * table[control, state, key[0]] * symbol_likelihood[k, column]
                 )
             lines.append(f"\taction u{control} [{float(problem.reward[state, control] + lift)!r}]")
             lines += [f"\t\t{number} : {share!r}" for number, share in sorted(reached.items())]
@@ -198,13 +203,15 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=100_000, help="beliefs that Storm unfolds")
     parser.add_argument("--resolution", type=int, default=8, help="of Storm's grid")
     arguments = parser.parse_args()
-    for name, made in PROBLEMS.items():
-        problem = made()
+    for name, make_problem in PROBLEMS.items():
+        problem = make_problem()
         begun = time.process_time()
         plan = plan_on_belief(problem)
-        taken = time.process_time() - begun
+        seconds = time.process_time() - begun
         gap = (plan.upper - plan.lower) / abs(plan.upper)
-        line = f"{name}: {plan.lower:.4f} to {plan.upper:.4f}, gap {100 * gap:.2f} %, {taken:.1f} s"
+        line = (
+            f"{name}: {plan.lower:.4f} to {plan.upper:.4f}, gap {100 * gap:.2f} %, {seconds:.1f} s"
+        )
         if arguments.storm:
             line += ", Storm {:.4f} to {:.4f}".format(
                 *by_storm(problem, arguments.size, arguments.resolution)

@@ -111,83 +111,114 @@ def _written(
 
 
 def plate(folder: Path, regions: int, around: int = 32, across: int = 8) -> Path:
-    """Write a plate of 200 x 100 x 4 mm with a 40 mm hole; its regions are sectors of the hole."""
-    flat = np.linspace(0.0, 1.0, across + 1) ** 1.5
-    turns = np.linspace(0.0, 1.0, around + 1)
-    places, cells = hexahedra((flat, turns, [0.0, 2.0, 4.0]), lambda *_: True)
-    angle = 2.0 * np.pi * places[:, 1]
+    """Write a plate of 200 x 100 x 4 mm with a 40 mm hole; its regions are sectors of the hole.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to write to.
+    regions : int
+        Number of damage regions.
+    around, across : int
+        Elements around the hole, and from the hole to the edge.
+    """
+    # Elements in coordinates 0 to 1 from the hole to the edge and around the hole, and height
+    from_hole = np.linspace(0.0, 1.0, across + 1) ** 1.5
+    around_hole = np.linspace(0.0, 1.0, around + 1)
+    nodes, cells = hexahedra((from_hole, around_hole, [0.0, 2.0, 4.0]), lambda *_: True)
+    outward, turn, height = nodes.T
+    angle = 2.0 * np.pi * turn
     circle = 20.0 * np.column_stack((np.cos(angle), np.sin(angle)))
-    # along the sides of the plate by equal parts, so that its corners are nodes
+
+    # Along the edge by equal eighths, so that the corners are nodes
     corners = np.array(
         [(100, 0), (100, 50), (0, 50), (-100, 50), (-100, 0), (-100, -50), (0, -50), (100, -50)]
     )
-    eighth = np.column_stack(
-        [
-            np.interp(8.0 * places[:, 1], np.arange(9), np.append(corners[:, k], corners[0, k]))
-            for k in (0, 1)
-        ]
+    edge = np.column_stack(
+        [np.interp(8.0 * turn, np.arange(9), np.append(row, row[0])) for row in corners.T]
     )
-    plane = circle + places[:, :1] * (eighth - circle)
-    centre = places[cells[:, :8]].mean(axis=1)
-    near = centre[:, 0] < 0.5
-    region = np.where(near, 1 + (centre[:, 1] * regions).astype(np.int64), 0)
+    plane = circle + outward[:, None] * (edge - circle)
+
+    # Regions at the hole
+    centre_outward, centre_turn, _ = nodes[cells[:, :8]].mean(axis=1).T
+    region = np.where(centre_outward < 0.5, 1 + (centre_turn * regions).astype(np.int64), 0)
+
+    # Tangential gauges around the hole
     middle = 2.0 * np.pi * (np.arange(8) + 0.5) / 8
-    at, along = (
-        np.array((np.cos(middle), np.sin(middle))).T,
-        np.array((-np.sin(middle), np.cos(middle))).T,
-    )
+    radial = np.column_stack((np.cos(middle), np.sin(middle)))
+    tangential = np.column_stack((-np.sin(middle), np.cos(middle)))
     gauges = _gauges(
-        np.column_stack((26.0 * at, np.full(8, 4.0))), np.column_stack((along, np.zeros(8)))
+        np.column_stack((26.0 * radial, np.full(8, 4.0))),
+        np.column_stack((tangential, np.zeros(8))),
     )
-    return _written(
-        folder, PLATE + COMMON + gauges, np.column_stack((plane, places[:, 2])), cells, region
-    )
+    points = np.column_stack((plane, height))
+    return _written(folder, PLATE + COMMON + gauges, points, cells, region)
 
 
 def tube(folder: Path, regions: int, along: int = 24) -> Path:
-    """Write a tube of 400 mm length, 40 mm width and 2 mm wall; its regions are half rings."""
-    places, cells = hexahedra(
+    """Write a tube of 400 mm length, 40 mm width and 2 mm wall; its regions are half rings.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to write to.
+    regions : int
+        Number of damage regions.
+    along : int
+        Elements along the tube.
+    """
+    nodes, cells = hexahedra(
         ([18.0, 20.0], np.linspace(0.0, 1.0, 17), np.linspace(0.0, 400.0, along + 1)),
         lambda *_: True,
     )
-    angle = 2.0 * np.pi * places[:, 1]
-    points = np.column_stack(
-        (places[:, 0] * np.cos(angle), places[:, 0] * np.sin(angle), places[:, 2])
+    radius, turn, height = nodes.T
+    angle = 2.0 * np.pi * turn
+    points = np.column_stack((radius * np.cos(angle), radius * np.sin(angle), height))
+    _, centre_turn, centre_height = nodes[cells[:, :8]].mean(axis=1).T
+    region = 1 + (centre_height / 400.0 * regions).astype(np.int64)
+    region[centre_turn > 0.5] = 0
+
+    # Gauges along the tube, on two sides by turns
+    side = 0.5 * np.pi * (np.arange(8) % 2)
+    gauge_points = np.column_stack(
+        (20.0 * np.cos(side), 20.0 * np.sin(side), 25.0 + 50.0 * np.arange(8))
     )
-    centre = places[cells[:, :8]].mean(axis=1)
-    region = 1 + (centre[:, 2] / 400.0 * regions).astype(np.int64)
-    region[centre[:, 1] > 0.5] = 0  # half of each ring
-    turn = 0.5 * np.pi * (np.arange(8) % 2)
-    at = np.column_stack((20.0 * np.cos(turn), 20.0 * np.sin(turn), 25.0 + 50.0 * np.arange(8)))
-    gauges = _gauges(at, np.tile((0.0, 0.0, 1.0), (8, 1)))
+    gauges = _gauges(gauge_points, np.tile((0.0, 0.0, 1.0), (8, 1)))
     return _written(folder, TUBE + COMMON + gauges, points, cells, region)
 
 
 def bracket(folder: Path, regions: int) -> Path:
-    """Write the shipped bracket, with heel and arm parted anew."""
+    """Write the shipped bracket, with its heel and arm divided into other damage regions.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to write to.
+    regions : int
+        Number of damage regions.
+    """
     file = structure_files()["bracket"]
     mesh = meshio.read(file.with_suffix(".inp"))
     cells = mesh.cells[0].data
-    centre = mesh.points[cells[:, :8]].mean(axis=1)
-    way = np.where(
-        centre[:, 0] < 6.0, 60.0 - centre[:, 2], 60.0 + centre[:, 0]
-    )  # down the back, along the arm
-    number = np.searchsorted(
-        np.quantile(way, np.arange(1, regions + 1) / (regions + 1)), way, side="right"
-    )
-    text = file.read_text(encoding="utf-8")
-    text = text[: text.index("[[damage]]")] + text[text.index("[[gauge]]") :]
-    mesh.cell_sets = {
-        **mesh.cell_sets,
-        **{f"R{one}": [np.flatnonzero(number == one)] for one in range(1, regions + 1)},
-    }
+
+    # Regions by distance down the back and along the arm
+    x, _, z = mesh.points[cells[:, :8]].mean(axis=1).T
+    distance = np.where(x < 6.0, 60.0 - z, 60.0 + x)
+    limits = np.quantile(distance, np.arange(1, regions + 1) / (regions + 1))
+    number = np.searchsorted(limits, distance, side="right")
+    sets = {f"R{region}": [np.flatnonzero(number == region)] for region in range(1, regions + 1)}
+    mesh.cell_sets = {**mesh.cell_sets, **sets}
+
+    # meshio writes the name of another element type
     mesh.write(folder / "bracket.inp")
     deck = (folder / "bracket.inp").read_text(encoding="utf-8")
     (folder / "bracket.inp").write_text(deck.replace("C3D20RH", "C3D20"), encoding="utf-8")
-    damage = "".join(
-        f'\n[[damage]]\nname = "z{one}"\nset = "R{one}"\n' for one in range(1, regions + 1)
-    )
-    (folder / "bracket.toml").write_text(text + damage, encoding="utf-8")
+
+    text = file.read_text(encoding="utf-8")
+    text = text[: text.index("[[damage]]")] + text[text.index("[[gauge]]") :]
+    for region in range(1, regions + 1):
+        text += f'\n[[damage]]\nname = "z{region}"\nset = "R{region}"\n'
+    (folder / "bracket.toml").write_text(text, encoding="utf-8")
     return folder / "bracket.toml"
 
 

@@ -370,11 +370,11 @@ def judge(out: Path, seed: int, number: int, *, colour: bool) -> dict[str, Any]:
 
 def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, Any]:
     """Return a verdict and its outcome: its kind if right, else wrong; nothing where nothing is."""
-    named = sorted(item.identifier for item in verdict.effects)
-    families = {item.identifier: item.family for item in library()}
+    named = sorted(hypothesis.identifier for hypothesis in verdict.effects)
+    families = {hypothesis.identifier: hypothesis.family for hypothesis in library()}
     kind = verdict.kind.value
     if kind == "group":
-        members = {name for item in verdict.group for name in item.split(" + ")}
+        members = {name for hypothesis in verdict.group for name in hypothesis.split(" + ")}
         outcome = "group" if true and true[0] in members else "wrong"
     elif kind in ("named", "named in part", "family"):
         right = named == true or (
@@ -392,7 +392,8 @@ def scored(verdict: Verdict, true: list[str], proof: Proof | None) -> dict[str, 
         "probability": verdict.probability,
         "share": None if closed is None else [closed.low, closed.value, closed.high],
         "hypotheses": [
-            [list(item.identifiers), item.log_evidence] for item in verdict.hypotheses[:6]
+            [list(hypothesis.identifiers), hypothesis.log_evidence]
+            for hypothesis in verdict.hypotheses[:6]
         ],
         "gates": [gate.reason for gate in verdict.gates if gate.passed is False],
     }

@@ -1,7 +1,7 @@
 """Eight gauges of 24, chosen by information, by pivoted QR and at random; docs/planning.md.
 
 `python -m benchmarks.studies.sensors --missions 300` flies `growing_damage` with eight of the
-wing's gauges; the others are lost from the first turn on. The table shows for each choice the rms
+wing's gauges; the others are lost from the first step on. The table shows for each choice the rms
 error of z1 and z2 in points, and the share of missions that leave the sharp turn before the damage
 asks for it. Pivoted QR of the readings in all states is how PySensors places sensors.
 """
@@ -48,16 +48,16 @@ def flown(chosen: tuple[int, ...], missions: int) -> tuple[NDArray[np.float64], 
 
 def choices(knowledge: Knowledge) -> dict[str, tuple[int, ...]]:
     """Return the gauges of each way to choose, from 0."""
-    shown = knowledge.sensor_model.mean
-    table = (shown - shown.mean(axis=0)).reshape(-1, shown.shape[-1])
+    mean_readings = knowledge.sensor_model.mean
+    table = (mean_readings - mean_readings.mean(axis=0)).reshape(-1, mean_readings.shape[-1])
     rng = np.random.default_rng(1)
-    found = {
+    gauges = {
         "by information": chosen_sensors(drawn_readings(knowledge), range(24), COUNT).sensors,
         "pivoted QR": tuple(qr(table, pivoting=True, mode="r")[1][:COUNT].tolist()),
     }
     for number in range(RANDOM):
-        found[f"random {number + 1}"] = tuple(sorted(rng.permutation(24)[:COUNT].tolist()))
-    return found
+        gauges[f"random {number + 1}"] = tuple(sorted(rng.permutation(24)[:COUNT].tolist()))
+    return gauges
 
 
 def main() -> None:

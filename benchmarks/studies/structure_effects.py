@@ -58,11 +58,17 @@ NOISE = {Quantity.STRAIN: 1e-6, Quantity.DISPLACEMENT: 2e-6}
 ZERO = {Quantity.STRAIN: 1e-6}
 LEVELS = np.array([20.0, 40.0, 60.0, 80.0, 60.0, 40.0, 20.0])
 DAY = 4000.0  # s, of the campaign
-INTERVAL, SAMPLES, DEFLECTION, MODES = 5e-4, 400, 5e-4, 12  # of a ring-down: s, number, m, number
+INTERVAL = 5e-4
+"""Sampling interval of ring-downs [s]."""
+SAMPLES = 400
+DEFLECTION = 5e-4
+"""Deflection of the end before a release [m]."""
+MODES = 12
+"""Modes of the simulated ring-downs."""
 
 
 @dataclass(frozen=True)
-class Hidden:
+class BracketEffect:
     """A hidden effect: name, place, laws at the port, and its changes of readings and forces."""
 
     identifier: str
@@ -77,29 +83,29 @@ class Hidden:
 
 
 HIDDEN = (
-    Hidden(""),
-    Hidden(
+    BracketEffect(""),
+    BracketEffect(
         "gauge_gain",
         "heel",
         readings=lambda name, _time, values: values * (1.06 if name == "heel" else 1.0),
     ),
-    Hidden(
+    BracketEffect(
         "gauge_zero_drift",
         "arm",
         readings=lambda name, time, values: values + (3e-5 * time / DAY if name == "arm" else 0.0),
     ),
-    Hidden("load_cell", force=1.05),
-    Hidden("load_cell", tare=4.0),
-    Hidden("cubic_stiffness", PORT, (PowerStiffness(PORT, 40.0, 3.0, 0, 1e-3),)),
-    Hidden("breathing_crack", PORT, (PowerStiffness(PORT, -8.0, 1.0, -1, 1e-3),)),
-    Hidden("joint_micro_slip", PORT, (MicroSlip(PORT, 8.0, 2e4, -0.5, 24),)),
+    BracketEffect("load_cell", force=1.05),
+    BracketEffect("load_cell", tare=4.0),
+    BracketEffect("cubic_stiffness", PORT, (PowerStiffness(PORT, 40.0, 3.0, 0, 1e-3),)),
+    BracketEffect("breathing_crack", PORT, (PowerStiffness(PORT, -8.0, 1.0, -1, 1e-3),)),
+    BracketEffect("joint_micro_slip", PORT, (MicroSlip(PORT, 8.0, 2e4, -0.5, 24),)),
 )
 IN_MOTION = (
     HIDDEN[0],
     HIDDEN[1],
     *HIDDEN[5:],
-    Hidden("coulomb_friction", PORT, (PowerDamping(PORT, 0.4, 0.0, 0.0, 0.1, 1e-3),)),
-    Hidden("quadratic_damping", PORT, (PowerDamping(PORT, 0.5, 2.0, 0.0, 0.1, 1e-3),)),
+    BracketEffect("coulomb_friction", PORT, (PowerDamping(PORT, 0.4, 0.0, 0.0, 0.1, 1e-3),)),
+    BracketEffect("quadratic_damping", PORT, (PowerDamping(PORT, 0.5, 2.0, 0.0, 0.1, 1e-3),)),
 )
 
 
@@ -121,7 +127,7 @@ def rig(folder: Path) -> Path:
     return path
 
 
-def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -> Campaign:
+def campaign(file: Path, hidden: BracketEffect, seed: int, *, ringdown: bool = False) -> Campaign:
     """Return the campaign of a seed on the full bracket with a hidden effect."""
     random = np.random.default_rng(seed)
     structure = load_and_assemble(file)
@@ -199,7 +205,7 @@ def campaign(file: Path, hidden: Hidden, seed: int, *, ringdown: bool = False) -
     return Campaign("Bracket", channels, tuple(trials), None, {}, "")
 
 
-def outcome(hidden: Hidden, verdict: Verdict) -> str:
+def outcome(hidden: BracketEffect, verdict: Verdict) -> str:
     """Return what became of a hidden effect."""
     if not hidden.identifier:
         return (
@@ -239,8 +245,10 @@ def main() -> int:
                 continue
             for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
                 began = process_time()
-                made = campaign(folder / "bracket.toml", hidden, seed, ringdown=arguments.ringdown)
-                verdict = investigate(made, model, seed=seed, thorough=False).verdict
+                simulated = campaign(
+                    folder / "bracket.toml", hidden, seed, ringdown=arguments.ringdown
+                )
+                verdict = investigate(simulated, model, seed=seed, thorough=False).verdict
                 seconds = process_time() - began
                 print(
                     f"{hidden.identifier or 'nothing'}, seed {seed}: {outcome(hidden, verdict)} "

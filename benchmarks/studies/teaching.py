@@ -4,7 +4,7 @@
 the FMU, and watches the recorded strains three times: by a twin that is never taught, by one that
 is (`uav-twin watch --teach`: alarm, search, trial, adoption), and by one that knew the effect from
 the start. Printed are the alarm, the verdicts, the adoption, the rms error of z1 and z2 in points
-after the adoption (without one, from turn 30 on), and the decisions for 3g there with z1 truly at
+after the adoption (without one, from step 30 on), and the decisions for 3g there with z1 truly at
 or above the limit. The wing with nothing hidden shows what the healthy twin does.
 """
 
@@ -46,9 +46,9 @@ HIDDEN: dict[str, tuple[Primitive, ...]] = {
     "root compliance of 3e-5 rad/(N m)": (RootCompliance(3e-5),),
     "all gauges saturate softly at 4000 microstrain": (SensorSaturation("*", 4e-3, "strain"),),
 }
-TURNS = 50
+STEPS = 50
 WITHOUT = 30
-"""First turn that is compared where nothing was adopted."""
+"""First step that is compared where nothing was adopted."""
 
 
 @dataclass(frozen=True)
@@ -62,18 +62,18 @@ class Watched:
 
 def scenario_of(place: Path, known: tuple[Primitive, ...]) -> Path:
     """Write the scenario of a watch whose twin knows some effects."""
-    kept = []
+    lines = []
     skipping = False
     for line in scenario_files()["level_turns"].read_text(encoding="utf-8").splitlines():
         if line.startswith("["):
             skipping = line.strip("[]").split(".")[0] in ("asset", "truth", "reference")
         if not skipping:
-            kept.append(
+            lines.append(
                 line.replace(
                     "standard_deviation_microstrain = 125", "standard_deviation_microstrain = 150"
                 )
             )
-    text = "\n".join([*kept, "", "[notice]", ""])
+    text = "\n".join([*lines, "", "[notice]", ""])
     if known:
         file = atomic_write_text(place / "known.json", patch_text(known))
         text = text.replace("[belief]\n", f'[belief]\npatch = "{file.resolve().as_posix()}"\n')
@@ -91,28 +91,28 @@ def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
         else:
             watch.run(feed, lambda _decision: None)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]
-    turns = [record for record in lines if "filtered" in record]
+    steps = [record for record in lines if "filtered" in record]
     filtered, chosen = (
-        np.array([turn[key] for turn in turns]) for key in ("filtered", "next_control")
+        np.array([step[key] for step in steps]) for key in ("filtered", "next_control")
     )
     mean = filtered @ watch.models[0].knowledge.model.states.coordinates
     return Watched(mean, chosen == watch.scenario.control_names.index("3g"), lines)
 
 
 def said(records: list[dict[str, Any]]) -> tuple[str, int]:
-    """Return what happened, and the first turn behind the adoption."""
+    """Return what happened, and the first step behind the adoption."""
     words = []
     first = WITHOUT
     for record in records:
         if "verdict" in record:
             verdict = record["verdict"]
-            words.append(f"{verdict['from_turn']} to {verdict['to_turn']}: {verdict['kind']}")
+            words.append(f"{verdict['from_step']} to {verdict['to_step']}: {verdict['kind']}")
         elif "model" in record:
-            first = record["turn"] + 1
-            words.append(f"believed from {record['model']['from_turn']} on at {record['turn']}")
+            first = record["step"] + 1
+            words.append(f"believed from {record['model']['from_step']} on at {record['step']}")
         else:
             alarm = any(notice["kind"] == "alarm" for notice in record.get("notices", ()))
-            words += [f"alarm at {record['turn']}"] if alarm else []
+            words += [f"alarm at {record['step']}"] if alarm else []
     return "; ".join(words) or "no alarm", first
 
 
@@ -121,7 +121,7 @@ def study(name: str, seed: int, work: Path) -> None:
     hidden = HIDDEN[name]
     place = work / f"{[*HIDDEN].index(name)}_{seed}"
     place.mkdir()
-    fly_mission(place / "run", seed, hidden, scenario="level_turns", turns=TURNS)
+    fly_mission(place / "run", seed, hidden, scenario="level_turns", steps=STEPS)
     truth = np.asarray(uav_twin.open_run(place / "run")["truth/state"].values)
     plain = scenario_of(place, ())
     taught = watched(place / "run", place / "taught", plain, teach=True)
@@ -131,12 +131,12 @@ def study(name: str, seed: int, work: Path) -> None:
         "taught": taught,
         "knew": watched(place / "run", place / "knew", scenario_of(place, known), teach=False),
     }
-    what, first = said(taught.records)
+    events, first = said(taught.records)
     errors = {
         way: 100.0 * np.sqrt(np.mean((watch.mean[first:] - truth[first:]) ** 2, axis=0))
         for way, watch in ways.items()
     }
-    # What is decided behind a turn is in force in the next one.
+    # What is decided behind a step is in force in the next one.
     decided = {
         way: "{} of {}".format(
             *beyond_the_limit(np.append(False, watch.sharp[first:-1]), truth[first:, 0])
@@ -147,7 +147,7 @@ def study(name: str, seed: int, work: Path) -> None:
         f"{way} {z1:.2f} {z2:.2f}, {decided[way]}" for way, (z1, z2) in errors.items()
     )
     print(
-        f"{name}, seed {seed}: {what}. From turn {first} on rms of z1, z2, 3g: {figures}",
+        f"{name}, seed {seed}: {events}. From step {first} on rms of z1, z2, 3g: {figures}",
         flush=True,
     )
 

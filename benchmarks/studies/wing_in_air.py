@@ -14,7 +14,7 @@ AIR = Path(__file__).with_name("swinging_air.py")
 
 _BINDING = """[binding]
 name = "wing_in_air"
-step_size = 1.0 # s, one turn
+step_size = 1.0 # s, one step
 description = "A wing in air of changing temperature: load factor as control, 24 strain gauges."
 
 [control.load_factor]
@@ -94,4 +94,4 @@ def scenario_in_air(text: str, folder: Path, name: str, patch: str) -> str:
 
 def depends_on_temperature(primitives: Sequence[Primitive]) -> bool:
     """Return whether one of the primitives depends on the temperature."""
-    return any(item.kind == "thermal_strain" for item in primitives)
+    return any(primitive.kind == "thermal_strain" for primitive in primitives)

@@ -24,7 +24,8 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.held import roughness
 from discrepancy.checks.quality import is_still, rest_faults
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import fit, normal_equations
+from discrepancy.fits.fitting import fit
+from discrepancy.fits.normal_equations import normal_equations
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.separability import prior_point_with_initial_states
 from discrepancy.system.interface import Model

@@ -95,7 +95,7 @@ class MotionEstimate:
     local : tuple of (L,) ndarray
         Unknowns of each trial.
     covariance : (K + E, K + E) ndarray
-        Of shared unknowns and those of effects.
+        The covariance of shared unknowns and effect parameters.
     processes : mapping of int to Process
         Missing forces beside its laws, by the numbers of their ports.
     log_evidence : float
@@ -161,7 +161,7 @@ class EstimatorStart:
     effect, shared : (E,), (K,) ndarray
         Unknowns.
     trajectories : tuple of Trajectory
-        Of each trial.
+        The trajectory of each trial.
     processes : mapping of int to Process
         Missing forces, large enough that the trajectory follows the readings.
     """

@@ -189,7 +189,7 @@ def filter_record(
     parts : int
         Fine steps between two samples.
     transition, noise, drift : (F - 1, n, n), (F - 1, n, n), (F - 1, n, W) ndarray
-        As of `step_matrices`.
+        The matrices that `step_matrices` returns.
     rows, columns : (N, C, n), (N, C, W) ndarray
         What a reading shows of the state, and what each weight leaves of it, over the deviation of
         its noise.
@@ -260,11 +260,11 @@ def smooth_record(
     Parameters
     ----------
     parts, transition, rows, used
-        As of `filter_record`.
+        The arguments of `filter_record`.
     states : (F, n) ndarray
         Predicted states at the values of all weights.
     covariances, gains, variances
-        What `filter_record` returns.
+        The arrays that `filter_record` returns.
     innovations : (N, C) ndarray
         Innovations at the values of all weights.
 

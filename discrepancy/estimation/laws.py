@@ -29,9 +29,9 @@ class ForceAlong:
     Attributes
     ----------
     force : (F,) ndarray
-        At the fine stamps [N or N m].
+        The force at the fine stamps [N or N m].
     by_position, by_speed : (F,) ndarray
-        Its derivatives by position and speed of the port [N/m, N s/m or per rad].
+        The derivatives of the force by position and speed of the port [N/m, N s/m or per rad].
     """
 
     force: FloatArray
@@ -100,7 +100,7 @@ def force_along(
     Parameters
     ----------
     law : PortForce
-        With its numbers.
+        The law with its numbers.
     time, positions, speeds : (F,) ndarray
         Fine stamps [s], and the motion of the port there [m or rad, and per s].
     smoothing : float

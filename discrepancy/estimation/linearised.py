@@ -83,7 +83,7 @@ class SensorReadings:
     Attributes
     ----------
     known : (N, C) ndarray
-        At the values of the unknowns.
+        The change of the readings at the values of the unknowns.
     by_unknown : mapping of int to (N, C) ndarray
         Derivative by an unknown, by its number.
     """
@@ -110,7 +110,7 @@ class LinearisedTrial:
     forces : mapping of int to Forces
         The forces of the hypothesis' laws, by port.
     sensors : SensorReadings
-        What the hypothesis' effects of sensors do to the readings.
+        The changes of readings by the hypothesis' effects of sensors.
     effect : (E,) ndarray
         The values of the effects' unknowns at which laws and sensors are linearised.
     shared : (K,) ndarray
@@ -417,7 +417,7 @@ class SmoothedTrial:
     trajectory : Trajectory
         The smoothed motion, and all forces at ports.
     missing : mapping of int to (F,) ndarray
-        What no law is of the force at a port, by its number [N or N m].
+        The force at each port that no law explains, by the number of the port [N or N m].
     laws : mapping of int to (F,) ndarray
         Force of the laws at a port, linear about the trajectory before.
     deviations : mapping of int to (F,) ndarray

@@ -45,6 +45,11 @@ class EffectTerm:
         return self.effect.identifier
 
     @property
+    def name_in_words(self) -> str:
+        """The name of the effect, or of its family if the shape of the law is free."""
+        return f"a law of the family {self.effect.family}" if self.free_shape else self.effect.name
+
+    @property
     def parameters(self) -> tuple[EffectParameter | ShapeParameter, ...]:
         """The fitted parameters, in order."""
         if self.free_shape:

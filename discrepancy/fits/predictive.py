@@ -21,14 +21,8 @@ from discrepancy.fits.beginnings import (
     with_initial_states_of_first_readings,
 )
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import (
-    LARGEST_EFFECT,
-    CandidateFit,
-    TrialRows,
-    fit,
-    objective,
-    trial_rows,
-)
+from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, objective
+from discrepancy.fits.normal_equations import TrialRows, trial_rows
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.fits.trial_data import TrialData

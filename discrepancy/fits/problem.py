@@ -7,10 +7,9 @@ n0 the degrees of freedom of the noise record, n the number of samples, and RSS 
 residuals in units of s0^2.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from functools import partial
 from math import inf
 
 import numpy as np
@@ -27,12 +26,12 @@ from reporting.memory import ResultCache
 from .candidate import (
     LEAST_STEP,
     PARAMETER_STEP,
-    SHARED_STEP,
     Candidate,
     Point,
     TrialDerivatives,
     with_step,
 )
+from .derivatives import nuisance_derivatives, prediction_derivatives
 from .trial_data import TrialData, global_unknowns, stand_in_deviation
 
 KEPT_RESPONSES = 2000
@@ -311,118 +310,23 @@ class Problem:
     def _nuisance_derivatives(
         self, number: int, point: Point, candidate: Candidate
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the derivatives of a trial's response with respect to its nuisances.
-
-        They are those by the calibrated parameters (P, N, C), and those by the unknowns of the
-        trial except its zeros (I, N, C).
-        """
-        data = self.trials[number]
-        unknowns = data.unknowns
-        shared = point.shared
-        local = point.local[number]
+        """Return the `nuisance_derivatives` of a trial beside the effects of a candidate."""
         patch = self.patch_in(number, candidate, point.effect)
-        response, rates = self.response(number, shared, local, patch)
 
-        def slope(
-            shared_values: FloatArray, local_values: FloatArray, step: float = PARAMETER_STEP
-        ) -> FloatArray:
-            stepped, _ = self.response(number, shared_values, local_values, patch)
-            return (stepped - response) / step
+        def respond(shared: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray | None]:
+            return self.response(number, shared, local, patch)
 
-        # calibrated parameters: inwards from the upper end of a range
-        _, high = self.shared.ends
-        is_at_end = shared + SHARED_STEP > high
-        steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: self.shared.count]
-        parameters = [
-            slope(with_step(shared, k, step), local, step) for k, step in enumerate(steps.tolist())
-        ]
-        # initial state and constants of inputs
-        zeros_end, _, inputs_end, time_zero_end = unknowns.ends
-        columns = [slope(shared, with_step(local, k)) for k in range(zeros_end, inputs_end)]
-        if unknowns.has_time_zero:
-            if rates is None:
-                columns.append(slope(shared, with_step(local, inputs_end)))
-            else:
-                columns.append(rates * unknowns.scale[inputs_end])
-        # health
-        if len(unknowns.health_rows):
-            columns.extend(
-                _health_derivatives(
-                    data, local, time_zero_end, response.shape, partial(slope, shared)
-                )
-            )
-        shape = (-1, *response.shape)
-        return np.array(parameters).reshape(shape), np.array(columns).reshape(shape)
+        return nuisance_derivatives(
+            self.trials[number], self.shared, point.shared, point.local[number], respond
+        )
 
     def prediction_derivatives(
         self, number: int, point: Point, derivatives: TrialDerivatives, candidate: Candidate
     ) -> tuple[FloatArray, IntArray]:
-        """Return the derivatives of a trial's prediction.
-
-        Those of the response, with gains and zeros.
-
-        Parameters
-        ----------
-        number : int
-            The index of the trial.
-        point : Point
-            The values of all unknowns.
-        derivatives : TrialDerivatives
-            The response and its derivatives.
-        candidate : Candidate
-            The effects whose parameters are unknowns.
-
-        Returns
-        -------
-        columns : (L + K, N, C) array
-            The derivatives with respect to the L unknowns of the trial, and to the K shared
-            unknowns and effect parameters that act on it [unit of the channel].
-        index : (K,) array of int
-            The indices of these K, among the Q shared unknowns and the effect parameters after
-            them.
-        """
-        data = self.trials[number]
-        unknowns = data.unknowns
-        shared = self.shared
-        channels = data.trial.channels
-        response = derivatives.response
-        gains = 1.0 + shared.gains(point.shared, channels)
-        # zeros of the channels
-        by_zeros = np.zeros((unknowns.zeros, *response.shape))
-        zero_scale = unknowns.scale[: unknowns.zeros, np.newaxis]
-        by_zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = zero_scale
-        # gains of the channels
-        gain_numbers = np.array(
-            [k for k, name in enumerate(shared.gain_channels) if name in channels], dtype=int
+        """Return the `prediction_derivatives` of a trial, given those of its response."""
+        return prediction_derivatives(
+            self.trials[number], self.shared, point.shared, derivatives, candidate
         )
-        gain_columns = [channels.index(shared.gain_channels[k]) for k in gain_numbers]
-        by_gains = np.zeros((len(gain_numbers), *response.shape))
-        gain_scale = shared.scale[shared.count + gain_numbers]
-        by_gains[np.arange(len(gain_numbers)), :, gain_columns] = (
-            response[:, gain_columns] * gain_scale
-        ).T
-        # parameters of the effects that act on such trials
-        kind = data.trial.kind
-        effect_numbers = np.array(
-            [k for k in range(candidate.size) if kind in candidate.acts_on_with(k)], dtype=int
-        )
-        columns = np.concatenate(
-            (
-                by_zeros,
-                derivatives.local * gains,
-                derivatives.parameters * gains,
-                by_gains,
-                derivatives.effect[effect_numbers] * gains,
-            )
-        )
-        index = np.concatenate(
-            (
-                np.arange(shared.count),
-                shared.count + gain_numbers,
-                shared.size + effect_numbers,
-            )
-        )
-        return columns, index
 
     # -------------------------------------------------------------------------- likelihood
 
@@ -498,48 +402,3 @@ class Problem:
         wider.trials = tuple(wider_trials)
         wider.freedom = np.where(factors != 1.0, inf, self.freedom)
         return wider
-
-
-def _health_derivatives(
-    data: TrialData,
-    local: FloatArray,
-    first: int,
-    shape: tuple[int, ...],
-    slope: Callable[[FloatArray], FloatArray],
-) -> FloatArray:
-    """Return the derivatives (H, N, C) of a response with respect to the uncertain health entries.
-
-    The health of a static trial has a row for each reading, and a row changes its own reading only.
-    So all entries of a region are stepped at once, and each takes its own row of the difference.
-
-    Parameters
-    ----------
-    data : TrialData
-        The trial and its unknowns.
-    local : (L,) array
-        The scaled unknowns of the trial.
-    first : int
-        The index of the first health entry among them.
-    shape : tuple of int
-        The shape (N, C) of the response.
-    slope : callable
-        Returns the difference quotient (N, C) to other unknowns of the trial (L,), for a positive
-        step.
-    """
-    unknowns = data.unknowns
-    derivatives = np.zeros((len(unknowns.health_rows), *shape))
-    for region in range(data.trial.health.shape[1]):
-        entries = np.flatnonzero(unknowns.health_columns == region)
-        if not len(entries):
-            continue
-        stepped = local.copy()
-        # away from the limits of the stiffness loss
-        sign = np.where(stepped[first + entries] > 0.0, -1.0, 1.0)
-        stepped[first + entries] += sign * PARAMETER_STEP
-        change = slope(stepped)
-        if data.trial.is_dynamic:
-            derivatives[entries] = sign[:, np.newaxis, np.newaxis] * change
-        else:
-            rows = unknowns.health_rows[entries]
-            derivatives[entries, rows] = sign[:, np.newaxis] * change[rows]
-    return derivatives

@@ -26,7 +26,8 @@ from discrepancy.errors import DiscrepancyError
 from discrepancy.search_settings import SEARCH
 
 from .candidate import Candidate, EffectTerm
-from .fitting import LARGEST_EFFECT, CandidateFit, check_finite, cholesky_factor, normal_equations
+from .fitting import LARGEST_EFFECT, CandidateFit
+from .normal_equations import check_finite, cholesky_factor, normal_equations
 from .problem import Problem
 
 

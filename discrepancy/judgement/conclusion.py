@@ -5,29 +5,26 @@ effects could not be tested.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from math import floor, isnan, log10, nan
+from math import isnan, nan
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray, TrialKind
-from discrepancy.catalogue.entry import NINETY, Effect, EffectParameter, Setting, ShapeParameter
+from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
 from discrepancy.fits.problem import Problem
-from discrepancy.search.starts import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.verdict import (
     FREE_SHAPE,
     CalibratedParameter,
     Estimate,
-    GapWindow,
     Gate,
     Hypothesis,
-    Moment,
     NamedEffect,
     RemainderEstimate,
     Verdict,
@@ -449,204 +446,3 @@ def _instrument_error(problem: Problem, primitive: Primitive) -> float | None:
     if isinstance(primitive, Clock):
         return max(abs(primitive.rate), abs(primitive.zero) * scales.angular_frequency)
     return None
-
-
-# ---------------------------------------------------------------- when there is a gap
-
-NO_GAP = (VerdictKind.NOTHING_MISSING, VerdictKind.BELOW_LIMIT)
-"""Kinds of verdicts by which the model stands as it is."""
-MOST_MENTIONED = 3
-"""Windows, or effects that were not tested, that a sentence mentions one by one."""
-
-
-def moment_text(moment: Moment) -> str:
-    """Return a time with its 90 % interval, to two digits of its width."""
-    width = moment.high - moment.low
-    places = max(0, 1 - floor(log10(width))) if width > 0.0 else 6
-    interval = f"{moment.low:.{places}f} to {moment.high:.{places}f}"
-    return f"{moment.value:.{places}f} s ({interval})"
-
-
-def window_text(window: GapWindow) -> str:
-    """Return in words since when and until when there is a gap."""
-    if window.begin is None and window.end is None:
-        return "throughout the record"
-    since = "from the first sample"
-    if window.begin:
-        since = f"since {moment_text(window.begin)}"
-    if window.end:
-        return f"{since} until {moment_text(window.end)}"
-    return f"{since}, to the end of the record"
-
-
-def when_sentence(windows: Sequence[GapWindow]) -> str:
-    """Return a sentence on when the model without effect has a gap; empty without a gap in time.
-
-    Parameters
-    ----------
-    windows : sequence of GapWindow
-        The windows of gaps, of the model without effect and of the best hypothesis.
-    """
-    without_effect = [window for window in windows if not window.with_effect]
-    if not without_effect:
-        return ""
-    if all(window.begin is None and window.end is None for window in without_effect):
-        return "The gap is there throughout the records."
-    if len(without_effect) > MOST_MENTIONED:
-        largest = max(without_effect, key=lambda window: window.size)
-        count = len(without_effect)
-        return f"The gap comes and goes, {count} times; the largest is {_sized_window(largest)}."
-    # those that begin in a record first, the largest of each first
-    ordered = sorted(without_effect, key=lambda window: (window.begin is None, -window.size))
-    return f"The gap is there {'; '.join(_sized_window(window) for window in ordered)}."
-
-
-def _sized_window(window: GapWindow) -> str:
-    """Return in words in which trial and when a gap is, and how large."""
-    size = f"{window.size:.2g}"
-    if "e+0" in size:
-        size = f"{float(size):,.0f}"
-    return f"in {window.trial!r} {window_text(window)}, {size} times the noise"
-
-
-def with_date(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
-    """Return the sentence of a verdict, and when its gap is there if that says something.
-
-    Parameters
-    ----------
-    verdict : Verdict
-        The verdict.
-    windows : sequence of GapWindow
-        The windows of gaps.
-    """
-    when = acting_sentence(verdict.effects)
-    is_informative = begins_inside(windows) or verdict.kind is VerdictKind.UNEXPLAINED
-    if not when and verdict.kind not in NO_GAP and is_informative:
-        when = when_sentence(windows)
-    return f"{verdict.sentence} {when}".strip()
-
-
-def begins_inside(windows: Sequence[GapWindow]) -> bool:
-    """Return whether a gap of the model without effect begins inside a record.
-
-    Something happened there.
-    """
-    return any(window.begin is not None for window in windows if not window.with_effect)
-
-
-def acting_sentence(effects: Sequence[NamedEffect]) -> str:
-    """Return a sentence for each effect that acts in windows of time only.
-
-    Empty if all always act.
-    """
-    sentences = []
-    for effect in effects:
-        windows = effect.patch.primitives[0].windows if len(effect.patch) else ()
-        if not windows:
-            continue
-        texts = []
-        for trial, begin, end in windows:
-            since = "from the first sample" if begin is None else f"from {begin:.6g} s"
-            until = "on" if end is None else f"until {end:.6g} s"
-            texts.append(f"{since} {until} in {trial!r}")
-        mentioned = "; ".join(texts[:MOST_MENTIONED])
-        if len(texts) > MOST_MENTIONED:
-            mentioned += f"; and in {len(texts) - MOST_MENTIONED} more"
-        sentences.append(f"{effect.name} acts {mentioned}.")
-    return " ".join(sentences)
-
-
-# ---------------------------------------------------------------- what was not compared
-
-
-def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect]) -> Verdict:
-    """Return the verdict with a sentence on the effects that could not be tested.
-
-    Only a verdict on a group or on several effects gets one.
-
-    A cause that needs another trial or a port is no member of a group, however similar its action
-    is. Those that are easily taken for a member are mentioned first.
-
-    Parameters
-    ----------
-    verdict : Verdict
-        The verdict.
-    setting : Setting
-        The campaign and model.
-    effects : sequence of Effect
-        The catalogue.
-    """
-    is_name = verdict.kind in (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
-    names_several = is_name and len(verdict.effects) > 1
-    if verdict.kind is not VerdictKind.GROUP and not names_several:
-        return verdict
-    untested = [effect for effect in effects if effect.unavailable(setting) is not None]
-    if not untested:
-        return verdict
-    by_identifier = {effect.identifier: effect for effect in effects}
-    members = []
-    for named_effect in verdict.effects:
-        if named_effect.identifier in by_identifier:
-            members.append(by_identifier[named_effect.identifier])
-    untested.sort(key=lambda effect: not any(are_related(effect, member) for member in members))
-    names = [effect.name for effect in untested[:MOST_MENTIONED]]
-    remaining = len(untested) - MOST_MENTIONED
-    if remaining > 0:
-        names.append(f"{remaining} more")
-    untested_sentence = f"These trials cannot test all effects that may act so: {listing(names)}."
-    return replace(verdict, sentence=f"{verdict.sentence} {untested_sentence}")
-
-
-def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:
-    """Return a remark on what else a named effect could be, by the likenesses in the catalogue.
-
-    Parameters
-    ----------
-    verdict : Verdict
-        The verdict with its effects.
-    compared : iterable of Effect
-        The effects that could act and were compared with the named ones.
-
-    Returns
-    -------
-    str or None
-        One sentence or two; None where nothing is named.
-    """
-    if verdict.kind is not VerdictKind.NAMED:
-        return None
-    named = {effect.identifier: effect.name for effect in verdict.effects}
-    compared_by_identifier = {effect.identifier: effect for effect in compared}
-    likenesses = _likenesses(set(named), compared_by_identifier)
-    tried = sorted(likenesses & compared_by_identifier.keys())
-    untried = sorted(likenesses - compared_by_identifier.keys())
-    does = "does" if len(named) == 1 else "do together"
-    remark = (
-        "A cause that the catalogue lacks and that acts on these trials as "
-        f"{' and '.join(named.values())} {does}, within the noise, would be given the same name."
-    )
-    not_compared = f"{', '.join(untried)} {_was(untried)} not compared."
-    if tried:
-        remark += (
-            f" Of what is known to look alike, {', '.join(tried)} {_was(tried)} compared, "
-            "with less evidence"
-        )
-        return f"{remark}; {not_compared}" if untried else f"{remark}."
-    if untried:
-        return f"{remark} Of what is known to look alike, {not_compared}"
-    return remark
-
-
-def _likenesses(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
-    """Return the identifiers of effects that look like a named one, as either of both declares."""
-    likenesses = set()
-    for identifier, effect in compared.items():
-        if not named.isdisjoint(effect.confusable):
-            likenesses.add(identifier)
-    for identifier in named & compared.keys():
-        likenesses.update(compared[identifier].confusable)
-    return likenesses - named
-
-
-def _was(names: Sequence[str]) -> str:
-    """Return the verb of one or several names."""
-    return "was" if len(names) == 1 else "were"

@@ -7,35 +7,25 @@ noise that they leave.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.special import logsumexp
 
 from discrepancy.fits.fitting import CandidateFit
-from discrepancy.fits.gates import check_absolute_fit
-from discrepancy.fits.problem import Problem
 from discrepancy.search.strategy import Search
 from discrepancy.search.wide_noise import compare_under_wide_noise
 from discrepancy.search_settings import SEARCH
-from discrepancy.verdict import Gate, NamedEffect, RemainderEstimate, Verdict, VerdictKind
+from discrepancy.verdict import Gate, NamedEffect, Verdict, VerdictKind
 from reporting.words import capital, listing
 
 from .closed_share import share_text, trials_text
-from .comparison import (
-    Comparison,
-    ForceComparison,
-    H,
-    SimulationComparison,
-    effects_at_places,
-    families_at_places,
-)
+from .coloured_noise import remainder_estimates, verdict_under_coloured_noise
+from .comparison import Comparison, H, effects_at_places
 from .conclusion import (
     UNSTATED_GAIN,
     Conclusion,
     VerdictOutcome,
     WeightedHypothesis,
-    below_limit_sentence,
     effects_text,
     has_one_driven_channel,
     is_small,
@@ -43,8 +33,9 @@ from .conclusion import (
     plain_names,
     probability_text,
 )
-from .consistency_gate import check_consistency
-from .proof import check_held_out
+from .force_comparison import ForceComparison
+from .part_sentences import shape_sentence, unproved_addition_sentence
+from .simulation_comparison import SimulationComparison
 
 LEAST_MENTIONED = 0.1
 """Share of the gap from which on a hypothesis is mentioned as the best one where none is named."""
@@ -70,7 +61,7 @@ def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
         return _verdict_by_comparison(ForceComparison(search, search.force_search), first)
     compare_under_wide_noise(search)
     comparison = SimulationComparison(search)
-    outcome = _outcome_under_coloured_noise(comparison)
+    outcome = verdict_under_coloured_noise(comparison)
     if outcome is not None:
         return outcome
     comparison.add_families()
@@ -172,79 +163,6 @@ def _key_of_notable_terms(
     return notable
 
 
-# ---------------------------------------------------------------- noise that is coloured
-
-
-def _outcome_under_coloured_noise(comparison: SimulationComparison) -> VerdictOutcome | None:
-    """Return the verdict where a fit leaves noise of the colour of its records, and nothing else.
-
-    None where no hypothesis does.
-    """
-    problem = comparison.problem
-    search = comparison.search
-    best = search.best()
-    no_effect = search.compared_no_effect
-    probabilities = search.set_probabilities()
-    conclusion = Conclusion.from_probabilities(search, best, probabilities)
-    no_effect_gate = check_absolute_fit(problem, no_effect)
-    probability_of_none = probabilities.get((), 0.0)
-    is_possible = probability_of_none > 1.0 - SEARCH.sure
-    if is_possible and no_effect_gate.passed is not False and _leaves_recorded_colour(no_effect):
-        return _nothing_under_coloured_noise(
-            conclusion, no_effect, no_effect_gate, probability_of_none
-        )
-    if not best.candidate.terms or best.candidate.is_family or not _leaves_recorded_colour(best):
-        return None
-    probability = comparison.probability(best)
-    held_out_residuals = comparison.residuals(replace(best, residual_process=None))
-    gates = (
-        check_absolute_fit(problem, best),
-        check_consistency(problem, best),
-        check_held_out(held_out_residuals),
-    )
-    if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
-        return None
-    return conclusion.named(best, probability, gates, remainder_estimates(problem, best))
-
-
-def _nothing_under_coloured_noise(
-    conclusion: Conclusion, no_effect: CandidateFit, gate: Gate, probability_of_none: float
-) -> VerdictOutcome:
-    """Return the verdict that nothing is missing under coloured noise, or too little to tell."""
-    remainders = remainder_estimates(conclusion.search.problem, no_effect)
-    if probability_of_none >= SEARCH.unsure:
-        return conclusion.outcome(
-            VerdictKind.NOTHING_MISSING,
-            "The model explains the data within their noise, which is coloured as its records "
-            "admit.",
-            probability_of_none,
-            no_effect,
-            gates=(gate,),
-            remainders=remainders,
-        )
-    hints = []
-    for name, probability in conclusion.inclusion.items():
-        if probability > 1.0 - SEARCH.sure:
-            hints.append(name)
-    hints.sort()
-    total = min(probability_of_none + sum(conclusion.inclusion[name] for name in hints), 1.0)
-    return conclusion.outcome(
-        VerdictKind.BELOW_LIMIT,
-        below_limit_sentence(hints, " that is coloured"),
-        total,
-        no_effect,
-        group=tuple(hints),
-        gates=(gate,),
-        remainders=remainders,
-    )
-
-
-def _leaves_recorded_colour(fit: CandidateFit) -> bool:
-    """Return whether a fit leaves noise of the colour of its records, and nothing else."""
-    process = fit.residual_process
-    return process is not None and process.is_all_recorded_colour
-
-
 # ---------------------------------------------------------------- verdicts of a comparison
 
 
@@ -307,8 +225,8 @@ def _named_in_part(comparison: Comparison[H], best: H, probability: float) -> Ve
     if comparison.has_held_out and not share.held_out:
         sentence += " In the trials held out it has hardly any force."
     sentence += f" It leaves {comparison.remaining_text(best, share)}, which is unexplained."
-    sentence += _shape_sentence(comparison, best)
-    sentence += _unproved_addition_sentence(comparison, best)
+    sentence += shape_sentence(comparison, best)
+    sentence += unproved_addition_sentence(comparison, best)
     return _outcome(
         comparison,
         VerdictKind.NAMED_IN_PART,
@@ -491,76 +409,3 @@ def _outcome(
         resembles=resembles,
         remainders=remainder_estimates(comparison.problem, fit),
     )
-
-
-# ---------------------------------------------------------------- what is added to a name in part
-
-
-def _shape_sentence(comparison: Comparison[H], best: H) -> str:
-    """Return the sentence on the free shape of a single law.
-
-    Empty if held-out trials speak against it.
-    """
-    if len(best.candidate.terms) != 1:
-        return ""
-    (term,) = best.candidate.terms
-    free = comparison.with_free_shape(best)
-    if free is None:
-        return ""
-    least_share = comparison.decisive_share(best).value - SEARCH.slim
-    if comparison.decisive_share(free).value < least_share:
-        return ""
-    first_shape = len(free.shared) + len(term.effect.parameters)
-    deviations = np.sqrt(np.diag(free.covariance))[first_shape:]
-    (effect,) = named_effects(comparison.problem, free)
-    texts = []
-    for parameter, deviation in zip(effect.shape, deviations, strict=True):
-        if deviation < SEARCH.told_by_data:
-            description = parameter.description.split(" (")[0]
-            interval = f"{parameter.low:.2g} to {parameter.high:.2g}"
-            texts.append(f"{description} {parameter.value:.2g} ({interval})")
-    return f" With a shape of its own: {', '.join(texts)}." if texts else ""
-
-
-def _unproved_addition_sentence(comparison: Comparison[H], best: H) -> str:
-    """Return the sentence on a further law that gains too little evidence for a name.
-
-    Empty if there is none.
-    """
-    families = families_at_places(best)
-    least_score = comparison.score(best) - SEARCH.contenders
-    addition = None
-    for other in comparison.ranked:
-        has_more_laws = families_at_places(other) > families
-        only_laws = all(comparison.acts_on_structure(term) for term in other.candidate.terms)
-        if has_more_laws and only_laws and comparison.score(other) > least_score:
-            addition = other
-            break
-    if addition is None:
-        return ""
-    least_share = comparison.decisive_share(best).value + SEARCH.sliver
-    if comparison.decisive_share(addition).value < least_share:
-        return ""
-    added = []
-    for effect in named_effects(comparison.problem, addition):
-        if (effect.family, effect.place) not in families:
-            added.append(effect)
-    return (
-        f" {capital(effects_text(added))} may be there beside it, but is not proved: it gains less "
-        "evidence than it costs."
-    )
-
-
-def remainder_estimates(problem: Problem, fit: CandidateFit) -> tuple[RemainderEstimate, ...]:
-    """Return what a fit leaves beside the noise, for each channel with such a residual process."""
-    process = fit.residual_process
-    if process is None:
-        return ()
-    estimates = []
-    for channel, name in enumerate(problem.channel_names):
-        amplitude = float(process.amplitude[channel])
-        if amplitude > 0.0:
-            correlation_time = float(process.correlation_time[channel])
-            frequency = float(process.frequency[channel])
-            estimates.append(RemainderEstimate(name, amplitude, correlation_time, frequency))
-    return tuple(estimates)

@@ -15,7 +15,8 @@ from scipy.special import logsumexp
 from discrepancy.campaign.records import FloatArray, Trial, TrialKind
 from discrepancy.errors import SENTENCES, DiscrepancyError
 from discrepancy.fits.candidate import Point
-from discrepancy.fits.fitting import CandidateFit, check_finite
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.normal_equations import check_finite
 from discrepancy.fits.problem import Problem
 from discrepancy.system.interface import NO_PATCH
 from discrepancy.verdict import Experiment

@@ -17,8 +17,9 @@ from discrepancy.verdict import UnfittedRecord, Verdict, VerdictKind
 from reporting.words import listing
 
 from .closed_share import NOMINAL_UNIT, closed_text, rms_by_channel
-from .conclusion import NO_GAP, VerdictOutcome, effects_text
+from .conclusion import VerdictOutcome, effects_text
 from .proof import closed_share_or_reason
+from .remarks import NO_GAP
 
 VETO_NOISES = 5.0
 """rms over the noise from which on a channel of a held-out trial vetoes that nothing is missing."""

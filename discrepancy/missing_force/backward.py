@@ -87,7 +87,8 @@ def backward(
     Returns
     -------
     J, h, c, half : (B, n, n), (B, n, W), (B, W, W), (B,) ndarray
-        All zero from N on.
+        The information, its vector, the products of columns, and half a log determinant; all
+        zero from sample N on.
     """
     count = len(step_of_sample)
     n = rows.shape[1]

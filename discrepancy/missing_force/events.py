@@ -65,7 +65,7 @@ class EventSearch(EventTrials):
     process : Process
         A force that acts throughout: the scale of both forces' priors.
     every : int
-        Of so many readings one is looked at.
+        The step between readings that are looked at; 1 for all.
     """
 
     def __init__(self, view: View, port: int, process: Process, *, every: int = 1) -> None:
@@ -126,11 +126,11 @@ class Events:
     Attributes
     ----------
     search : EventSearch
-        What they were looked for in.
+        The search that found them.
     forces : (Process, Process)
         That of events, and what may be missing throughout.
     paths : sequence of (N,) ndarray of bool
-        By trial.
+        Whether the force acts from each sample on, for each trial.
     score : float
         ln evidence less the prices of all changes, priors of the forces included [nat].
     """

@@ -63,7 +63,7 @@ class ForceStateSpace(NamedTuple):
     generator, intensity : (n, n) ndarray
         Rates of the state, and the spectral density of the white noise that drives it.
     output_rows : (C, n) ndarray
-        What the readings show of the state, over the white part of their noise.
+        The rows by which readings show the state, over the white part of their noise.
     start_covariance : (n, n) ndarray
         Covariance of the state at the first sample.
     """
@@ -238,7 +238,7 @@ class ForceFilter:
         means, covariances : (N, n, 1), (N, n, n) ndarray
             State after the readings of each sample.
         additions : (N, n) ndarray
-            What readings from a sample on add there, as of `later`.
+            The smoothing additions of each sample, see `later`.
         """
         parts = self.trial.parts
         lengths, step_of_sample = self.trial.steps
@@ -300,7 +300,7 @@ class Regression:
     products : (1 + K, 1 + K) ndarray
         Unknowns of single trials are gone from it.
     log_determinant : float
-        What the covariance of the readings and those unknowns take from the evidence [nat].
+        Half the log determinant of the covariance of the readings and those unknowns [nat].
     """
 
     products: FloatArray

@@ -233,7 +233,7 @@ def driven(
     transitions : (J, n, n) ndarray
         Transitions of the different fine steps.
     push_at_begin, push_at_end : (J, n, d) ndarray
-        What the pushes at both ends of a fine step do to the state.
+        The change of the state by a unit push at the begin and the end of a fine step.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
     start : (n,) ndarray

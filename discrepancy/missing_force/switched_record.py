@@ -56,7 +56,7 @@ class EventTrials:
     port : int
         Number of the port.
     every : int
-        Of so many readings one is looked at.
+        The step between readings that are looked at; 1 for all.
 
     Attributes
     ----------
@@ -91,13 +91,13 @@ class SwitchedRecord:
     Parameters
     ----------
     trials : EventTrials
-        All trials.
+        The trials in which events are looked for.
     number : int
         Number of this one.
     forces : (Process, Process)
         That of events, and what may be missing throughout.
     others : sequence of Products
-        What the other trials tell of the shared unknowns.
+        The products of the other trials, which inform on the shared unknowns.
     parts : int
         How many times smaller its steps are than those of the record.
     """

@@ -48,11 +48,11 @@ class TrialColumn:
     Attributes
     ----------
     readings : (N, C) ndarray
-        Over the noise's deviations.
+        The change of the readings, over the noise deviations.
     added : (F, n) ndarray or None
-        State that it adds.
+        The state that it adds.
     forces : mapping of int to (F,) ndarray
-        Its force at ports, by their numbers.
+        The force at each port, by the number of the port.
     """
 
     readings: FloatArray
@@ -80,7 +80,7 @@ class SeenTrial:
     Attributes
     ----------
     name : str
-        Of the trial.
+        The name of the trial.
     time : (N,) ndarray
         Stamps [s].
     residual : (N, C) ndarray
@@ -88,18 +88,18 @@ class SeenTrial:
     used : (N, C) ndarray of bool
         Readings that count.
     deviation : (C,) ndarray
-        Of the noise.
+        The noise deviation of each channel [unit of the channel].
     coloured : sequence of (int, float, float)
         Channels whose noise has a part that decays in time: its share of the variance, and its rate
         [1/s].
     shared, local : (K, N, C), (L, N, C) ndarray
-        What a unit of each scaled unknown does to readings.
+        The derivatives of the readings by the scaled shared unknowns, and by the trial's own.
     local_precision : (L,) ndarray
         Prior precision of the latter.
     system : PortedSystem
-        At the point, with its gains.
+        The linear system with ports at the point, with the gains of the channels.
     slopes : sequence of PortedSystem or None
-        Its derivative by each shared unknown.
+        The derivatives of the system by each shared unknown; None where it is zero.
     parts : int
         Fine steps of an interval.
     positions, speeds : (F, P) ndarray
@@ -111,7 +111,7 @@ class SeenTrial:
     gains : sequence of (int, int, float)
         Shared unknowns that are gains: number, channel, and what a unit is over one and the gain.
     by_unknowns : mapping of int to (2, F, P) ndarray
-        What a unit of unknowns, by their numbers in `about`, does to positions and speeds of ports.
+        The derivatives of positions and speeds of ports, by the number of the unknown in `about`.
     """
 
     name: str
@@ -296,7 +296,7 @@ def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, flo
 def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
     """Return a dynamic trial of a problem, linear about a point.
 
-    Its model must tell how ports move.
+    Its model must say how ports move.
     """
     data = problem.trials[number]
     trial = data.trial
@@ -446,10 +446,5 @@ def _slope_of_system(above: PortedSystem, below: PortedSystem) -> PortedSystem |
         outputs=slope(above.outputs, below.outputs),
         through=slope(above.through, below.through),
     )
-    changes = (
-        derivative.generator,
-        derivative.actions,
-        derivative.outputs,
-        derivative.through,
-    )
-    return derivative if any(np.any(change) for change in changes) else None
+    arrays = (derivative.generator, derivative.actions, derivative.outputs, derivative.through)
+    return derivative if any(np.any(array) for array in arrays) else None

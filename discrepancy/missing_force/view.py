@@ -35,11 +35,11 @@ class TrialMotion:
     forces : mapping of int to (F,) ndarray
         The missing force of each port, laws of the hypothesis included.
     left : mapping of int to (F,) ndarray
-        What no law of the hypothesis is of it.
+        The part of it that no law of the hypothesis explains.
     explained : (F, n) ndarray
         State that parameters and laws add: without what is left.
     positions, speeds : (F, P) ndarray
-        Of the ports.
+        The motion of the ports [m or rad, and per s].
     deviations : mapping of int to ((N,) ndarray, float)
         How well missing forces are known at the samples, and the speeds of their ports.
     """
@@ -80,19 +80,19 @@ class View:
     Attributes
     ----------
     trials : sequence of SeenTrial
-        All that are looked at.
+        The trials in motion.
     shared_precision : (K,) ndarray
         Prior precision of the shared unknowns.
     motions : sequence of TrialMotion
-        By trial, along which laws and parameters act; empty: that of the model.
+        The motion of each trial along which laws and parameters act; empty for that of the model.
     effects : sequence of EffectColumn
-        What acts in proportion to one more unknown each.
+        The columns of effects that act in proportion to one more unknown each.
     precision : sequence of float
         Prior precision of these unknowns.
     known : EffectColumn or None
-        What the hypothesis has beside them.
+        The column of what the hypothesis has beside them, without an unknown.
     own : EffectColumn or None
-        What the model has beside its linear system.
+        The column of the model's own laws beside its linear system.
     """
 
     trials: Sequence[SeenTrial]
@@ -181,7 +181,7 @@ class View:
         begin : mapping of int to Process
             Processes to begin with; the search begins at the best of a grid around them.
         near : bool
-            Begin at `begin` itself instead.
+            Whether the search begins at `begin` itself.
         most_steps : int
             Steps of Newton's method, at most.
         """

@@ -23,7 +23,7 @@ from .events import GROUND, MOST_EVENTS, Events, events, throughout
 from .explained import ForceHypothesis, with_most_probable_forces
 from .filtered import Process
 from .naming import ForceSearch
-from .shares import evidence_without_force
+from .port_force import evidence_without_force
 from .switched_record import changes
 from .trial import SeenTrial
 from .view import View
@@ -145,6 +145,8 @@ def sized_windows(
 ) -> tuple[GapWindow, ...]:
     """Return windows with the sizes and channels that the residuals show in them.
 
+    A window in which no reading counts is left out: nothing shows a gap there.
+
     Parameters
     ----------
     windows : sequence of GapWindow
@@ -158,7 +160,10 @@ def sized_windows(
     for window in windows:
         residuals = after if window.with_effect else before
         (fitted,) = (fitted for fitted in residuals.trials if fitted.trial.name == window.trial)
-        sizes = _rms_in_window(window, fitted, noise[window.trial])
+        inside = _used_in_window(window, fitted)
+        if not inside.any():
+            continue
+        sizes = _rms_inside(inside, fitted, noise[window.trial])
         largest = float(sizes.max())
         shows = (sizes > 0.0) & (sizes >= SHOWS * largest)
         channels = _selected(fitted.trial.channels, shows)
@@ -166,12 +171,16 @@ def sized_windows(
     return tuple(sized)
 
 
-def _rms_in_window(window: GapWindow, fitted: FittedTrial, noise: FloatArray) -> FloatArray:
-    """Return the rms residual (C,) of each channel within a window, over its noise (C,)."""
+def _used_in_window(window: GapWindow, fitted: FittedTrial) -> BoolArray:
+    """Return which readings (N, C) of a trial count and lie within a window."""
     begin = window.first if window.begin is None else window.begin.value
     end = window.last if window.end is None else window.end.value
     time = fitted.trial.time
-    inside = fitted.used & ((time >= begin) & (time <= end))[:, None]
+    return np.asarray(fitted.used & ((time >= begin) & (time <= end))[:, None])
+
+
+def _rms_inside(inside: BoolArray, fitted: FittedTrial, noise: FloatArray) -> FloatArray:
+    """Return the rms residual (C,) of each channel over its noise (C,), of some readings (N, C)."""
     squares = np.where(inside, (fitted.residual / noise) ** 2, 0.0).sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(inside.sum(axis=0), 1)))
 

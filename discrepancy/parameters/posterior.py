@@ -20,7 +20,8 @@ from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, cholesky_factor, fit, normal_equations, solve_factored
+from discrepancy.fits.fitting import CandidateFit, fit
+from discrepancy.fits.normal_equations import cholesky_factor, normal_equations, solve_factored
 from discrepancy.fits.problem import Problem
 
 NOTHING = Candidate()

@@ -17,7 +17,7 @@ from discrepancy.document import Origin
 from discrepancy.files.verdict import PrimitiveInterval
 from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.shares import MissingForce
+from discrepancy.missing_force.port_force import MissingForce
 from discrepancy.proof_record import Scores
 from discrepancy.self_calibration import SelfCalibration
 from discrepancy.workflow import Investigation

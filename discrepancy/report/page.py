@@ -8,13 +8,8 @@ from math import isfinite, nan
 from typing import Any
 
 from discrepancy.campaign.units import UNITS
-from discrepancy.judgement.conclusion import (
-    NO_GAP,
-    calibrated_parameters,
-    effects_text,
-    named_effects,
-    when_sentence,
-)
+from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
+from discrepancy.judgement.remarks import NO_GAP, when_sentence
 from discrepancy.report import text as words
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import WORDS, group_lines, neighbours, seen_of

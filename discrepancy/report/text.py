@@ -258,10 +258,13 @@ def size_sentence(
     """Return the sizes of the effects of a patch in one sentence; empty where none has a unit."""
     model, campaign = investigation.model, investigation.campaign
     sizes = [si_sizes(e.patch, row, model, campaign) for e, row in zip(effects, intervals, strict=True)]
-    named = investigation.verdict.kind in NAMING
+    named = investigation.verdict.kind in (*NAMING, VerdictKind.FAMILY)
     alone = named and len(effects) == 1
-    pairs = [(effect, size) for effect, size in zip(effects, sizes, strict=True) if size]
-    parts = [size if alone else f"{effect.name}, {size}" for effect, size in pairs]
+    parts = []
+    for effect, size in zip(effects, sizes, strict=True):
+        name = f"a law of the family {effect.family}" if effect.shape else effect.name
+        if size:
+            parts.append(size if alone else f"{name}, {size}")
     if not parts:
         return ""
     words = "In SI units" if named else "In SI units, were it the most probable member, which is not named"

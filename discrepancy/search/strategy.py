@@ -3,24 +3,23 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from math import exp
 
 import numpy as np
-from scipy.special import logsumexp
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
 from discrepancy.estimation.refinement import refined
-from discrepancy.fits.candidate import Candidate, CandidateKey
+from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit, time_step_error
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.hypotheses import log_prior, sees_forces
+from discrepancy.missing_force.hypotheses import sees_forces
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
+from .fitted_candidates import FittedCandidates
 from .other_optima import canonical_relatives, points_at_other_sizes, sets_at_other_places
 from .starts import (
     FitStart,
@@ -36,26 +35,11 @@ from .starts import (
 
 
 @dataclass
-class Search:
-    """A search for the effects that explain a campaign.
-
-    All candidates fitted so far, and what fits more.
+class Search(FittedCandidates):
+    """A search for the effects that explain a campaign: screen, fit, add, drop.
 
     Attributes
     ----------
-    problem : Problem
-        The campaign and model.
-    effects : tuple of Effect
-        The effects that can act here.
-    no_effect : CandidateFit
-        The fit of the model without effect.
-    exact_fits : dict of CandidateKey to CandidateFit
-        The candidates that were fitted to convergence.
-    rough_fits : dict of CandidateKey to CandidateFit
-        The candidates that were fitted by few steps only; their evidence is approximate.
-    wide_fits : dict of CandidateKey to CandidateFit
-        The candidates that were fitted under a wider noise; where there are any, they alone are
-        compared.
     screened_gains : dict of str to float
         The largest gain of each effect that a screen at the fit without effect found [nat].
     on_progress : callable
@@ -67,83 +51,10 @@ class Search:
         The sets of effects that were fitted to the missing force, the most probable first.
     """
 
-    problem: Problem
-    effects: tuple[Effect, ...]
-    no_effect: CandidateFit
-    exact_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
-    rough_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
-    wide_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
     screened_gains: dict[str, float] = field(default_factory=dict)
     on_progress: OnProgress = no_progress
     wide_problem: Problem | None = None
     force_hypotheses: list[ForceHypothesis] = field(init=False, default_factory=list)
-
-    def __post_init__(self) -> None:
-        self.exact_fits[()] = self.no_effect
-
-    # ---------------------------------------------------------------- candidates that were fitted
-
-    def log_prior(self, candidate: Candidate) -> float:
-        """Return the log prior probability of a candidate at its places."""
-        return log_prior(candidate, len(self.effects), self.problem.setting)
-
-    def score(self, fit: CandidateFit | ForceHypothesis) -> float:
-        """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""
-        return fit.log_evidence + self.log_prior(fit.candidate)
-
-    def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
-        """Return the fit of every candidate that is compared, the exact one where there is one."""
-        return self.wide_fits or {**self.rough_fits, **self.exact_fits}
-
-    def best(self) -> CandidateFit:
-        """Return the most probable candidate."""
-        return max((self.wide_fits or self.exact_fits).values(), key=self.score)
-
-    def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
-        """Return the most probable fit of a set of effects, over their places."""
-        fits = self.compared_fits().values()
-        return max(
-            (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
-        )
-
-    def fitted_effects(self) -> frozenset[str]:
-        """Return the identifiers of all effects that were fitted, alone or with others."""
-        identifiers: set[str] = set()
-        for fits in (self.rough_fits, self.exact_fits, self.wide_fits):
-            for fit in fits.values():
-                identifiers.update(term.effect.identifier for term in fit.candidate.terms)
-        return frozenset(identifiers)
-
-    @property
-    def compared_no_effect(self) -> CandidateFit:
-        """The fit without effect under the noise by which candidates are compared."""
-        return self.wide_fits.get((), self.no_effect)
-
-    def set_probabilities(self) -> dict[tuple[str, ...], float]:
-        """Return the probability of each set of effects at any places, the most probable first."""
-        scores: dict[tuple[str, ...], list[float]] = {}
-        for fit in self.compared_fits().values():
-            scores.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
-        sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
-        total = float(logsumexp(list(sums.values())))
-        ordered = sorted(sums.items(), key=lambda entry: -entry[1])
-        return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
-
-    def record(self, fit: CandidateFit, *, exact: bool) -> None:
-        """Record a fit if its evidence is above that of an earlier fit of the same candidate."""
-        fits = self.exact_fits if exact else self.rough_fits
-        key = fit.candidate.key
-        if key not in fits or fits[key].log_evidence < fit.log_evidence:
-            fits[key] = fit
-
-    def is_unexplained(self) -> bool:
-        """Return whether the best candidate cannot be shown to leave noise alone."""
-        return not check_absolute_fit(self.problem, self.best()).passed
-
-    @property
-    def is_all_in_motion(self) -> bool:
-        """Whether all trials are in motion."""
-        return all(data.trial.is_dynamic for data in self.problem.trials)
 
     @cached_property
     def force_search(self) -> ForceSearch | None:
@@ -292,21 +203,6 @@ class Search:
         return best_fits
 
     # ---------------------------------------------------------------- exact fits
-
-    def fit_exactly(self, rough: CandidateFit) -> CandidateFit:
-        """Return a candidate fitted to convergence, from a rough fit, and record it.
-
-        An exact fit that is known already is repeated only if the rough one is clearly better.
-        """
-        key = rough.candidate.key
-        if key in self.wide_fits:
-            return self.wide_fits[key]
-        known = self.exact_fits.get(key)
-        if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
-            exact = attempt(self.problem, rough.candidate, rough.point)
-            # few steps may have led to where the structure cannot follow
-            self.record(rough if exact is None else exact, exact=True)
-        return self.exact_fits[key]
 
     def fit_best_exactly(self, rough: Sequence[CandidateFit], floor: float) -> list[CandidateFit]:
         """Fit the best of some rough fits to convergence; return these, the best first.

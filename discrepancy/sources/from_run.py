@@ -1,4 +1,4 @@
-"""The run folder of a mission as a campaign: every turn is a row of a flight, its health uncertain.
+"""The run folder of a mission as a campaign: every step is a row of a flight, its health uncertain.
 
 `docs/run_folder.md` describes the folder; it is read by its files alone.
 """
@@ -37,16 +37,16 @@ TEMPERATURE = ("temperature_difference", "temperature")
 """Names under which a run may record the temperature: less the reference [K], or itself [degC]."""
 REFERENCE_TEMPERATURE = 20.0
 HEALTH_DEVIATION = 0.25
-"""Least prior deviation of a stiffness loss in a turn, about its smoothed belief. The belief was led astray
-by what is looked for, and is much surer than it is right; 24 gauges tell the health of a turn anyway."""
+"""Least prior deviation of a stiffness loss in a step, about its smoothed belief. The belief was led astray
+by what is looked for, and is much surer than it is right; 24 gauges tell the health of a step anyway."""
 BLOCK, HELD_OUT_SHARE = 4, 0.2
-"""Turns of a block that is held out; share of the turns that is, in whole blocks spread over the flight."""
+"""Steps of a block that is held out; share of the steps that is, in whole blocks spread over the flight."""
 
 
 def run_campaign(
     folder: Path | str,
-    first_turn: int | None = None,
-    last_turn: int | None = None,
+    first_step: int | None = None,
+    last_step: int | None = None,
     held_out_share: float = HELD_OUT_SHARE,
 ) -> records.Campaign:
     """Return the flight of a run folder as a campaign.
@@ -55,16 +55,16 @@ def run_campaign(
     ----------
     folder : path
         As `uav-twin run --out` leaves it.
-    first_turn, last_turn : int, optional
-        Turns that are read; by default from the first of the flight to its last.
+    first_step, last_step : int, optional
+        Steps that are read; by default from the first of the flight to its last.
     held_out_share : float
-        Share of the turns that is held out.
+        Share of the steps that is held out.
 
     Returns
     -------
     Campaign
-        Strain channels g1, g2, ...; flight trials whose rows are turns, some of them held out. The time of a
-        turn is that at its end, as the FMU has it. Health is uncertain in every turn. Of the
+        Strain channels g1, g2, ...; flight trials whose rows are steps, some of them held out. The time of a
+        step is that at its end, as the FMU has it. Health is uncertain in every step. Of the
         truth, only a temperature that the asset monitors and the scenario's noise of the gauges are read.
 
     Raises
@@ -77,7 +77,7 @@ def run_campaign(
     folder = Path(folder)
     restore_folder(folder)
     try:
-        return _campaign(folder, (first_turn, last_turn), held_out_share, _config(folder)["scenario"])
+        return _campaign(folder, (first_step, last_step), held_out_share, _config(folder)["scenario"])
     except DiscrepancyError:
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as cause:
@@ -86,7 +86,7 @@ def run_campaign(
 
 
 def _campaign(
-    folder: Path, turns: tuple[int | None, int | None], held_out_share: float, scenario: dict[str, Any]
+    folder: Path, steps: tuple[int | None, int | None], held_out_share: float, scenario: dict[str, Any]
 ) -> records.Campaign:
     states = {item["name"] for item in scenario["state"]}
     if scenario["observation"].get("role") != STRAIN or states != {*records.USUAL_REGIONS}:
@@ -94,16 +94,16 @@ def _campaign(
     if force := (scenario["asset"].get("load") or {}).get("tip_force", 0.0):
         raise CampaignDataError(said("runs.force", force=force, folder=folder))
     run = _run(folder)
-    # Turns before a patch that was adopted on the way were believed with another model.
+    # Steps before a patch that was adopted on the way were believed with another model.
     adopted = run.attrs.get(PATCH_STEP)
-    since = slice(max((turn for turn in (adopted, turns[0]) if turn is not None), default=None), turns[1])
+    since = slice(max((step for step in (adopted, steps[0]) if step is not None), default=None), steps[1])
     observed, smoothed = (run[name].to_dataset().sel(step=since) for name in ("observed", "smoothed"))
     if not observed.sizes["step"]:
-        ends = zip(("from {} on", "up to {}"), turns, strict=True)
-        wanted = ", ".join(text.format(turn) for text, turn in ends if turn is not None)
+        ends = zip(("from {} on", "up to {}"), steps, strict=True)
+        wanted = ", ".join(text.format(step) for text, step in ends if step is not None)
         steps = np.asarray(run["observed"]["step"].values).tolist()
         has = f"{steps[0]} to {steps[-1]}" if steps else "none"
-        raise CampaignDataError(f"{folder.name} has the turns {has}, and none {wanted}.")
+        raise CampaignDataError(f"{folder.name} has the steps {has}, and none {wanted}.")
     strain = np.asarray(observed[STRAIN].values, dtype=np.float64)
     used = np.isfinite(strain)
     if not used.any():
@@ -119,16 +119,16 @@ def _campaign(
         for name in names
     }
     whole = records.Trial.plain(
-        "turns", records.TrialKind.FLIGHT, names, _ends(folder, observed["step"].values),
+        "steps", records.TrialKind.FLIGHT, names, _ends(folder, observed["step"].values),
         values=np.where(used, strain, 0.0), used=used, temperature=temperature,
         load_factor=np.asarray(observed["load_factor"].values, dtype=np.float64),
         run=str(run.attrs.get("scenario", "run")), health=np.asarray(smoothed["mean"].values, dtype=float),
         health_deviation=np.maximum(smoothed["standard_deviation"].values, HEALTH_DEVIATION),
     )  # fmt: skip
-    held = held_out_turns(size, BLOCK, held_out_share)
+    held = held_out_steps(size, BLOCK, held_out_share)
     trials = [whole.rows(~held)]
     if held.any():
-        trials.append(whole.rows(held, name="turns held out", held_out=True))
+        trials.append(whole.rows(held, name="steps held out", held_out=True))
     lost = int(used.size - used.sum())
     be = "was" if lost == 1 else "were"
     return records.Campaign(
@@ -139,7 +139,7 @@ def _campaign(
         parameters=_calibrated(run),
         data_hash=hash_file(folder / RUN_FILE),
         remarks=(
-            f"Flight of {counted(size, 'turn')} read from a run folder; health in each turn: "
+            f"Flight of {counted(size, 'step')} read from a run folder; health in each step: "
             f"belief with a deviation of {HEALTH_DEVIATION:g} or more.",
             f"Noise of a gauge: {1e6 * noise:.4g} microstrain, {source}.",
             *([f"{lost} of {used.size} readings {be} lost."] if lost else []),
@@ -189,8 +189,8 @@ def _is_calibrated_wing(folder: Path) -> bool:
         return True
 
 
-def held_out_turns(count: int, block: int, share: float) -> NDArray[np.bool_]:
-    """Return which of `count` turns are held out (count,): whole blocks, evenly spread, never the first."""
+def held_out_steps(count: int, block: int, share: float) -> NDArray[np.bool_]:
+    """Return which of `count` steps are held out (count,): whole blocks, evenly spread, never the first."""
     blocks = count // block
     wanted = min(round(share * count / block), blocks - 1)
     chosen = np.linspace(1, blocks - 1, max(wanted, 0) + 1)[:-1].round()
@@ -223,13 +223,13 @@ def _run(folder: Path) -> xr.DataTree:
     return run
 
 
-def _ends(folder: Path, turns: records.FloatArray) -> records.FloatArray:
-    """Return when turns end [s]; each takes a second where the run has no binding of its own."""
+def _ends(folder: Path, steps: records.FloatArray) -> records.FloatArray:
+    """Return when steps end [s]; each takes a second where the run has no binding of its own."""
     path = folder / BINDING_FILE
     with CampaignFileError.instead_of(FmuError, before="The binding of the run cannot be read: "):
         bound = load_binding(path) if path.exists() else None
     start, interval = (0.0, 1.0) if bound is None else (bound.binding.start_time, bound.interval)
-    return np.asarray(start + interval * (turns + 1.0))
+    return np.asarray(start + interval * (steps + 1.0))
 
 
 def _temperature(run: xr.DataTree, since: slice, size: int) -> tuple[records.FloatArray, bool]:

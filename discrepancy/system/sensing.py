@@ -283,6 +283,8 @@ def observe_response(
         have.
     """
     trial, patch = in_own_clock(trial, patch)
+    strains = tuple(across)
+    transverse, shear = strains if strains else (None, None)
     record = SensorRecord(
         tuple((name, campaign.channels[name].quantity.value) for name in trial.channels),
         trial.kind.value,
@@ -297,7 +299,13 @@ def observe_response(
     with CatalogueError.instead_of(InvalidPatchError):
         check_channels(patch, quantities)
         values, rates = apply_sensors(
-            patch, record, response.values, response.rates, *across, high_pass=filtered_record
+            patch,
+            record,
+            response.values,
+            response.rates,
+            transverse=transverse,
+            shear=shear,
+            high_pass=filtered_record,
         )
     return Response(values, rates)
 

@@ -5,14 +5,13 @@ This file is copied into the FMU: standard library only.
 The loss of a region is the sum of three parts, kept below a ceiling:
 
 - a script: at each mark of time between `first` and `last` of an entry, the entry's gain;
-- growth with the load, as in crack growth (Paris and Erdogan 1963), dz/dt = rate (|n| /
-n_ref)^exponent;
-- chance: at each mark but the first, one level more with probability min(1, p (|n| /
-n_ref)^exponent),
-  where n is the load factor that was held before the mark.
+- growth with the load, as in crack growth (Paris and Erdogan 1963):
+  dz/dt = rate (|n| / n_ref)^exponent;
+- chance: at each mark but the first, one level more with probability
+  min(1, p (|n| / n_ref)^exponent), where n is the load factor that was held before the mark.
 
 A mark is a multiple of `period` after the start. What happens at a mark belongs to the step that
-begins at it, so that the damage that a turn does is felt from the next turn on. The numbers of a
+begins at it, so that the damage that a step does is felt from the next step on. The numbers of a
 mark follow from the seed, the region and the mark alone: they do not depend on the step size, on
 the other region or on earlier marks.
 """

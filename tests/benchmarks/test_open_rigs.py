@@ -56,7 +56,7 @@ def test_equations_and_model_files_agree(name, tmp_path):
         expected = simulate(bench.rig, truth, bench.courses[:1], bench.stamps[:1])[0]
         found = model.respond(campaign.trials[0], outputs, patch, Conditions(factors, refinement=4)).values
         assert np.sqrt(np.mean(((found - expected) / bench.noise) ** 2)) < 0.5
-    assert bench.left(truth, bench.bare) > 1.0  # the law is seen beside calibration and zeros
+    assert bench.unexplained(truth, bench.bare) > 1.0  # the law is seen beside calibration and zeros
 
 
 @pytest.mark.parametrize("number", [1, 4, 27])
@@ -68,8 +68,8 @@ def test_what_is_hidden_has_its_size(number):
         return
     assert GAPS[0] * 0.9 < facts["gap"] < GAPS[1] * 1.1
     assert SHARES[0] * 0.9 < facts["remainder"] / facts["gap"] < SHARES[1] * 1.1
-    without = bench.stacked(replace(truth, amount=0.0))
-    assert bench.left(truth, without) == pytest.approx(facts["remainder"])
+    without = bench.readings_over_noise(replace(truth, amount=0.0))
+    assert bench.unexplained(truth, without) == pytest.approx(facts["remainder"])
 
 
 @pytest.mark.long

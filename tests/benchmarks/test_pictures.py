@@ -98,9 +98,9 @@ def test_a_printed_number_agrees_where_it_is_the_value_rounded(printed, value, a
 
 
 def test_a_number_that_a_page_states_otherwise_is_told():
-    statement = Statement("README.md", "alarm at turn {alarm},")
+    statement = Statement("README.md", "alarm at step {alarm},")
     (sentence,) = statement.disagreements({"alarm": 14})
-    assert sentence == "README.md says 13 where 14 is drawn: 'alarm at turn {alarm},'."
+    assert sentence == "README.md says 13 where 14 is drawn: 'alarm at step {alarm},'."
 
 
 def test_a_sentence_that_no_page_holds_is_told():

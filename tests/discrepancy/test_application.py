@@ -109,9 +109,9 @@ def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
         for folder in (laboratory / "verdict", tmp_path / "verdicts" / "lab")
     )
     assert once == again
-    command = "uav-twin discrepancy run --from-run /flights/m1 --to-turn 3 --model own.toml --seed 0"
+    command = "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --model own.toml --seed 0"
     assert _again(command, Path("two/one.json")) == (
-        "uav-twin discrepancy run --from-run /flights/m1 --to-turn 3 --seed 0 --model two/one.json "
+        "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --seed 0 --model two/one.json "
         "--out verdicts/m1_one"
     )
 

@@ -144,7 +144,7 @@ def drawing() -> "figures.Figure":
         left = figure.add_axes((0.1, 0.1, 0.35, 0.3))
         left.plot(X, 10.0**X, color=figures.PAST)
         left.set_yscale("log")
-        left.set_xlabel("turn")
+        left.set_xlabel("step")
         right = figure.add_axes((0.55, 0.1, 0.35, 0.3))
         right.scatter([1.0, 2.0, 3.0], [0.0, 1.0, 1.0], label="choice")
         right.set_yticks([0, 1], ["2g", "3g"])
@@ -163,7 +163,7 @@ def drawing() -> "figures.Figure":
 SEEN = {
     "0": ['a Tunnel: speed < "limit"', "time (s): 2", "speed (m/s): 11.25 (9.25 to 12.25)"],
     "1": ["a Tunnel: tested", "time (s): 2.5", "speed (m/s): 12.5 (12.25 to 13)"],
-    "2": ['speed < "limit"', "turn: 2", "100"],
+    "2": ['speed < "limit"', "step: 2", "100"],
     "3": ["choice", "2", "3g"],
 }
 """What is said at the middle point of each series, in the order of drawing."""

@@ -23,7 +23,7 @@ def test_a_table_can_be_read_at_any_width(width):
     rows = [
         ("posterior mean of the Young modulus factor of the wing box", "", "1.008", "1.0073 (1)"),
         ("temperature_dependent_modulus", "", "4.1592 points", "3.8 points (2)"),
-        ("asset, per turn", "", "0.281 ms (largest 3.14 ms)", ""),
+        ("asset, per step", "", "0.281 ms (largest 3.14 ms)", ""),
     ]
     lines = printed(("figure", "unit", "this run", "reference"), rows, width)
     assert max(map(len, lines)) <= width
@@ -35,11 +35,11 @@ def test_a_table_can_be_read_at_any_width(width):
 
 
 def fly(progress: Progress) -> None:
-    with progress.stage("Flying [the wing]", total=3, unit="turns") as stage:
-        for turn in range(3):
+    with progress.stage("Flying [the wing]", total=3, unit="steps") as stage:
+        for step in range(3):
             with progress.stage("Inside"):
                 pass
-            stage.advance(detail=f"turn {turn}")
+            stage.advance(detail=f"step {step}")
         progress.note("half way [there]")
 
 
@@ -51,7 +51,7 @@ def test_stages_and_notes_are_shown_and_standard_output_stays_free(terminal, mon
     fly(RichProgress())
     told = capsys.readouterr()
     assert told.out == ""
-    assert all(words in told.err for words in ("Flying [the wing]", "turns", "half way [there]", "Inside"))
+    assert all(words in told.err for words in ("Flying [the wing]", "steps", "half way [there]", "Inside"))
 
 
 def test_an_exception_passes_and_the_terminal_is_given_back():

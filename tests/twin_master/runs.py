@@ -1,6 +1,7 @@
 """What tests of missions share: scenarios with changes, twins of a strain library, runs cut off."""
 
 import json
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,19 +11,29 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fe.runtime.arrays import arrays_from_bytes, arrays_to_bytes
 from fe.runtime.patch import ModelPatch, Primitive
 from fmu_asset.packing.patch_file import SCHEMA
+from reporting.files import hash_record
 from reporting.progress import SilentProgress
 from scenarios import scenario_files
 from twin_master.assets.asset_source import Asset, AssetSource
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.assets.resolution import asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrarySource, load_strain_library
-from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
+from twin_master.mission.journal import (
+    JOURNAL_NAME,
+    JournalFile,
+    line_of,
+    records,
+    state_of,
+    state_text,
+)
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
-from twin_master.mission.turns import History, Turn
+from twin_master.mission.steps import History, MissionStep
 from twin_master.network.estimator import Estimator
+from twin_master.run_folder import CONFIG_NAME, to_json
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from uav_twin import Estimate, load_scenario, reduced_model
@@ -100,7 +111,7 @@ def of_wing(given: str | Scenario, seed: int = 3) -> tuple[Knowledge, ReducedMod
 def flight_of(
     knowledge: Knowledge,
     source: AssetSource,
-    *sinks: Callable[[Turn], None],
+    *sinks: Callable[[MissionStep], None],
     seed: int = 3,
     asset: Asset | None = None,
 ) -> History:
@@ -112,11 +123,11 @@ def flight_of(
 def estimates_of(
     estimator: Estimator, seen: np.ndarray, controls: Sequence[int] | None = None
 ) -> list[Estimate]:
-    """Return what an estimator makes of turns, under their controls or always the first one."""
+    """Return what an estimator makes of steps, under their controls or always the first one."""
     estimates: list[Estimate] = []
-    for turn, (row, control) in enumerate(zip(seen, controls or [0] * len(seen), strict=True)):
+    for step, (row, control) in enumerate(zip(seen, controls or [0] * len(seen), strict=True)):
         before = estimates[-1].carried if estimates else None
-        estimates.append(estimator.turn(before, row, control, turn))
+        estimates.append(estimator.step(before, row, control, step))
     return estimates
 
 
@@ -137,14 +148,38 @@ def journal(folder: Path) -> list[dict[str, Any]]:
     return [record for record, *_ in records(folder / JOURNAL_NAME)]
 
 
+def with_former_names(folder: Path) -> None:
+    """Write a run folder as earlier versions did, with `turn` wherever a key says `step`."""
+    config = json.loads((folder / CONFIG_NAME).read_text(encoding="utf-8"))
+    notice = config["scenario"].get("notice") or {}
+    for name in [name for name in notice if name.endswith("_steps")]:
+        notice[name.replace("steps", "turns")] = notice.pop(name)
+    (folder / CONFIG_NAME).write_text(to_json(config), encoding="utf-8")
+    path, content = folder / JOURNAL_NAME, b""
+    for line in path.read_bytes().splitlines():
+        text = re.sub(r'"(\w+_)?step(s?)":', r'"\1turn\2":', line[65:].decode("ascii"))
+        record = json.loads(text)
+        if "config_hash" in record:
+            record["config_hash"] = hash_record(config)
+        if "settled" in record:
+            arrays = arrays_from_bytes(state_of(record["settled"]["state"]), "the state")
+            arrays = {re.sub(r"\bsteps$", "turns", name): values for name, values in arrays.items()}
+            record["settled"]["state"] = state_text(arrays_to_bytes(arrays))
+        if "standing" in record:
+            record["standing"]["begin"] = len(content)
+        content += line_of(record)
+    assert b'"step' not in content
+    path.write_bytes(content)
+
+
 @contextmanager
-def cut_off_after(turns: int) -> Iterator[None]:
-    """Let the run within die once so many turns are kept."""
+def cut_off_after(steps: int) -> Iterator[None]:
+    """Let the run within die once so many steps are kept."""
     append = JournalFile.append
 
     def dying(self: JournalFile, record: Mapping[str, Any]) -> None:
         append(self, record)
-        if record.get("turn") == turns - 1:
+        if record.get("step") == steps - 1:
             raise KeyboardInterrupt
 
     with pytest.MonkeyPatch.context() as patch:

@@ -14,7 +14,8 @@ import pytest
 
 from reporting.errors import DiskFullError
 from reporting.folders import restore_folder
-from tests.twin_master.runs import check_same, cut_off_after, noted, written
+from reporting.former_names import FormerNameWarning
+from tests.twin_master.runs import check_same, cut_off_after, noted, with_former_names, written
 from twin_master import workflow
 from twin_master.errors import MissionInputError, NotResumableError, RunFolderError
 from twin_master.run_folder import FIELD_NAME, KIND, create_run_folder, lock_run_folder, read_config
@@ -122,8 +123,8 @@ def test_a_configuration_that_cannot_be_read_is_that_of_no_run(tmp_path, text):
 def test_the_field_of_a_belief_that_rounds_beyond_the_last_level():
     """A mean of 0.8000000000000003 lies outside every model that ends at 0.8."""
     model = SimpleNamespace(states=SimpleNamespace(mean=lambda _belief: np.array([0.8000000000000003, 0.3])))
-    turn = SimpleNamespace(concluded=SimpleNamespace(filtered=None, control_index=0))
-    knowledge, flight = SimpleNamespace(model=model), SimpleNamespace(turns=[turn])
+    step = SimpleNamespace(concluded=SimpleNamespace(filtered=None, control_index=0))
+    knowledge, flight = SimpleNamespace(model=model), SimpleNamespace(steps=[step])
     scenario, seen = load_scenario("level_turns").scenario, list[dict[str, float]]()
     result = SimpleNamespace(scenario=scenario, knowledge=knowledge, flight=flight)
     source = SimpleNamespace(write_field=lambda _path, state, _control: seen.append(state))
@@ -131,11 +132,11 @@ def test_the_field_of_a_belief_that_rounds_beyond_the_last_level():
     assert seen == [{"z1": 0.8, "z2": 0.3}]
 
 
-@pytest.mark.parametrize("turns", [1, 50])
-def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, turns):
+@pytest.mark.parametrize("steps", [1, 50])
+def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, steps):
     """Though its folder was moved and the files that were given are gone."""
     library = written(tmp_path, library_file.read_text(encoding="utf-8"), name="é.json")
-    with cut_off_after(turns):
+    with cut_off_after(steps):
         fly(tmp_path / "part", library)
     assert not (tmp_path / "part" / "run.nc").exists()
     library.unlink()
@@ -156,11 +157,26 @@ def test_a_resumed_run_is_bit_identical(flown, tmp_path, library_file, turns):
     assert not (tmp_path / "never").exists()
 
 
+def test_a_run_of_an_earlier_version_is_taken_up_with_a_sentence_for_each_file(flown, tmp_path, library_file):
+    with cut_off_after(20):
+        fly(tmp_path / "run", library_file)
+    with_former_names(tmp_path / "run")
+    assert "memory_turns" in (tmp_path / "run" / "config.json").read_text(encoding="utf-8")
+    with pytest.warns(FormerNameWarning) as told:
+        resume_run(tmp_path / "run")
+    assert [str(warning.message).removeprefix(f"{tmp_path / 'run'}/") for warning in told] == [
+        "config.json: `memory_turns` is now called `memory_steps` and `onset_turns` is now called "
+        "`onset_steps`. The former names are still read.",
+        "journal.jsonl: `turn` is now called `step`. The former name is still read.",
+    ]
+    check_same(tmp_path / "run", flown.folder, "csv/health.csv", "csv/observed.csv", "csv/decisions.csv")
+
+
 def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flown, tmp_path, monkeypatch):
     whole = Path(shutil.copytree(flown.folder, tmp_path / "whole"))
     groups = {"observed", "filtered", "smoothed", "predicted", "policy", "calibration", "truth", "notice"}
     assert {*open_run(whole).children} == groups
-    assert json.loads((whole / "timing.json").read_text(encoding="utf-8"))["turns"] == 50
+    assert json.loads((whole / "timing.json").read_text(encoding="utf-8"))["steps"] == 50
 
     def report(folder: Path) -> Path:
         (folder / "report.html").write_text("report", encoding="utf-8")
@@ -244,7 +260,7 @@ def test_a_damaged_configuration_is_one_sentence(tmp_path):
             resume_run(tmp_path)
 
 
-def test_an_error_before_the_first_turn_says_how_to_begin_anew(tmp_path, library_file, monkeypatch):
+def test_an_error_before_the_first_step_says_how_to_begin_anew(tmp_path, library_file, monkeypatch):
     def broken(*_: object) -> None:
         raise MissionInputError("the parameter cannot be drawn.")
 

@@ -29,7 +29,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import text_of, written
 from tests.uav_twin.test_discrepancy import TWO
 from twin_master.errors import MissionInputError, ScenarioError
-from twin_master.mission.turns import Truth
+from twin_master.mission.steps import Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.workflow import check_scenario
 from uav_twin import _HOMES, cli, load_design, load_scenario
@@ -149,7 +149,7 @@ SHAPES = {
     "inspected_wing": (25, 120, 24),
     "watched_wing": (25, 60, 24),
 }
-"""States, turns and sensors, where they are not those of the paper's mission."""
+"""States, steps and sensors, where they are not those of the paper's mission."""
 
 
 @pytest.mark.parametrize("name", sorted(scenario_files()))
@@ -160,7 +160,7 @@ def test_every_shipped_scenario_can_be_flown_or_says_what_it_needs(name, library
             check_scenario(loaded)
         given = {"strain_library": library_file}
     found, shape = check_scenario(loaded, given), SHAPES.get(name, (25, 50, 24))
-    assert (found["states"], found["turns"], found["sensors"]) == shape
+    assert (found["states"], found["steps"], found["sensors"]) == shape
     assert found["name"] == name
     # at least predictions (E, S, U, G) and transitions (U, S, S)
     drawn, controls = found["draws"] * shape[0] * shape[2], len(found["controls"])
@@ -222,7 +222,7 @@ def folder(
         "bad.ssp": "nothing", "bar.inp": INPUTS.text("bar.inp"), "bar.toml": INPUTS.text("bar.toml"),
         "library.toml": text.replace(flown, library), "pull.csv": TWO["pull.csv"].decode(),
         "filled/pull.csv": TWO["pull.csv"].decode(),
-        "run.nc": "", "misspelt.csv": "turn,strian_24\n0,1e-4\n", "lines.jsonl": "{}\n",
+        "run.nc": "", "misspelt.csv": "step,strian_24\n0,1e-4\n", "lines.jsonl": "{}\n",
         "torn.toml": "mass = [", "half.toml": "name = 'half a wing'",
         "hole.csv": "F [N];Weg [mm]\n1;0,5\n;0,75\n3;0,8\n",
         "back.csv": "t [ms];Weg [mm]\n" + "".join(f"{t};1,5\n" for t in (0, 2, 4, 6, 5, 8, 10, 12, 14)),
@@ -337,7 +337,7 @@ def test_records_show_themselves_in_a_few_words(library_file):
         (knowledge, ("level_turns", "GraphicalModel(", "GaussianSensorModel(")),
         (knowledge.model, ("states=", "controls=2 (2g, 3g)")),
         (knowledge.sensor_model, ("draws=", "sensors=")),
-        (knowledge.twin(), ("turns=0", "GraphicalModel(")),
+        (knowledge.twin(), ("steps=0", "GraphicalModel(")),
         (uav_twin.load_design(), ("regions=2 (z1, z2)", "gauges=24")),
     ]
     for record, words in shown:

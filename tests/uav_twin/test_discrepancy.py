@@ -135,9 +135,9 @@ def test_samples_at_rest_inputs_temperatures_and_remarks_of_origins_and_assumpti
     assert "(assumed: say `begins`" in " ".join(read.remarks)
     Path("lab/campaign.toml").write_text(toml.replace('"driven"', '"driven"\nbegins = "still"'), "utf-8")
     assert "(assumed: say `begins`" not in " ".join(read_campaign("lab").remarks)
-    Path("turn.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
-    said(*IMPORT, "turn.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
-    assert read_campaign("turn").trials[0].load_factor.tolist() == [1.0, 2.5]
+    Path("step.csv").write_text("time [s],n [g],x [um]\n0,1,2\n1,2.5,3\n", "utf-8")
+    said(*IMPORT, "step.csv", "--kind", "flight", "--column", "n=load_factor", "--column", "x=x")
+    assert read_campaign("step").trials[0].load_factor.tolist() == [1.0, 2.5]
 
 
 def test_the_force_of_a_ring_down_is_none_though_a_column_gives_it():

@@ -386,10 +386,10 @@ class RecordedStructure(Asset):
         variables = bound.observation["acceleration"].variables
         self._chosen = [begin + variables.index(f"acceleration.{name}") for name in names]
         self.units = {name: item.unit for name, item in (*bound.parameter.items(), *bound.control.items())}
-        self._turn = 0
+        self._step = 0
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Make and identify the record of a turn.
+        """Make and identify the record of a step.
 
         Raises
         ------
@@ -402,7 +402,7 @@ class RecordedStructure(Asset):
 
         section, record, model = self._section, self._record, self._model
         root = seed_sequence(self._scenario.mission.seed, "asset")
-        random = np.random.default_rng([*root.generate_state(4).tolist(), self._turn])
+        random = np.random.default_rng([*root.generate_state(4).tolist(), self._step])
         count = round(record.duration * record.sampling_rate)
         held: dict[str, float] = dict(control)
         course: dict[str, Float | float] = dict(control)
@@ -415,7 +415,7 @@ class RecordedStructure(Asset):
         acceleration = history.values[:, self._chosen]
         acceleration = acceleration + record.noise * random.standard_normal(acceleration.shape)
         found = identify_modes(acceleration, record.sampling_rate, section.bands, record.kind)
-        self._turn += 1
+        self._step += 1
         given = {**self._parameters, **control, **health}
         vector = model.vector({name: value for name, value in given.items() if name in model.input_names})
         alpha, beta = model.damping.tolist()
@@ -431,11 +431,11 @@ class RecordedStructure(Asset):
 
     def save_state(self) -> bytes:
         """Return the number of records made: each begins anew."""
-        return str(self._turn).encode()
+        return str(self._step).encode()
 
     def restore_state(self, state: bytes) -> None:
         """Go on behind as many records."""
-        self._turn = int(state)
+        self._step = int(state)
 
     def close(self) -> None:
         """End the worker."""

@@ -143,7 +143,7 @@ class Worsening:
 
 
 def scaled_likelihood(model: GaussianSensorModel, observed: Float, control: Index) -> tuple[Float, Float]:
-    """Return p(o_t | D_t, u_t) of B twins over the largest of each turn (B, T, S), and the logs of that (B,).
+    """Return p(o_t | D_t, u_t) of B twins over the largest of each step (B, T, S), and the logs of that (B,).
 
     Parameters
     ----------

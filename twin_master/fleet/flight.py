@@ -18,6 +18,7 @@ from reporting.files import (
     write_members,
 )
 from reporting.folders import closing_lock
+from reporting.former_names import with_present_names
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from reporting.provenance import collect_provenance
@@ -32,6 +33,7 @@ from twin_master.fleet.store import STORE_NAME, check_installed, create_store, s
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.scenario import reading as scenario_reading
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
 
@@ -180,6 +182,12 @@ def held_fleet(
         yield config
 
 
+PRESENT_NAMES = {
+    f"fleet.groups.scenarios.{location}": name for location, name in scenario_reading.PRESENT_NAMES.items()
+}
+"""The present name of each key of the configuration of a fleet, by the location that it had before."""
+
+
 def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
     """Return the configuration of a folder that holds a fleet, by default one that is flown.
 
@@ -193,7 +201,7 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
         raise RunFolderError(
             f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."
         )
-    return found
+    return with_present_names(found, PRESENT_NAMES, str(folder / run_folder.CONFIG_NAME), RunFolderError)
 
 
 def flies_model(scenario: Scenario) -> bool:

@@ -55,7 +55,7 @@ class _Lessons:
     grid : Grid or None
         Their likelihood; None where the transitions are not learnt.
     flown : set of str
-        The controls under which a turn was followed by another.
+        The controls under which a step was followed by another.
     record : dict
         Of the group, but for the probabilities.
     """
@@ -214,7 +214,7 @@ def _noisier(model: GaussianSensorModel, factor: float, nodes: _Nodes | None = N
 def _noise(seen: Sequence[Seen], worsening: Worsening, nodes: _Nodes | None) -> Line:
     """Return the posterior of the factor on the assumed noise, uniform in its logarithm before the data.
 
-    The parameter of an asset is the same in all its turns: a twin that draws it anew in each takes a part of
+    The parameter of an asset is the same in all its steps: a twin that draws it anew in each takes a part of
     the noise for it.
     """
     assumed = _possible(worsening)

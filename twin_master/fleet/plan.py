@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from reporting.files import hash_file
+from reporting.former_names import with_present_names
 from reporting.toml_file import Fault, NotNegative, Number, read_toml, validate
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import FleetError, TwinMasterError, said
@@ -39,6 +40,10 @@ class Spread(Section):
     standard_deviation: NotNegative = 0.0
 
 
+PRESENT_NAMES = {"group.inspections_a_turn": "inspections_per_step"}
+"""The present name of each key of a fleet file, by the location that it had before."""
+
+
 class GroupSection(Section):
     """Assets that share a scenario."""
 
@@ -61,8 +66,8 @@ class GroupSection(Section):
     """A file of `uav-twin fleet learn`."""
     steps: Count | None = None
     parameters: dict[str, Spread] = Field(default_factory=dict)
-    inspections_a_turn: Count | None = None
-    """What `planner.inspections_a_turn` is in this group, which then flies in one shard."""
+    inspections_per_step: Count | None = None
+    """What `planner.inspections_per_step` is in this group, which then flies in one shard."""
     true_probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
     """What `truth.probability` is in this group."""
 
@@ -197,15 +202,15 @@ def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
         in one list.
     """
     path = Path(path)
-    found = validate(
-        FleetFile, read_toml(path, FleetError, what="fleet"), str(path), FleetError, what="a fleet"
-    )
+    table = read_toml(path, FleetError, what="fleet")
+    table = with_present_names(table, PRESENT_NAMES, str(path), FleetError)
+    found = validate(FleetFile, table, str(path), FleetError, what="a fleet")
     head = found.fleet if seed is None else found.fleet.model_copy(update={"seed": seed})
     groups, wrong = [], []
     for section in found.group:
         try:
             groups.append(_group(section, path.resolve().parent, head.seed))
-            rationed = groups[-1].scenarios[0].planner.inspections_a_turn is not None
+            rationed = groups[-1].scenarios[0].planner.inspections_per_step is not None
             if rationed and (len(groups[-1].members) > head.shard or len(groups[-1].scenarios) > 1):
                 raise FleetError(said("fleet.shared", members=len(groups[-1].members)))
         except TwinMasterError as error:
@@ -295,8 +300,8 @@ def _of_group(section: GroupSection, scenario: Scenario) -> Scenario:
     table = scenario.to_dict()
     if section.steps is not None:
         table["mission"]["steps"] = section.steps
-    if section.inspections_a_turn is not None:
-        table["planner"]["inspections_a_turn"] = section.inspections_a_turn
+    if section.inspections_per_step is not None:
+        table["planner"]["inspections_per_step"] = section.inspections_per_step
     if section.true_probability:
         table["truth"]["probability"] = section.true_probability
     return parse_scenario(table, f"group {section.name}")

@@ -46,7 +46,7 @@ class Outcomes:
     evidence : Estimated
         Mean log evidence of a step.
     credible : Estimated
-        Share of the turns in which the true state lies in the smallest set of states that the filtered
+        Share of the steps in which the true state lies in the smallest set of states that the filtered
         belief holds for `CREDIBILITY` probable.
     """
 
@@ -65,7 +65,7 @@ class Outcomes:
             name: np.asarray(stored[name])[flown].astype(np.float64)
             for name in ("delay", "early", "credible", "mean", "state", "log_evidence")
         }
-        error = np.ma.masked_invalid(kept["mean"] - kept["state"])  # (N, T, F), some turns were not flown
+        error = np.ma.masked_invalid(kept["mean"] - kept["state"])  # (N, T, F), some steps were not flown
         squared, bias = ((error**power).mean(axis=1).filled(np.nan).T for power in (2, 1))
         return cls(
             within=_share(kept["delay"][~np.isnan(kept["delay"])] <= WITHIN),
@@ -87,7 +87,7 @@ def _share(hits: NDArray[np.bool_]) -> Estimated:
 
 
 def _mean(values: Float) -> Estimated:
-    """Return the mean over missions; the turns of a mission are not independent, the missions are."""
+    """Return the mean over missions; the steps of a mission are not independent, the missions are."""
     count = len(values)
     error = float(np.std(values, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
     return Estimated(float(np.mean(values)), error)
@@ -116,13 +116,13 @@ def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.int64]:
 
 
 def believed_means(group: "xr.Dataset") -> Float:
-    """Return the means of the states of B twins in T turns (B, T, F), SI; NaN where no state is believed."""
+    """Return the means of the states of B twins in T steps (B, T, F), SI; NaN where no state is believed."""
     unexplained = group["unexplained"].values > BELIEVED
     return np.where(unexplained[..., np.newaxis], np.nan, group["mean"].values)
 
 
-def last_turns(group: "xr.Dataset") -> NDArray[np.int64]:
-    """Return the last turn of each twin: that of a recording may come early."""
+def last_steps(group: "xr.Dataset") -> NDArray[np.int64]:
+    """Return the last step of each twin: that of a recording may come early."""
     last: NDArray[np.int64] = np.maximum((group["control_index"].values >= 0).sum(axis=1) - 1, 0)
     return last
 
@@ -136,7 +136,7 @@ def severity(scenario: Scenario, mean: Float) -> Float:
 def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     """Return the probability that twins leave a control within the steps that are predicted: (B,).
 
-    Of a policy by states it is that of the state of each turn, or of the turn behind it where that decides;
+    Of a policy by states it is that of the state of each step, or of the step behind it where that decides;
     where the belief decides it is of lives that are drawn.
 
     Parameters
@@ -144,7 +144,7 @@ def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     knowledge : Knowledge
         Of the twins.
     belief : (B, S)
-        After the last turn.
+        After the last step.
     control : int
         In force then; it stays so until it is left.
     """
@@ -199,12 +199,12 @@ def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Flo
     `known_twins`.
     """
     chance, belief = np.full(group.sizes["twin"], np.nan), group["belief"].values.astype(np.float64)
-    control = group["control_index"].values[np.arange(len(chance)), last_turns(group)]
+    control = group["control_index"].values[np.arange(len(chance)), last_steps(group)]
     for rows, _, knowledge in known_twins(folder, record, group):
         for index in np.unique(control[rows]).tolist():
             mine = rows[control[rows] == index]
             chance[mine] = attention(knowledge, belief[mine], index)
-    last = np.arange(len(chance)), last_turns(group)
+    last = np.arange(len(chance)), last_steps(group)
     chance[group["unexplained"].values[last] > BELIEVED] = np.nan
     return chance
 

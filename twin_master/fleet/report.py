@@ -29,7 +29,7 @@ from twin_master.fleet.reading import (
     believed_means,
     figure_rows,
     group_figures,
-    last_turns,
+    last_steps,
     leaving,
     noticed,
     severity,
@@ -54,7 +54,7 @@ NEXT, FAILURES = 15, 10
 
 @dataclass(frozen=True)
 class Standing:
-    """How B assets of a group stand: turns and alarms (B,), moments of the state (B, F), SI, controls.
+    """How B assets of a group stand: steps and alarms (B,), moments of the state (B, F), SI, controls.
 
     Moments are NaN where no state is believed. `leaving` (B,) is the probability that a control is left soon;
     NaN where it is not known.
@@ -63,7 +63,7 @@ class Standing:
     group: str
     scenario: Scenario
     names: list[str]
-    turn: NDArray[np.int64]
+    step: NDArray[np.int64]
     mean: Float
     deviation: Float
     control: list[str]
@@ -146,9 +146,9 @@ def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: in
 
 
 def _flown(record: dict[str, Any], group: "xr.Dataset") -> Standing:
-    """Return how the twins of a group stood after their last turn, but for what they would do next."""
+    """Return how the twins of a group stood after their last step, but for what they would do next."""
     scenario, flown = Scenario.model_validate(record["scenarios"][0]), has_flown(group["status"].values)
-    at = flown, last_turns(group)[flown]
+    at = flown, last_steps(group)[flown]
     return Standing(
         record["name"], scenario, [record["members"][row][0] for row in flown], at[1],
         believed_means(group)[at], group["standard_deviation"].values[at],
@@ -194,13 +194,13 @@ def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: i
             )
             for moment in ("mean", "standard_deviation")
         )
-        turn, control = np.array([one["turn"] for one in last]), [one["control"] for one in last]
+        step, control = np.array([one["step"] for one in last]), [one["control"] for one in last]
         alarmed = np.array([asset["alarms"] for asset in own.values()], np.int64)
         chance = np.array([asset["leaving"] for asset in own.values()], np.float64)
         page.add_section(f"Group {group['name']}")
         _add_group(
             page,
-            Standing(group["name"], scenario, [*own], turn, mean, deviation, control, alarmed, chance),
+            Standing(group["name"], scenario, [*own], step, mean, deviation, control, alarmed, chance),
             most,
         )
 
@@ -228,7 +228,7 @@ def _add_lessons(page: Page, folder: Path) -> None:
 def _add_group(
     page: Page, standing: Standing, most: int, failed: int = 0, courses: tuple[Float, Float] | None = None
 ) -> None:
-    """Add a map of a group, bands where all turns are at hand, and so many assets that need attention."""
+    """Add a map of a group, bands where all steps are at hand, and so many assets that need attention."""
     count, scenario = len(standing.names), standing.scenario
     if not count:
         page.add_paragraph(WORDS.say("nothing"))
@@ -250,7 +250,7 @@ def _add_group(
         change = "" if np.isnan(standing.leaving[row]) else f"{soon[row]:.0f}"
         alarms = [str(standing.alarms[row] or "")] * told
         rows.append(
-            [standing.names[row], str(standing.turn[row]), *states, standing.control[row], change, *alarms]
+            [standing.names[row], str(standing.step[row]), *states, standing.control[row], change, *alarms]
         )
     more = [
         number_column(state.name, factor.unit) for state, factor in zip(scenario.state, factors, strict=True)
@@ -298,7 +298,7 @@ def map_figure(scenario: Scenario, last: Float, failed: int) -> Figure:
 
 @style.publication_style()
 def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
-    """Return bands of the states of B assets over the turns: (B, T, F), true ones NaN where not known."""
+    """Return bands of the states of B assets over the steps: (B, T, F), true ones NaN where not known."""
     factors = printed_factors(scenario)
     figure, (row,) = style.panels(1, len(factors), 2.4, 0.3, 0.45, wspace=0.25)
     steps = np.flatnonzero(~np.isnan(mean).all(axis=(0, 2)))

@@ -37,7 +37,7 @@ from twin_master.fleet.store import FAILED, outcomes_of
 from twin_master.mission.loop import BelievedModel, filtered_again, operate
 from twin_master.mission.preparation import Knowledge, kept_knowledge
 from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one, fly_side_by_side
-from twin_master.mission.turns import History, Reading
+from twin_master.mission.steps import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.intake import Feed, Intake
@@ -56,12 +56,12 @@ def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Fl
         except IN_FLIGHT as error:
             flights.failure[number] = str(error)
             continue
-        turns = len(history.turns)
-        if not turns:
-            flights.failure[number] = "its recording has no turn yet."
-        elif turns > most:
+        steps = len(history.steps)
+        if not steps:
+            flights.failure[number] = "its recording has no step yet."
+        elif steps > most:
             flights.failure[number] = (
-                f"it has {turns} turns, and {most} at most are flown: set `steps` of the group."
+                f"it has {steps} steps, and {most} at most are flown: set `steps` of the group."
             )
         else:
             flights.put(number, history)
@@ -74,10 +74,10 @@ def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
     history = History(twin, scenario.observation.count)
     intake, seen, late = Intake(scenario, Feed(messages)), {}, False
     lost: list[tuple[int, Notice]] = []
-    for turn in operate(twin, intake, history.add):
-        at = intake.observation_turn
-        seen[at] = Reading(turn.reading.observed, twin.control_of(at))
-        late |= turn.reading.revises is not None
+    for step in operate(twin, intake, history.add):
+        at = intake.observation_step
+        seen[at] = Reading(step.reading.observed, twin.control_of(at))
+        late |= step.reading.revises is not None
         lost += [(at, notice) for notice in intake.notices]
     if late:
         history = filtered_again(seen, [BelievedModel(0, knowledge)])
@@ -205,8 +205,8 @@ class _Hangar(ExitStack):
 
     def asset(self, twin: int, sound: bool) -> Asset:
         """Return the asset of a twin, which flies alone, at its start."""
-        if self._kit.scenario.planner.inspections_a_turn is not None:
-            raise FleetError("`inspections_a_turn` needs assets without memory, which fly side by side")
+        if self._kit.scenario.planner.inspections_per_step is not None:
+            raise FleetError("`inspections_per_step` needs assets without memory, which fly side by side")
         return self._at_start(twin, sound)
 
     def _at_start(self, twin: int, sound: bool) -> Asset:

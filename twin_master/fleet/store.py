@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from reporting.files import explained_write_errors
+from reporting.former_names import warn_of_former_names
 from twin_master.errors import FleetError, said
 from twin_master.fleet.plan import Fleet, Group, Member
 from twin_master.mission.preparation import Knowledge
@@ -30,7 +31,7 @@ CREDIBILITY = 0.9
 """Probability of the set of states in which the true one is looked for."""
 _TOLERANCE = 1e-9
 WITHIN = 2
-"""Turns within which the fallback is to come."""
+"""Steps within which the fallback is to come."""
 
 FLOWN, FAILED, ENDED = 1, 2, 3
 """Values of `status`; 0 has not flown yet."""
@@ -44,7 +45,7 @@ def has_flown(status: NDArray[Any]) -> NDArray[np.int64]:
 def sizes_of(scenario: Scenario) -> dict[str, int]:
     """Return the lengths of the dimensions."""
     return {
-        "turn": scenario.mission.steps,
+        "step": scenario.mission.steps,
         "sensor": scenario.row_width,
         "factor": len(scenario.state),
         "notice_kind": len(NOTICE_KINDS),
@@ -65,10 +66,10 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
     failed = np.array([bool(text) for text in flights.failure])
     delay, early = _fallbacks(knowledge, flights)
     unknown = np.isnan(flights.state[:, 0]).any(axis=1)  # of a real asset
-    turns = (flights.control_index >= 0).sum(axis=1)  # a recording or a simulation may end early
+    steps_flown = (flights.control_index >= 0).sum(axis=1)  # a recording or a simulation may end early
     short = np.array([bool(text) for text in flights.ended])
     told = [
-        [[turn for turn, notice in own if notice.kind == kind] for kind in NOTICE_KINDS]
+        [[step for step, notice in own if notice.kind == kind] for kind in NOTICE_KINDS]
         for own in flights.notices
     ]
     found: dict[str, Any] = {
@@ -81,13 +82,13 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
         "standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
         "log_evidence": flights.log_evidence,
         "unexplained": flights.unexplained,
-        "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, turns) - 1],
+        "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, steps_flown) - 1],
         "delay": np.where(failed, np.nan, delay),
         "early": np.where(failed, -1, early),
-        "notices": [[len(turns) for turns in own] for own in told],
-        "first_notice": [[min(turns, default=-1) for turns in own] for own in told],
+        "notices": [[len(numbers) for numbers in own] for own in told],
+        "first_notice": [[min(numbers, default=-1) for numbers in own] for own in told],
         "credible": np.where(
-            failed | unknown, np.nan, inside.reshape(-1, steps).sum(axis=1) / np.maximum(turns, 1)
+            failed | unknown, np.nan, inside.reshape(-1, steps).sum(axis=1) / np.maximum(steps_flown, 1)
         ),
     }
     found = {name: np.ascontiguousarray(values, SCHEMA["fleet"][name][3]) for name, values in found.items()}
@@ -105,13 +106,14 @@ def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float
     for twin, (control, state) in enumerate(zip(flights.control_index, flights.state, strict=True)):
         if np.isnan(state[0]).any():
             continue
-        turns = int(np.sum(control >= 0))
-        course = control[:turns], state[:turns]
+        steps_flown = int(np.sum(control >= 0))
+        course = control[:steps_flown], state[:steps_flown]
         fallback = find_fallback(knowledge.model.states, plan.control_index, first, *course)
         if fallback.switch_state is not None:
             early[twin] = fallback.early_step is not None
         if fallback.called_for_step is not None:
-            late = turns - fallback.called_for_step <= WITHIN  # so that nobody knows whether it would come
+            # Where the mission ends so soon behind it, nobody knows whether the fallback would come.
+            late = steps_flown - fallback.called_for_step <= WITHIN
             never = np.nan if late else np.inf
             delay[twin] = never if fallback.delay is None else fallback.delay
     return delay, early
@@ -148,6 +150,8 @@ def in_credible_set(
 
 
 STORE_NAME = "fleet.zarr"
+FORMER_DIMENSION = "turn"
+"""What the dimension `step` was called in the stores of earlier versions."""
 
 
 def check_installed(*packages: str) -> None:
@@ -177,6 +181,9 @@ def open_group(folder: Path, group: str) -> "xr.Dataset":
     before = f"{folder} holds no group {group} of a fleet ("
     with FleetError.instead_of(OSError, KeyError, ValueError, before=before, after=")."):
         found: xr.Dataset = xr.open_zarr(folder / STORE_NAME, group=group, chunks=None, consolidated=False)
+    if FORMER_DIMENSION in found.dims:
+        warn_of_former_names(f"{folder / STORE_NAME}", {FORMER_DIMENSION: "step"})
+        found = found.rename({FORMER_DIMENSION: "step"})
     if missing := SCHEMA["fleet"].keys() - found.keys():
         raise FleetError(said("fleet.other_layout", folder=folder, missing=", ".join(sorted(missing))))
     return found

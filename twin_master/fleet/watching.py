@@ -14,6 +14,7 @@ import numpy as np
 
 from reporting.errors import DiskFullError
 from reporting.files import atomic_write_text, explained_write_errors
+from reporting.former_names import with_present_names
 from reporting.json_file import read_json
 from reporting.progress import SilentProgress
 from twin_master.errors import FleetError, said
@@ -28,8 +29,8 @@ from twin_master.watch.intake import Feed
 from twin_master.watch.mqtt import Session, Topic
 from twin_master.watch.opening import begun_watch, resumed_watch
 
-TURNS_AT_ONCE = 64
-"""Turns of one asset before the next one is looked at."""
+STEPS_AT_ONCE = 64
+"""Steps of one asset before the next one is looked at."""
 SEARCH_SECONDS, STATE_SECONDS = 2.0, 2.0
 """Between two searches for new files, and between two writings of the state."""
 AGAIN_SECONDS, LONGEST_AGAIN = 30.0, 3600.0
@@ -40,7 +41,7 @@ LARGEST_FLEET = 100_000
 """Assets; a broker could name more of them without end."""
 STATE_NAME = "watched.json"
 """In the folder of a fleet that is watched: its assets as they stood a moment ago, for its view."""
-_OF_A_DECISION = ("turn", "control", "next_control", "probability", "health")
+_OF_A_DECISION = ("step", "control", "next_control", "probability", "health")
 """What of its last decision is kept of each asset."""
 _NAME = re.compile(r"\w[\w.-]{0,63}")
 
@@ -53,7 +54,10 @@ def read_standing(folder: Path) -> dict[str, Any]:
     `severity` how badly off it is. Both are None where no state is believed.
     """
     path = folder / STATE_NAME
-    return dict(read_json(path, FleetError)) if path.is_file() else {"assets": {}, "failures": {}}
+    if not path.is_file():
+        return {"assets": {}, "failures": {}}
+    record = dict(read_json(path, FleetError))
+    return with_present_names(record, {"assets.*.last.turn": "step"}, str(path), FleetError)
 
 
 def counts_of(standing: Mapping[str, Any]) -> dict[str, int]:
@@ -61,7 +65,7 @@ def counts_of(standing: Mapping[str, Any]) -> dict[str, int]:
     known = standing["assets"].values()
     return {
         "assets": len(known),
-        "turns": sum(asset["last"]["turn"] + 1 for asset in known if asset["last"] is not None),
+        "steps": sum(asset["last"]["step"] + 1 for asset in known if asset["last"] is not None),
         "alarms": sum(asset["alarms"] for asset in known),
         "messages refused": sum(asset["refused"] for asset in known),
         "not watched": len(standing["failures"]),
@@ -84,7 +88,7 @@ class WatchedAsset:
     alarms : set of str
         The alarms that the operator was told since it was taken up, each sentence once.
     first_untold : int
-        The first turn that the operator was not told before.
+        The first step that the operator was not told before.
     close : callable
         Gives its folder free.
     """
@@ -97,7 +101,7 @@ class WatchedAsset:
         self.decision = watch.last_decision()
         self.first_untold = self._alarms_before = 0
         if before is not None and before["last"] is not None:
-            self.first_untold, self._alarms_before = before["last"]["turn"] + 1, before["alarms"]
+            self.first_untold, self._alarms_before = before["last"]["step"] + 1, before["alarms"]
         told = [notice for _, notice in watch.told(self.first_untold)] if self.decision else []
         self.alarms = {notice.sentence for notice in told if notice.kind == "alarm"}
         if self.decision is not None:
@@ -141,8 +145,8 @@ class FleetWatch:
         Told of assets that are lost, and of brokers.
     follow : bool
         Files grow, and new ones come.
-    turns : int, optional
-        Turns of each asset after which it is left alone.
+    steps : int, optional
+        Steps of each asset after which it is left alone.
     authority : Path, optional
         Certificate of the authority of a broker.
 
@@ -160,7 +164,7 @@ class FleetWatch:
     standing : dict
         How all stood a moment ago, as `read_standing` has it.
     asked : bool
-        Set it to end between two turns.
+        Set it to end between two steps.
     """
 
     def __init__(
@@ -171,13 +175,13 @@ class FleetWatch:
         note: Callable[[str], None],
         *,
         follow: bool = False,
-        turns: int | None = None,
+        steps: int | None = None,
         authority: Path | None = None,
     ) -> None:
         self.folder, self.assets, self.asked = folder, dict[str, WatchedAsset](), False
         self._lost: dict[str, _Lost] = {}
         self.note, self.closing, self.goodbyes = note, ExitStack(), ExitStack()
-        self._tell, self._turns = tell, turns
+        self._tell, self._steps = tell, steps
         self._like: dict[str, Watch] = {}
         flown = [group.name for group in fleet.groups if not group.observations]
         if flown:
@@ -232,12 +236,12 @@ class FleetWatch:
                     begin = time.monotonic()
                     searching = begin - searched >= SEARCH_SECONDS
                     searched = begin if searching else searched
-                    turns = sum(source.look(searching) for source in self._sources)
+                    steps = sum(source.look(searching) for source in self._sources)
                     if begin - state > STATE_SECONDS:
                         self._write_state()
                         state = begin
                     looked()
-                    if not turns:
+                    if not steps:
                         if all(source.ended for source in self._sources):
                             return
                         looking = time.monotonic() - begin
@@ -246,7 +250,7 @@ class FleetWatch:
                 self._write_state()
 
     def advance(self, group: Group, name: str, feed: Callable[[], Feed], most: int | None = None) -> int:
-        """Take in what has come of an asset, in so many turns at most; return the number of turns.
+        """Take in what has come of an asset, in so many steps at most; return the number of steps.
 
         It is begun, or taken up again, where it is not watched and it is time.
         """
@@ -297,7 +301,7 @@ class FleetWatch:
         self._like.setdefault(group.name, watch)
         self.assets[key] = asset
         last = asset.decision
-        if last is not None and last["turn"] >= asset.first_untold:  # a kill may have left it untold
+        if last is not None and last["step"] >= asset.first_untold:  # a kill may have left it untold
             self._decided(asset, last)
 
     def _decided(self, asset: WatchedAsset, decision: dict[str, Any]) -> None:
@@ -308,12 +312,12 @@ class FleetWatch:
         asset.alarms |= {notice["sentence"] for notice in decision["notices"] if notice["kind"] == "alarm"}
 
     def ask(self) -> None:
-        """Ask for an end between two turns."""
+        """Ask for an end between two steps."""
         self.asked = True
 
     def enough(self, asset: WatchedAsset) -> bool:
-        """Return whether an asset has the turns that were wanted."""
-        return self._turns is not None and asset.watch.twin.turns >= self._turns
+        """Return whether an asset has the steps that were wanted."""
+        return self._steps is not None and asset.watch.twin.steps >= self._steps
 
     def lost(self, key: str, error: Exception) -> None:
         """Say once why an asset is not watched, and give its folder free; a full disk ends all."""
@@ -354,7 +358,7 @@ class _Files:
         )
 
     def look(self, searching: bool) -> int:
-        """Take in what is new, and look for new files; return the number of turns."""
+        """Take in what is new, and look for new files; return the number of steps."""
         for path in recordings(self._group.observations) if searching else ():
             name = asset_name(path)
             if self._files.get(name, path) != path:
@@ -365,7 +369,7 @@ class _Files:
         scenario = self._group.scenarios[0]
         return sum(
             self._fleet.advance(
-                self._group, name, partial(file_feed, path, scenario, follow=self._follow), TURNS_AT_ONCE
+                self._group, name, partial(file_feed, path, scenario, follow=self._follow), STEPS_AT_ONCE
             )
             for name, path in self._files.items()
         )
@@ -394,23 +398,23 @@ class _Topics:
         self._topics: dict[str, Topic] = {}
 
     def look(self, searching: bool) -> int:
-        """Take in what the broker has sent; return the number of turns."""
-        turns, begin = 0, time.monotonic()
+        """Take in what the broker has sent; return the number of steps."""
+        steps, begin = 0, time.monotonic()
         if not self._topics:  # those that were watched before may be quiet, or have decisions to publish
             for path in sorted((self._fleet.folder / self._group.name).glob(f"*/{CONFIG_NAME}")):
                 self._found(path.parent.name)
         for name in [*self._topics] if searching else ():
-            turns += self._advanced(name)
+            steps += self._advanced(name)
         while not self._fleet.asked and (message := next(self._messages)) is not None:
             name = message.topic.rpartition("/")[2]
             asset = self._fleet.assets.get(f"{self._group.name}/{name}")
             topic = self._found(name)
             if topic is not None and not (asset and self._fleet.enough(asset)):
                 topic.came.append(message.payload)
-                turns += self._advanced(name)
+                steps += self._advanced(name)
             if time.monotonic() - begin > STATE_SECONDS:
                 break
-        return turns
+        return steps
 
     def _found(self, name: str) -> Topic | None:
         """Return the topic of an asset; None of one too many."""
@@ -426,7 +430,7 @@ class _Topics:
     def _pulse(self) -> dict[str, Any]:
         kept = [topic.watch for topic in self._topics.values() if topic.watch is not None]
         return {
-            "state": "watching", "assets": len(kept), "turns": sum(watch.twin.turns for watch in kept),
+            "state": "watching", "assets": len(kept), "steps": sum(watch.twin.steps for watch in kept),
             "quiet": sum(watch.is_quiet for watch in kept), "lag": len(self._session.came),
             "refused": sum(watch.intake.counts.rejected for watch in kept),
         }  # fmt: skip

@@ -79,29 +79,29 @@ class LearntExpectation:
     policy: Float
 
     def filtered(self, carried: Sequence[Carried], beliefs: Float, observed: Float) -> Expected:
-        """Return what is expected of T turns given the observations up to each.
+        """Return what is expected of T steps given the observations up to each.
 
         Parameters
         ----------
         carried : sequence of Carried
-            Of each turn.
+            Of each step.
         beliefs : (T, S)
             About the state, which may be those of more than the model alone.
         observed : (T, G)
             What the sensors say, SI.
         """
         rows = zip(carried, beliefs, observed, strict=True)
-        known = (self._known(self.learning.hypotheses(turn), turn, *row) for turn, *row in rows)
+        known = (self._known(self.learning.hypotheses(step), step, *row) for step, *row in rows)
         return joined(known, np.array)
 
     def smoothed(self, carried: Sequence[Carried], beliefs: Float, observed: Float) -> Expected:
-        """Return what is expected of T turns given all observations, see `filtered`."""
+        """Return what is expected of T steps given all observations, see `filtered`."""
         rows, own = zip(carried, beliefs, observed, strict=True), self.learning.smoothed_hypotheses(carried)
         last = (self.learning.hypotheses(carried[-1], weight) for weight in own)
         return joined((self._known(found, *row) for found, row in zip(last, rows, strict=True)), np.array)
 
     def predicted(self, carried: Sequence[Carried], beliefs: Float, asked: Float, horizon: int) -> Expected:
-        """Return what is expected after each of T turns of given filtered beliefs, of the H to come.
+        """Return what is expected after each of T steps of given filtered beliefs, of the H to come.
 
         Controls are asked for with the probabilities p(U | D) (T, S, U).
         """
@@ -119,7 +119,7 @@ class LearntExpectation:
         Parameters
         ----------
         learnt : dict of str to Learnt
-            Posterior of each quantity, as a turn tells it.
+            Posterior of each quantity, as a step tells it.
         joint : (B, S, U')
             Belief over states and controls.
         controls : slice
@@ -159,17 +159,17 @@ class LearntExpectation:
         matrix = self.learning.model.transition.matrix
         return np.asarray(np.einsum("su,usn->sn", self.policy, matrix))
 
-    def _known(self, hypotheses: Hypotheses, turn: Carried, belief: Float, seen: Float) -> Expected:
-        u = slice(turn.control_index, turn.control_index + 1)
+    def _known(self, hypotheses: Hypotheses, step: Carried, belief: Float, seen: Float) -> Expected:
+        u = slice(step.control_index, step.control_index + 1)
         found = self._of(hypotheses, _believing(hypotheses.weight, belief)[None, :, :, None], u, seen)
         return Expected(**{name: values[0] for name, values in vars(found).items()})
 
-    def _ahead(self, turn: Carried, belief: Float, asked: Float, horizon: int) -> Expected:
-        hypotheses = self.learning.hypotheses(turn)
+    def _ahead(self, step: Carried, belief: Float, asked: Float, horizon: int) -> Expected:
+        hypotheses = self.learning.hypotheses(step)
         rows, coming = _believing(hypotheses.weight, belief), np.empty((horizon, *hypotheses.weight.shape))
-        step = self.learning.model.transition.matrix[turn.control_index]
+        transition = self.learning.model.transition.matrix[step.control_index]
         for h in range(horizon):
-            rows, step = rows @ step, self._closed_loop
+            rows, transition = rows @ transition, self._closed_loop
             coming[h] = rows
         return self._of(hypotheses, coming[..., None] * asked, slice(None), None)
 
@@ -217,6 +217,6 @@ def _believing(weight: Float, belief: Float) -> Float:
 
 
 def joined(parts: Iterable[Expected], by: Callable[[list[Float]], Float] = np.concatenate) -> Expected:
-    """Return what is expected of turns one after the other; by `np.array` each is a row of a leading axis."""
+    """Return what is expected of steps one after the other; by `np.array` each is a row of a leading axis."""
     found = [vars(part) for part in parts]
     return Expected(**{name: by([part[name] for part in found]) for name in found[0]})

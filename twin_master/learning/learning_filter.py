@@ -146,7 +146,7 @@ class LearningFilter:
         The priors; of the transitions it is what is given here.
     draws : (str, (E,)), optional
         Name of the parameter of the draws, and its values in the order of the sensor model; without it the
-        draws are averaged anew in each turn.
+        draws are averaged anew in each step.
     transitions : mapping of float to TransitionModel, optional
         Those of each factor on the probabilities to leave a state, equally probable at first; those of the
         model if left out.
@@ -191,10 +191,10 @@ class LearningFilter:
         weight = np.exp(self._log_weight)[:, None]
         return self._learnt(weight, np.zeros((len(weight), sensors, 6)), np.zeros(sensors))
 
-    def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
-        """Advance belief and what is learnt to turn t, and correct them by an observation.
+    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+        """Advance belief and what is learnt to step t, and correct them by an observation.
 
-        See `Estimator.turn`; `learnt` of the estimate holds by name the parameter, `transition_factor`,
+        See `Estimator.step`; `learnt` of the estimate holds by name the parameter, `transition_factor`,
         and `noise_scale[g]`, `gauge_gain[g]`, `gauge_offset[g]` for the sensors g from 1.
         """
         seen, told = self.sensor_model.apart(observation)
@@ -207,7 +207,7 @@ class LearningFilter:
         best = float(log_belief.max())
         if best == -np.inf:
             worst = self.sensor_model.worst_residuals(seen, control_index)
-            raise ImpossibleObservation(self._name, turn, worst)
+            raise ImpossibleObservation(self._name, step, worst)
         filtered = np.exp(log_belief - best)
         evidence = best + float(np.log(filtered.sum()))
         filtered /= filtered.sum()
@@ -238,7 +238,7 @@ class LearningFilter:
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
     def hypotheses(self, carried: Carried, weight: Float | None = None) -> Hypotheses:
-        """Return what is believed after a turn of each hypothesis that tells something.
+        """Return what is believed after a step of each hypothesis that tells something.
 
         Of other beliefs the weight (K, S) is given.
         """
@@ -257,21 +257,21 @@ class LearningFilter:
         )  # fmt: skip
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
+        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
         return np.asarray(self.smoothed_hypotheses(carried).sum(axis=1))
 
     def smoothed_hypotheses(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_i, k | o_0..o_t) for the turns i of `carried`, which end at t: (n, K, S)."""
+        """Return p(D_i, k | o_0..o_t) for the steps i of `carried`, which end at t: (n, K, S)."""
         result = np.zeros((len(carried), len(self._draw), self.model.states.size))
         if not len(carried):
             return result
-        rows = np.array([turn.arrays["log_belief"] for turn in carried])  # (n, K, S)
+        rows = np.array([step.arrays["log_belief"] for step in carried])  # (n, K, S)
         if self.draws is None and len(self._draw) > 1:
             rows = np.stack([self._averaged_anew(row) for row in rows])
         weight = np.exp(rows[-1]).sum(axis=1)
         held = np.flatnonzero(weight > 0.0)
         own = rows[:, held] - logsumexp(rows[:, held], axis=2, keepdims=True)
-        control = self._first_control[held, None] + np.array([turn.control_index for turn in carried])
+        control = self._first_control[held, None] + np.array([step.control_index for step in carried])
         own = np.ascontiguousarray(own.swapaxes(0, 1))
         parts = smooth_many(self._transition, control, np.exp(own), own)
         result[:, held] = weight[held, None] * parts.swapaxes(0, 1)

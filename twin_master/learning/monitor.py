@@ -3,9 +3,9 @@
 Beside the model as it is (every gauge shows what the state, a draw of the parameter and noise of unknown
 scale say) run rivals with filters of their own, so that state and parameter are marginalised under each: that
 a gauge shows a stated share too much or too little, and that several gauges have gains of their own, which no
-state of the model explains. Each may begin in any turn; the mixture over the first turn is exact, because
+state of the model explains. Each may begin in any step; the mixture over the first step is exact, because
 until then the rival's belief is the model's. The ratio of the evidence of a rival to that of the model is an
-e-process: its mean under the predictions of the model is one at every turn, so that it ever exceeds a
+e-process: its mean under the predictions of the model is one at every step, so that it ever exceeds a
 threshold c with a probability of at most 1 / c, however often one looks (Ville 1939; Ramdas, Grünwald, Vovk
 and Shafer 2023).
 """
@@ -31,7 +31,7 @@ Arrays = dict[str, NDArray[Any]]
 
 _PREFIX = "notice/"
 _FROM_THE_START = 0.5
-"""Prior share of faults that are there from the first turn; the others begin at a later one."""
+"""Prior share of faults that are there from the first step; the others begin at a later one."""
 _FREE = 0.5
 """Prior probability that a gauge has a gain of its own, where no state explains all of them."""
 _GAINS = (-2.5, -1.0, 1.0, 2.5)
@@ -39,7 +39,7 @@ _GAINS = (-2.5, -1.0, 1.0, 2.5)
 _REACH = (1.0, 0.5, 0.5, 1.0)
 """How far about each of these the gain is learnt: half of a gain that is to be found is none."""
 _LARGEST = 20_000_000
-"""Numbers that the beliefs of the rivals may take: each turn that is kept holds them."""
+"""Numbers that the beliefs of the rivals may take: each step that is kept holds them."""
 _CLEARLY = float(np.log(10.0))
 """A single gauge is the simpler explanation: several must be so much better for the alarm to say so."""
 _OR_THE_ASSET = "or the asset near it is not as the model says, as where it has softened"
@@ -104,51 +104,51 @@ class WatchfulEstimator:
         self._low = (sensor_model.value_per_draw.min(axis=0) - reach).min(axis=0)  # (U, G)
         self._high = (sensor_model.value_per_draw.max(axis=0) + reach).max(axis=0)
         self._gains, self._reach = settings.gauge_gain * np.array([_GAINS, _REACH])
-        # The prior of a gauge grows with the turns that it takes to be found, or weak ones would be lost.
-        per_turn = np.mean((settings.gauge_gain * sensor_model.mean / deviation) ** 2, axis=(0, 1))
-        turns = 1.0 + 1.0 / np.maximum(per_turn, 1e-3)
-        self._log_prior: Float = np.log(turns / turns.sum())
+        # The prior of a gauge grows with the steps that it takes to be found, or weak ones would be lost.
+        per_step = np.mean((settings.gauge_gain * sensor_model.mean / deviation) ** 2, axis=(0, 1))
+        steps = 1.0 + 1.0 / np.maximum(per_step, 1e-3)
+        self._log_prior: Float = np.log(steps / steps.sum())
         of_gauges = np.repeat(self._log_prior - np.log(len(_GAINS)), len(_GAINS))
         self._begins: Float = np.log(0.5) + np.concatenate([[-np.inf, -np.inf, 0.0], of_gauges])
         self._names = tuple(f"{self._words.sensors([g])} off" for g in range(sensors))
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S).
+        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S).
 
         Under the model it is the estimator's; otherwise the beliefs of the mixture are smoothed, from that of
-        the last turn under all but the model.
+        the last step under all but the model.
         """
         own = self._inner.smoothed(carried)
         if not carried:
             return own
         with np.errstate(divide="ignore"):
-            rows = np.log([turn.arrays[_PREFIX + "belief"] for turn in carried])
+            rows = np.log([step.arrays[_PREFIX + "belief"] for step in carried])
             rows[-1] = np.log(carried[-1].arrays[_PREFIX + "rivals"])
-        others = smooth(self.model, [turn.control_index for turn in carried], rows)
+        others = smooth(self.model, [step.control_index for step in carried], rows)
         right = float(carried[-1].arrays[_PREFIX + "right"][0])
         return np.asarray(right * own + (1.0 - right) * others)
 
-    def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
-        """Advance the belief to turn t and correct it by an observation, see `Estimator.turn`."""
+    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+        """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         seen, told = self._sensor_model.apart(observation)
         absurd = (seen < self._low[control_index]) | (seen > self._high[control_index])
         used = np.where(absurd, np.nan, seen)
         given = np.append(used, observation[len(used) :])
-        estimate = self._inner.turn(before, given, control_index, turn)
+        estimate = self._inner.step(before, given, control_index, step)
         followed = before is not None and before.arrays.get(_PREFIX + "model_key") == self._key
         if before is not None and followed:
             own, shares = self._advanced(before, control_index)
         else:
             own, shares = self._start(estimate.forecast), self._first_shares(control_index)
         self._assimilate(own, shares, used, told, control_index)
-        notices = self._left_out(own["left_out"] > 0.0, absurd, seen, control_index, turn)
+        notices = self._left_out(own["left_out"] > 0.0, absurd, seen, control_index, step)
         # A gauge that is left out stays so while it is silent.
         own["left_out"] = (absurd | ((own["left_out"] > 0.0) & np.isnan(seen))).astype(np.float64)
         suspicion = self._suspicion(own, shares)
-        notices += self._alarms(own, suspicion, turn)
+        notices += self._alarms(own, suspicion, step)
         believed = shares, estimate.filtered, own["mended"], own["gauge"]
         found = rivals.hypotheses(*believed, self._names)
-        notices += self._leading(own, found, turn)
+        notices += self._leading(own, found, step)
         own["belief"], own["rivals"], right = rivals.beliefs_of(*believed)
         own["right"] = np.array([right])
         own |= {"share": shares.current, "hidden": shares.hidden, "shows": shares.shows}
@@ -161,14 +161,19 @@ class WatchfulEstimator:
             hypotheses=found,
         )
 
-    def _leading(self, own: Arrays, found: Sequence[Hypothesis], turn: int) -> list[Notice]:
+    def _leading(self, own: Arrays, found: Sequence[Hypothesis], step: int) -> list[Notice]:
         """Return the notice that belief and decision follow another hypothesis than before, if it is so."""
         first = max(found, key=lambda one: one.probability)
         number = 0 if first is found[0] else -1 if first.belief is None else self._names.index(first.name) + 1
         if first.probability <= 0.5 or number == own["leading"][0]:
             return []
         own["leading"][0] = number
-        told = {"words": self._words, "step": self._words.step.capitalize(), "turn": turn, "first": first}
+        told = {
+            "words": self._words,
+            "step_word": self._words.step.capitalize(),
+            "step": step,
+            "first": first,
+        }
         sentence = said("learning.follows" if number else "learning.explained", **told)
         if number > 0:
             sentence = f"{sentence} {_OR_THE_ASSET[0].upper()}{_OR_THE_ASSET[1:]}: these data cannot tell."
@@ -197,7 +202,7 @@ class WatchfulEstimator:
             "gauge_sums": np.zeros((sensors, gains, 2)),
             "none_statistics": np.tile([_FREE, 0.0, 0.0, 0.0, 0.0], (sensors, 1)),
             "count": np.zeros(sensors),
-            "turns": np.zeros(1),
+            "steps": np.zeros(1),
             "alarmed": np.zeros(2),
             "left_out": np.zeros(sensors),
         }
@@ -208,14 +213,14 @@ class WatchfulEstimator:
         return Shares.at_first(begun, self._begins, control_index, len(self._value))
 
     def _advanced(self, before: Carried, control_index: int) -> tuple[Arrays, Shares]:
-        """Return what was carried, one transition later, with the rivals that begin in this turn.
+        """Return what was carried, one transition later, with the rivals that begin in this step.
 
         Parameters
         ----------
         before : Carried
-            Of the turn before.
+            Of the step before.
         control_index : int
-            Control in force in this turn.
+            Control in force in this step.
         """
         own = self._unpacked(before.arrays)
         shares = Shares(own["share"], own["hidden"], own["shows"])
@@ -223,25 +228,25 @@ class WatchfulEstimator:
             rows = own[name].reshape(-1, self._shape[-1])
             held = rows.any(axis=1)
             rows[held] = self.model.transition.forward(before.control_index, rows[held])
-        turn = float(own["turns"][0])
-        inflow = np.log(self._to_begin(turn - 1.0) - self._to_begin(turn))
+        step = float(own["steps"][0])
+        inflow = np.log(self._to_begin(step - 1.0) - self._to_begin(step))
         gauges = own["gauge"].reshape(-1, *self._shape[2:])
         weight, onset = own["log_gauge"].reshape(-1), own["gauge_onset"].reshape(-1)
-        keep = rivals.mix_onset(own["model"], gauges, weight, inflow - np.log(self._shape[1]), turn, onset)
+        keep = rivals.mix_onset(own["model"], gauges, weight, inflow - np.log(self._shape[1]), step, onset)
         keep = keep.reshape(self._shape[:2])
-        fading = np.exp(-1.0 / self._settings.memory_turns)
+        fading = np.exp(-1.0 / self._settings.memory_steps)
         own["gauge_sums"] *= fading * keep[..., None]
         own["gauge_squares"] = keep * own["gauge_squares"] + (1.0 - keep) * own["model_squares"][:, None]
-        kept = rivals.mix_onset(own["model"], own["none"], own["log_none"], inflow, turn, own["none_onset"])
+        kept = rivals.mix_onset(own["model"], own["none"], own["log_none"], inflow, step, own["none_onset"])
         statistics, fresh = own["none_statistics"], 1.0 - kept[0]
         statistics[:, 0] += fresh * (_FREE - statistics[:, 0])
         statistics[:, [1, 4]] += fresh * (own["model_squares"][:, None] - statistics[:, [1, 4]])
         statistics[:, 2:4] *= fading * kept[0]
-        self._switch(own, shares, inflow, turn, (before.control_index, control_index))
+        self._switch(own, shares, inflow, step, (before.control_index, control_index))
         return own, shares
 
     def _switch(
-        self, own: Arrays, shares: Shares, inflow: float, turn: float, controls: tuple[int, int]
+        self, own: Arrays, shares: Shares, inflow: float, step: float, controls: tuple[int, int]
     ) -> None:
         """Let faults begin, end and be hidden.
 
@@ -252,16 +257,16 @@ class WatchfulEstimator:
         own : dict of str to array
             What is carried.
         shares : Shares
-            Of the turn before; brought up to date.
+            Of the step before; brought up to date.
         inflow : float
-            Log prior share of the faults that begin in the turn.
-        turn : float
-            Turns since the start of this model.
+            Log prior share of the faults that begin in the step.
+        step : float
+            Steps since the start of this model.
         controls : tuple of int
-            Control of the turn before, and of this turn.
+            Control of the step before, and of this step.
         """
         twice = 2.0 * self._settings.prior
-        hazard = np.log(twice) + inflow - np.log1p(twice * (self._to_begin(turn - 1.0) - 1.0))
+        hazard = np.log(twice) + inflow - np.log1p(twice * (self._to_begin(step - 1.0) - 1.0))
         gone = np.zeros_like(shares.hidden)
         if controls[0] != controls[1]:
             gone += shares.change_control(*controls)
@@ -300,9 +305,9 @@ class WatchfulEstimator:
         gauge.ravel()[own.pop("gauge_place")] = own["gauge"]
         return own | {"gauge": gauge}
 
-    def _to_begin(self, turn: float) -> float:
-        """Return the prior share of faults that begin after a turn."""
-        return (1.0 - _FROM_THE_START) / (1.0 + turn / self._settings.onset_turns)
+    def _to_begin(self, step: float) -> float:
+        """Return the prior share of faults that begin after a step."""
+        return (1.0 - _FROM_THE_START) / (1.0 + step / self._settings.onset_steps)
 
     def _assimilate(self, own: Arrays, shares: Shares, seen: Float, told: Float, control_index: int) -> None:
         """Correct all hypotheses by the sensors, and by what else is told of each state (S,)."""
@@ -340,10 +345,10 @@ class WatchfulEstimator:
         ratio[rivals.GAUGES :] = (log_gauges - log_model).ravel()
         shares.weigh(ratio)
         count += ~np.isnan(seen)
-        own["turns"] += 1.0
+        own["steps"] += 1.0
 
     def _suspicion(self, own: Arrays, shares: Shares) -> Suspicion:
-        to_begin = np.log(self._to_begin(float(own["turns"][0]) - 1.0))
+        to_begin = np.log(self._to_begin(float(own["steps"][0]) - 1.0))
         begun = np.logaddexp.reduce(own["log_gauge"], axis=1)
         log_gauge = np.logaddexp(begun, to_begin)
         none = float(own["log_none"][0])
@@ -357,11 +362,11 @@ class WatchfulEstimator:
         )
 
     def _left_out(
-        self, before: NDArray[np.bool_], absurd: NDArray[np.bool_], seen: Float, control_index: int, turn: int
+        self, before: NDArray[np.bool_], absurd: NDArray[np.bool_], seen: Float, control_index: int, step: int
     ) -> list[Notice]:
         """Return a notice for each gauge whose readings begin or cease to be absurd."""
         notices, words = [], self._words
-        when = f"{words.step.capitalize()} {turn}"
+        when = f"{words.step.capitalize()} {step}"
         for g in np.flatnonzero(absurd & ~before).tolist():
             low, high = self._low[control_index, g], self._high[control_index, g]
             values = words.value(g, seen[g], low, high)
@@ -372,8 +377,8 @@ class WatchfulEstimator:
             notices.append(Notice("gauge_back", sentence, (g + 1,), float(seen[g])))
         return notices
 
-    def _alarms(self, own: Arrays, suspicion: Suspicion, turn: int) -> list[Notice]:
-        """Return the alarms that are raised in this turn, each once.
+    def _alarms(self, own: Arrays, suspicion: Suspicion, step: int) -> list[Notice]:
+        """Return the alarms that are raised in this step, each once.
 
         What explains less than the other kind of fault waits: a gauge that is off is also seen by the gains
         of all gauges, and a region that softens by its gauges. Waiting makes false alarms rarer still.
@@ -382,7 +387,7 @@ class WatchfulEstimator:
         threshold, notices = np.log(self._settings.threshold), []
         if gauge >= max(threshold, none - _CLEARLY) and not own["alarmed"][0]:
             own["alarmed"][0] = 1.0
-            notices.append(self._gauge_alarm(own, gauge, turn))
+            notices.append(self._gauge_alarm(own, gauge, step))
         if none >= max(threshold, gauge + _CLEARLY) and not own["alarmed"][1]:
             own["alarmed"][1] = 1.0
             sums = own["none_statistics"]
@@ -390,10 +395,10 @@ class WatchfulEstimator:
             order = np.argsort(-deviations, kind="stable").tolist()
             named = [g for g in order if deviations[g] >= _NAMED_DEVIATIONS][:_MOST_NAMED] or order[:1]
             what = f"no state of the model explains all gauges together, least {self._words.sensors(named)}"
-            notices.append(self._alarm(own, turn, what, named, none, float(own["none_onset"][0])))
+            notices.append(self._alarm(own, step, what, named, none, float(own["none_onset"][0])))
         return notices
 
-    def _gauge_alarm(self, own: Arrays, log_value: float, turn: int) -> Notice:
+    def _gauge_alarm(self, own: Arrays, log_value: float, step: int) -> Notice:
         log_weight = own["log_gauge"] + self._log_prior[:, None]
         share = np.exp(log_weight - np.logaddexp.reduce(log_weight, axis=None))
         order = np.argsort(-share.sum(axis=1), kind="stable").tolist()
@@ -405,20 +410,20 @@ class WatchfulEstimator:
         else:
             what = f"{self._words.sensors(named)} shows too {'much' if sign[named[0]] > 0.0 else 'little'}"
         what = f"{what}, {_OR_THE_ASSET}"
-        return self._alarm(own, turn, what, named, log_value, onset)
+        return self._alarm(own, step, what, named, log_value, onset)
 
     def _alarm(
-        self, own: Arrays, turn: int, what: str, gauges: list[int], log_value: float, onset: float
+        self, own: Arrays, step: int, what: str, gauges: list[int], log_value: float, onset: float
     ) -> Notice:
-        """Return an alarm; its onset is counted from the first turn of this model, which may be taught."""
+        """Return an alarm; its onset is counted from the first step of this model, which may be taught."""
         odds, words = float(np.exp(min(log_value, 700.0))), self._words
-        first = round(turn + 1.0 - float(own["turns"][0]) + onset)
+        first = round(step + 1.0 - float(own["steps"][0]) + onset)
         since = f"since about {words.step} {first}" if first else "from the start"
         search = f"; to find the cause: {words.command}" if words.command else ""
-        search += f" --from-turn {first}" if search and first else ""
+        search += f" --from-step {first}" if search and first else ""
         evidence = f"{odds:,.0f}" if 1e3 <= odds < 1e6 else f"{odds:.3g}"
         sentence = said(
-            "learning.alarm", when=f"{words.step.capitalize()} {turn}", what=what, since=since,
+            "learning.alarm", when=f"{words.step.capitalize()} {step}", what=what, since=since,
             evidence=evidence, threshold=self._settings.threshold, search=search,
         )  # fmt: skip
         return Notice("alarm", sentence, tuple(g + 1 for g in gauges), odds, first)

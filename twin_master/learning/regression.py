@@ -6,7 +6,7 @@
 
 so that the predictive density is Student's (Gelman et al., Bayesian Data Analysis, 3rd ed., section 14.2).
 Its sums are exact given the path of the state; over the paths they are expected sums, under the filtered
-belief of each turn given the hypothesis.
+belief of each step given the hypothesis.
 """
 
 from dataclasses import dataclass

@@ -7,7 +7,7 @@ end:
     the model is right --> a gauge is off, or none of these --> mended --> the model is right
 
 Evidence for an alarm never fades, so that its false alarms stay bounded. What is believed has to come back
-when a fault has ended: each turn one ends with a small probability, and its share goes with its own belief
+when a fault has ended: each step one ends with a small probability, and its share goes with its own belief
 about the state to the hypothesis "mended", under which the sensors are right again. The shares of all are the
 posterior of this switching process, given the predictive density of each hypothesis; the belief of a fault
 stays that of its first beginning (compare Blom and Bar-Shalom 1988).
@@ -66,17 +66,17 @@ class OfModel(NamedTuple):
 
 
 def mix_onset(
-    model: Float, belief: Single, log_weight: Float, log_inflow: float, turn: float, onset: Float
+    model: Float, belief: Single, log_weight: Float, log_inflow: float, step: float, onset: Float
 ) -> Float:
-    """Let R rivals begin in this turn: those of before and the model's belief are mixed by their weights.
+    """Let R rivals begin in this step: those of before and the model's belief are mixed by their weights.
 
-    belief (R, E, S), log_weight and onset, the expected first turn, (R,) are brought up to date; returned is
+    belief (R, E, S), log_weight and onset, the expected first step, (R,) are brought up to date; returned is
     the share of those that began before (R,).
     """
     total = np.logaddexp(log_weight, log_inflow)
     keep = np.exp(log_weight - total)
     log_weight[:] = total
-    onset[:] = keep * onset + (1.0 - keep) * turn
+    onset[:] = keep * onset + (1.0 - keep) * step
     old = keep[:, None, None].astype(np.float32)
     belief[:] = old * belief + (1.0 - old) * model.astype(np.float32)
     return np.asarray(keep)
@@ -91,7 +91,7 @@ def weigh_model(shown: Shown, squares: Float, belief: Float, log_likelihood: Flo
     Returns
     -------
     tuple of float, (N, G)
-        The log evidence, up to a constant of the turn, and 1 + x² / (degrees + squares).
+        The log evidence, up to a constant of the step, and 1 + x² / (degrees + squares).
     """
     known = 1.0 + shown.residual**2 / (shown.degrees + squares)
     log_likelihood -= np.log(known) @ shown.power
@@ -194,7 +194,7 @@ def weigh_none(shown: Shown, model: OfModel, gain: float, belief: Single, statis
 MODEL, MENDED, NONE, GAUGES = 0, 1, 2, 3
 """Places in the log shares; from the last on the sensors and their gains. Those of faults hold what shows."""
 ENDS = 0.02
-"""Probability that a fault that shows ends in a turn, and that what is mended is as if nothing had been."""
+"""Probability that a fault that shows ends in a step, and that what is mended is as if nothing had been."""
 SHOWS_ELSEWHERE = 0.5
 """Prior probability that a fault shows under another control than that in force when it began."""
 LEAST_SHOWS = 1e-3
@@ -246,7 +246,7 @@ class Shares:
         Parameters
         ----------
         before, now : int
-            Control of the turn before, and of this turn.
+            Control of the step before, and of this step.
 
         Returns
         -------
@@ -261,19 +261,19 @@ class Shares:
         return np.asarray(np.maximum(np.exp(self.hidden) - hidden_before, 0.0))
 
     def advance(self, log_hazard: float, begins: Float) -> Float:
-        """Let faults begin and end in a turn.
+        """Let faults begin and end in a step.
 
         Parameters
         ----------
         log_hazard : float
-            Log probability that a fault begins in the turn.
+            Log probability that a fault begins in the step.
         begins : (3 + G K,)
             Log probability of each fault where one begins.
 
         Returns
         -------
         (1 + G K,)
-            Probability of each fault that it has ended in the turn.
+            Probability of each fault that it has ended in the step.
         """
         share = self.current
         ended = np.log(ENDS) + share
@@ -291,7 +291,7 @@ class Shares:
         self.current = np.logaddexp(share + stays, comes)
         self.hidden = self.hidden + np.log1p(-np.exp(log_another))
 
-        # A fault that began in this turn is not known under the other controls.
+        # A fault that began in this step is not known under the other controls.
         fresh = np.exp(begun - np.logaddexp(self.current[NONE:], self.hidden))
         self.shows += fresh[:, None] * (SHOWS_ELSEWHERE - self.shows)
         return np.asarray(np.exp(ended[NONE:]))

@@ -1,4 +1,4 @@
-"""The journal of a run or a watch, `journal.jsonl`: a line for each turn, behind the SHA-256 of it.
+"""The journal of a run or a watch, `journal.jsonl`: a line for each step, behind the SHA-256 of it.
 
 The file only grows. A line that was cut off by a kill ends without a line feed and is dropped; any other line
 that does not have its hash was changed. It is read line by line, however long it is.
@@ -21,11 +21,32 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.files import explained_write_errors, synchronise, write_error
+from reporting.former_names import with_present_names
 from reporting.json_file import plain
 from twin_master.errors import NotResumableError, said
-from twin_master.mission.turns import Happened, Reading, Turn
+from twin_master.mission.steps import Happened, MissionStep, Reading
 
 JOURNAL_NAME = "journal.jsonl"
+PRESENT_NAMES = {
+    "turn": "step",
+    "observation_turn": "observation_step",
+    "settled.turn": "step",
+    "model.from_turn": "from_step",
+    "verdict.turn": "step",
+    "verdict.from_turn": "from_step",
+    "verdict.to_turn": "to_step",
+    "intake.stream.turns": "steps",
+    "quiet.turn": "step",
+    "quiet.revised_by_turn": "revised_by_step",
+    "refused.turn": "step",
+    "refused.revised_by_turn": "revised_by_step",
+    "standing.teaching.turn": "step",
+    "standing.teaching.trial.turn": "step",
+    "standing.teaching.trial.from_turn": "from_step",
+    "standing.teaching.trial.to_turn": "to_step",
+    "standing.teaching.adopted.from_turn": "from_step",
+}
+"""The present name of each key of a journal, by the location that it had before."""
 _DIGEST = 64
 _PIECE = 1_000_000
 _ENCODER = json.JSONEncoder(sort_keys=True, allow_nan=False, separators=(", ", ": "))
@@ -46,20 +67,20 @@ def array_of(values: Any) -> Float:
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def turn_record(turn: Turn) -> dict[str, Any]:
-    """Return what a line says of a turn: what came, and the belief for viewers, who need not filter again."""
-    concluded = turn.concluded
+def step_record(step: MissionStep) -> dict[str, Any]:
+    """Return what a line says of a step: what came, and the belief for viewers, who need not filter again."""
+    concluded = step.concluded
     record: dict[str, Any] = {
-        "turn": concluded.turn,
-        "observed": plain(turn.reading.observed),
+        "step": concluded.step,
+        "observed": plain(step.reading.observed),
         "control_index": concluded.control_index,
         "next_control": concluded.next_control,
         "decision_probability": concluded.decision_probability.tolist(),
         "filtered": concluded.filtered.tolist(),
         "log_evidence": concluded.log_evidence,
     }
-    if turn.reading.happened is not None:
-        record |= plain(turn.reading.happened._asdict())
+    if step.reading.happened is not None:
+        record |= plain(step.reading.happened._asdict())
     if concluded.learnt:
         record["learnt"] = {name: vars(learnt) for name, learnt in concluded.learnt.items()}
     if concluded.notices:
@@ -70,7 +91,7 @@ def turn_record(turn: Turn) -> dict[str, Any]:
 
 
 def reading_of(record: Mapping[str, Any]) -> Reading:
-    """Return what came in a turn, from its line; raises `KeyError`, `TypeError` or `ValueError`."""
+    """Return what came in a step, from its line; raises `KeyError`, `TypeError` or `ValueError`."""
     happened = None
     if "monitors" in record:
         told = dict(zip(record["monitors"], array_of(record["monitors"].values()).tolist(), strict=True))
@@ -168,7 +189,7 @@ def check_header(path: Path, config_hash: str) -> None:
     header = line_of({"config_hash": config_hash})
     with suppress(FileNotFoundError), path.open("rb") as file:
         found = file.readline()
-        if whole_record(found) is None and not header.startswith(found):  # nor cut off by a kill
+        if whole_record(found, path) is None and not header.startswith(found):  # nor cut off by a kill
             raise damaged(path, 0, "it does not have the hash that stands before it")
         if not header.startswith(found):
             raise NotResumableError(said("mission.journal", path=path))
@@ -201,7 +222,7 @@ def records_of(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[tuple[dic
     for line in file:
         if not line.endswith(b"\n"):
             return  # cut off by a kill
-        record = whole_record(line)
+        record = whole_record(line, path)
         if record is None:
             raise damaged(path, begin, "it does not have the hash that stands before it")
         if begin:
@@ -209,12 +230,19 @@ def records_of(file: BinaryIO, path: Path, begin: int = 0) -> Iterator[tuple[dic
         begin += len(line)
 
 
-def whole_record(line: bytes) -> dict[str, Any] | None:
-    """Return the record of a line, None of a damaged one: each has a hash of its own."""
+def whole_record(line: bytes, path: Path) -> dict[str, Any] | None:
+    """Return the record of a line of the journal at `path`, or None where the line was changed.
+
+    Each line has a hash of its own. A line of an earlier version is returned with the present names.
+    """
     text = line[_DIGEST + 1 :].rstrip(b"\n")
     whole = sha256(text).hexdigest().encode("ascii") == line[:_DIGEST]
     record = json.loads(text) if whole else None
-    return record if isinstance(record, dict) else None
+    if not isinstance(record, dict):
+        return None
+    if "turn" in record:
+        return with_present_names(record, PRESENT_NAMES, str(path), NotResumableError)
+    return record
 
 
 def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict[str, Any], int, int]]:
@@ -248,23 +276,23 @@ def records_backwards(path: Path, end: int | None = None) -> Iterator[tuple[dict
             rest, lines = (first, lines) if begin else (b"", [first, *lines])
             for line in reversed(lines):
                 after -= len(line)
-                record = whole_record(line) if line.endswith(b"\n") else None
+                record = whole_record(line, path) if line.endswith(b"\n") else None
                 if record is not None:
                     yield record, after, after + len(line)
                 elif line.endswith(b"\n") or after + len(line) < size:  # else cut off by a kill
                     raise damaged(path, after, "it does not have the hash that stands before it")
 
 
-def last_turn(path: Path, limit: float = math.inf) -> tuple[int, int]:
-    """Return the last turn of a journal up to a limit, -1 for none, and where its lines end in bytes.
+def last_step(path: Path, limit: float = math.inf) -> tuple[int, int]:
+    """Return the last step of a journal up to a limit, -1 for none, and where its lines end in bytes.
 
     Raises
     ------
     NotResumableError
         A line at the end was changed or is damaged.
     """
-    lines = ((int(record.get("turn", -1)), end) for record, _, end in records_backwards(path))
-    return next(((turn, end) for turn, end in lines if turn <= limit), (-1, 0))
+    lines = ((int(record.get("step", -1)), end) for record, _, end in records_backwards(path))
+    return next(((step, end) for step, end in lines if step <= limit), (-1, 0))
 
 
 def damaged(path: Path, begin: int, why: str) -> NotResumableError:
@@ -273,7 +301,7 @@ def damaged(path: Path, begin: int, why: str) -> NotResumableError:
     with path.open("rb") as file:
         for line in file:
             number += end < begin
-            whole[end < begin] += end != begin and whole_record(line) is not None
+            whole[end < begin] += end != begin and whole_record(line, path) is not None
             end += len(line)
     found = {"line": number, "before": whole[True], "behind": whole[False]}
     return NotResumableError(said("mission.damaged", path=path, why=why, **found))

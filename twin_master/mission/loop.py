@@ -1,6 +1,6 @@
-"""The one loop: a source gives observations, the twin decides; and a mission, resumable at any turn.
+"""The one loop: a source gives observations, the twin decides; and a mission, resumable at any step.
 
-The journal of a run or a watch is read back: what was told, the twin as it was, turns to be stored.
+The journal of a run or a watch is read back: what was told, the twin as it was, steps to be stored.
 """
 
 import math
@@ -31,14 +31,14 @@ from twin_master.mission.journal import (
     records_backwards,
     state_of,
     state_text,
-    turn_record,
+    step_record,
 )
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.turns import History, Plant, Reading, Turn
+from twin_master.mission.steps import History, MissionStep, Plant, Reading
 from twin_master.network.estimator import Notice, is_state_believed
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import known_control
-from twin_master.network.twin import Twin, TwinTurn
+from twin_master.network.twin import Twin, TwinStep
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 
@@ -62,7 +62,7 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
     controls, coming = scenario.control_names, line["next_control"]
     believed = is_state_believed(line.get("suspicion", {}).get("none_of_these", 0.0))
     record = {
-        "turn": line["turn"],
+        "step": line["step"],
         "control": controls[line.get("control_in_force", line["control_index"])],
         "state_believed": believed,
         "health": {
@@ -82,7 +82,7 @@ def journalled_decision(line: Mapping[str, Any], scenario: Scenario, model: Grap
     if "suspicion" in line:
         record |= {name: line["suspicion"][name] for name in _SUSPECTED}
     if "control_in_force" in line:
-        record["revised_by_turn"] = line["observation_turn"]
+        record["revised_by_step"] = line["observation_step"]
     if "learnt" in line:
         record["learnt"] = line["learnt"]
     return record
@@ -105,14 +105,14 @@ def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
     return told
 
 
-def expected_in(turns: History, knowledge: Knowledge, name: str, belief: Float) -> tuple[Expected, Float]:
-    """Return what is expected in turns, and the probability of each control there.
+def expected_in(history: History, knowledge: Knowledge, name: str, belief: Float) -> tuple[Expected, Float]:
+    """Return what is expected in the steps of a history, and the probability of each control there.
 
     Parameters
     ----------
-    turns : History
+    history : History
     knowledge : Knowledge
-        Of the twin in these turns.
+        Of the twin in these steps.
     name : str
         `filtered`, `smoothed` or `predicted`.
     belief : (T, S), or (T, H, S) where it is predicted
@@ -120,39 +120,39 @@ def expected_in(turns: History, knowledge: Knowledge, name: str, belief: Float) 
     """
     learns, rows, more = knowledge.expectation, None, tuple[Any, ...]()
     if name == "predicted":
-        asked = knowledge.asked(turns.unexplained)
+        asked = knowledge.asked(history.unexplained)
         joint = belief[..., None] * asked[:, None]  # (T, H, S, U), eqs. (37)-(39)
-        belief, more = turns.filtered, (asked, belief.shape[1])
+        belief, more = history.filtered, (asked, belief.shape[1])
     else:
-        rows, more = turns.row, (turns.observed,)
-        joint = known_control(belief, turns.control_index, len(knowledge.model.controls))
+        rows, more = history.row, (history.observed,)
+        joint = known_control(belief, history.control_index, len(knowledge.model.controls))
     if learns is None:
         expected = expected_of(knowledge.sensor_model, knowledge.rewards, joint, rows)
     else:
-        carried = [turn.concluded.carried for turn in turns.turns]
+        carried = [step.concluded.carried for step in history.steps]
         expected = getattr(learns, name)(carried, belief, *more)
     return expected, joint.sum(axis=-2)
 
 
 def spans_of(history: History, given: "Sequence[BelievedModel]") -> list[tuple[Knowledge, slice]]:
-    """Return what a twin knew, and in which of the turns of a history, by the models that it believed."""
-    models = in_turn(given)
-    starts = [max(0, model.from_turn - history.first_turn) for model in models]
-    parts = map(slice, starts, [*starts[1:], len(history.turns)])
+    """Return what a twin knew, and in which of the steps of a history, by the models that it believed."""
+    models = successive_models(given)
+    starts = [max(0, model.from_step - history.first_step) for model in models]
+    parts = map(slice, starts, [*starts[1:], len(history.steps)])
     return [(model.knowledge, part) for model, part in zip(models, parts, strict=True)]
 
 
-def gap_of(history: History, from_turn: int, models: "Sequence[BelievedModel]") -> dict[str, Any]:
-    """Return root mean square residual and log evidence of the turns from one on; None without any.
+def gap_of(history: History, from_step: int, models: "Sequence[BelievedModel]") -> dict[str, Any]:
+    """Return root mean square residual and log evidence of the steps from one on; None without any.
 
     The residuals are in standard deviations of the noise that is assumed, or learnt where the twin learns.
     """
-    left = history.behind(from_turn - history.first_turn)
-    if not left.turns or np.isnan(left.observed).all():
+    left = history.behind(from_step - history.first_step)
+    if not left.steps or np.isnan(left.observed).all():
         return {"rms_residual": None, "log_evidence": None}
-    parts = [(known, replace(left, turns=left.turns[part])) for known, part in spans_of(left, models)]
+    parts = [(known, replace(left, steps=left.steps[part])) for known, part in spans_of(left, models)]
     expected = joined(
-        expected_in(own, known, "filtered", own.filtered)[0] for known, own in parts if own.turns
+        expected_in(own, known, "filtered", own.filtered)[0] for known, own in parts if own.steps
     )
     residual = (left.observed - expected.mean) / expected.noise
     return {
@@ -163,28 +163,28 @@ def gap_of(history: History, from_turn: int, models: "Sequence[BelievedModel]") 
 
 @dataclass(frozen=True)
 class BelievedModel:
-    """What the twin believes from a turn on.
+    """What the twin believes from a step on.
 
     Attributes
     ----------
-    from_turn : int
-        The first turn that is filtered with it.
+    from_step : int
+        The first step that is filtered with it.
     knowledge : Knowledge
         Its predicted observations.
     patch : Path or None
         Of the model, where it has one.
     """
 
-    from_turn: int
+    from_step: int
     knowledge: Knowledge
     patch: Path | None = None
 
 
 def replay(
-    path: Path, models: Sequence[BelievedModel], lag: int | None, *, first_turn: int | None = None,
+    path: Path, models: Sequence[BelievedModel], lag: int | None, *, first_step: int | None = None,
     end: int | None = None, question: BelievedModel | None = None,
 ) -> tuple[History, dict[str, Any]]:  # fmt: skip
-    """Filter the turns of a journal again, what came late in its place.
+    """Filter the steps of a journal again, what came late in its place.
 
     The journal is read from its end to the last state of the twin that lies before what is wanted.
 
@@ -196,17 +196,17 @@ def replay(
         The model of the beginning, and those that were adopted later.
     lag : int or None
         Of the twin.
-    first_turn : int, optional
-        The first turn whose belief is wanted; if left out the twin alone, from the last state.
+    first_step : int, optional
+        The first step whose belief is wanted; if left out the twin alone, from the last state.
     end : int, optional
         Bytes of the journal that are read; all of it if left out.
     question : BelievedModel, optional
-        What would be believed with one model more, from its turn on.
+        What would be believed with one model more, from its step on.
 
     Returns
     -------
     History
-        The turns behind that state, with the twin behind the last one.
+        The steps behind that state, with the twin behind the last one.
     dict
         The last line; empty where there is none.
 
@@ -215,55 +215,55 @@ def replay(
     NotResumableError
         The journal was changed or is damaged, or decided otherwise.
     """
-    wanted = [] if first_turn is None else [first_turn]
-    wanted += [] if question is None else [question.from_turn]
+    wanted = [] if first_step is None else [first_step]
+    wanted += [] if question is None else [question.from_step]
     seen: dict[int, Reading] = {}
-    decided, stands = dict[int, int](), math.inf  # decisions from some turn on were revised by later lines
+    decided, stands = dict[int, int](), math.inf  # decisions from some step on were revised by later lines
     settled, last = (-1, b""), dict[str, Any]()
-    behind, place = -1, 0  # the turn of the line behind, and where it begins
+    behind, place = -1, 0  # the step of the line behind, and where it begins
     for record, begin, _ in records_backwards(path, end):
         try:
-            turn = int(record["turn"]) if begin else -1
-            if last and behind - turn not in (0, 1):
-                raise damaged(path, place if turn < behind else begin, f"turn {behind} is out of place")
-            if not begin or turn <= settled[0]:
+            step = int(record["step"]) if begin else -1
+            if last and behind - step not in (0, 1):
+                raise damaged(path, place if step < behind else begin, f"step {behind} is out of place")
+            if not begin or step <= settled[0]:
                 break
-            last, behind, place = last or record, turn, begin
+            last, behind, place = last or record, step, begin
             if settled[0] < 0 and "settled" in record:
-                kept, state = int(record["settled"]["turn"]), record["settled"]["state"]
+                kept, state = int(record["settled"]["step"]), record["settled"]["state"]
                 # Only one before what is wanted, and before all models that are adopted behind it.
                 if all(kept < other for other in wanted):
                     settled = kept, state_of(state)
-            if turn < stands:
-                decided.setdefault(turn, record["next_control"])
+            if step < stands:
+                decided.setdefault(step, record["next_control"])
             if "model" in record:
-                stands = min(stands, int(record["model"]["from_turn"]))
-                wanted.append(int(record["model"]["from_turn"]))
+                stands = min(stands, int(record["model"]["from_step"]))
+                wanted.append(int(record["model"]["from_step"]))
             elif "observed" in record:
-                observed = int(record.get("observation_turn", turn))
+                observed = int(record.get("observation_step", step))
                 stands = min(stands, observed)
                 seen.setdefault(observed, reading_of(record))
         except (KeyError, TypeError, ValueError, AttributeError, zlib.error) as error:
             raise damaged(path, begin, f"it has another layout, {error}") from error
     found = filtered_again(seen, [*models, *([question] if question else [])], lag, settled)
-    for again in found.turns if question is None else ():
-        number, control = again.concluded.turn, again.concluded.next_control
+    for again in found.steps if question is None else ():
+        number, control = again.concluded.step, again.concluded.next_control
         if decided.get(number, control) != control:
             other = f"begin another watch, in another folder, with `--observations {path.parent}`"
             advice = other if "intake" in last else "fly the mission again with --replace"
-            raise NotResumableError(said("mission.decided", turn=number, advice=advice))
+            raise NotResumableError(said("mission.decided", step=number, advice=advice))
     return found, last
 
 
-def in_turn(given: Sequence[BelievedModel]) -> list[BelievedModel]:
+def successive_models(given: Sequence[BelievedModel]) -> list[BelievedModel]:
     """Return the models that are believed one after the other.
 
-    One that was adopted from an earlier turn on than one before it takes its place altogether.
+    One that was adopted from an earlier step on than one before it takes its place altogether.
     """
     return [
         model
         for index, model in enumerate(given)
-        if all(later.from_turn > model.from_turn for later in given[index + 1 :])
+        if all(later.from_step > model.from_step for later in given[index + 1 :])
     ]
 
 
@@ -271,23 +271,23 @@ def filtered_again(
     seen: Mapping[int, Reading], given: Sequence[BelievedModel], lag: int | None = None,
     settled: tuple[int, bytes] = (-1, b""),
 ) -> History:  # fmt: skip
-    """Return the turns that a twin filters of what was seen in each, from a settled state on."""
-    models = in_turn(given)
+    """Return the steps that a twin filters of what was seen in each, from a settled state on."""
+    models = successive_models(given)
     at = max(
-        index for index, model in enumerate(models) if not index or model.from_turn <= max(settled[0], 0)
+        index for index, model in enumerate(models) if not index or model.from_step <= max(settled[0], 0)
     )
     twin = models[at].knowledge.twin(lag=lag)
     if settled[1]:
         twin.restore_state(settled[1])
     found = History(twin, models[at].knowledge.scenario.observation.count)
-    while twin.turns in seen:
-        if at + 1 < len(models) and models[at + 1].from_turn <= twin.turns:
+    while twin.steps in seen:
+        if at + 1 < len(models) and models[at + 1].from_step <= twin.steps:
             at += 1
             state, twin = twin.save_state(), models[at].knowledge.twin(lag=lag)
             twin.restore_state(state)
             found.twin = twin
-        reading = seen[twin.turns]
-        found.add(Turn(reading, twin.turn(reading.observed, reading.control)))
+        reading = seen[twin.steps]
+        found.add(MissionStep(reading, twin.step(reading.observed, reading.control)))
     return found
 
 
@@ -301,16 +301,16 @@ class Source(Protocol):
         """Return what is assimilated in the place of one that no state allows, or that has no weight."""
 
 
-def operate(twin: Twin, source: Source, *sinks: Callable[[Turn], None]) -> Iterator[Turn]:
-    """Let a twin assimilate and decide until its source ends; each turn is kept before it is given.
+def operate(twin: Twin, source: Source, *sinks: Callable[[MissionStep], None]) -> Iterator[MissionStep]:
+    """Let a twin assimilate and decide until its source ends; each step is kept before it is given.
 
     Parameters
     ----------
     twin : Twin
     source : Source
-        Asked for the next observation when the turn before it was taken in.
+        Asked for the next observation when the step before it was taken in.
     *sinks : callable
-        Told each turn, one after the other: a journal, a history.
+        Told each step, one after the other: a journal, a history.
     """
     while True:
         begin = time.perf_counter()
@@ -324,24 +324,24 @@ def operate(twin: Twin, source: Source, *sinks: Callable[[Turn], None]) -> Itera
             reading = source.impossible(reading, error)
             concluded = _assimilated(twin, reading)
         decided = time.perf_counter()
-        turn = Turn(reading, concluded)
+        step = MissionStep(reading, concluded)
         for sink in sinks:
-            sink(turn)
+            sink(step)
         kept = time.perf_counter()
-        yield replace(turn, seconds=(received - begin, decided - received, kept - decided))
+        yield replace(step, seconds=(received - begin, decided - received, kept - decided))
 
 
-def _assimilated(twin: Twin, reading: Reading) -> TwinTurn:
+def _assimilated(twin: Twin, reading: Reading) -> TwinStep:
     if reading.revises is not None:
         return twin.revise(reading.revises, reading.observed, reading.control)
-    return twin.turn(reading.observed, reading.control)
+    return twin.step(reading.observed, reading.control)
 
 
 def fly(
     scenario: Scenario,
     twin: Twin,
     plant: Plant,
-    *sinks: Callable[[Turn], None],
+    *sinks: Callable[[MissionStep], None],
     history: History | None = None,
     progress: Progress | None = None,
 ) -> History:
@@ -356,7 +356,7 @@ def fly(
     *sinks : callable
         As of `operate`.
     history : History, optional
-        Takes in the turns; what it has is there also where an error ends the flight.
+        Takes in the steps; what it has is there also where an error ends the flight.
     progress : Progress, optional
 
     Raises
@@ -365,38 +365,38 @@ def fly(
         The mission cannot be flown on.
     """
     history = history or History(twin, scenario.observation.count)
-    history.resumed_at = twin.turns
+    history.resumed_at = twin.steps
     unit = f"{scenario.mission.step_name}s"
     with (progress or SilentProgress()).stage("Flying", total=scenario.mission.steps, unit=unit) as stage:
-        stage.advance(twin.turns)
-        for turn in operate(twin, plant, *sinks):
-            history.add(turn)
-            stage.advance(detail=scenario.control_names[turn.concluded.control_index])
+        stage.advance(twin.steps)
+        for step in operate(twin, plant, *sinks):
+            history.add(step)
+            stage.advance(detail=scenario.control_names[step.concluded.control_index])
     if plant.ended:
-        history.ended = ended_sentence(scenario, twin.turns, plant.ended)
-        history.notices.append((twin.turns - 1, Notice("ended", history.ended)))
+        history.ended = ended_sentence(scenario, twin.steps, plant.ended)
+        history.notices.append((twin.steps - 1, Notice("ended", history.ended)))
     return history
 
 
-def ended_sentence(scenario: Scenario, turns: int, how: str) -> str:
-    """Return that an asset has ended its simulation after some turns of a mission."""
+def ended_sentence(scenario: Scenario, steps_flown: int, how: str) -> str:
+    """Return that an asset has ended its simulation after some steps of a mission."""
     steps, unit = scenario.mission.steps, scenario.mission.step_name
-    return f"The asset ended the mission after {turns} of {steps} {unit}s: {how}"
+    return f"The asset ended the mission after {steps_flown} of {steps} {unit}s: {how}"
 
 
 STATE_ALLOWANCE = 64_000_000
 STATE_SHARE = 4_000
-"""Bytes of asset states that a checkpoint may hold, and how many more for each turn.
+"""Bytes of asset states that a checkpoint may hold, and how many more for each step.
 
-States that need more are kept less often, so that the file grows with the turns and not with their square
-(an asset that is replayed keeps the inputs of all its steps); the turns after the last one are flown again.
+States that need more are kept less often, so that the file grows with the steps and not with their square
+(an asset that is replayed keeps the inputs of all its steps); the steps after the last one are flown again.
 """
 
 
 def taken_up(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> History:
     """Return what an earlier process flew, with plant and journal where it stopped.
 
-    Turns behind the last saved state of the asset are flown again.
+    Steps behind the last saved state of the asset are flown again.
 
     Raises
     ------
@@ -409,7 +409,7 @@ def taken_up(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> Histor
             state = record.get("asset_state", "")
             break
     history, _ = replay(journal.path, [BelievedModel(0, knowledge)], None)
-    if history.turns:
+    if history.steps:
         try:
             plant.restore(history, state_of(state))
         except (TypeError, ValueError, zlib.error) as error:
@@ -417,20 +417,20 @@ def taken_up(journal: JournalFile, knowledge: Knowledge, plant: Plant) -> Histor
     return history
 
 
-def kept_in(journal: JournalFile, plant: Plant) -> Callable[[Turn], None]:
-    """Return a sink that writes turns into a journal, with the state of the asset as often as it may.
+def kept_in(journal: JournalFile, plant: Plant) -> Callable[[MissionStep], None]:
+    """Return a sink that writes steps into a journal, with the state of the asset as often as it may.
 
     What a kill cuts off, or has no state of the asset behind it, is flown again to the same bits.
     """
     since = 0
 
-    def keep(turn: Turn) -> None:
+    def keep(step: MissionStep) -> None:
         nonlocal since
         since += 1
         state: str | None = state_text(plant.save_state())
         if journal.size + len(state or "") > STATE_ALLOWANCE and len(state or "") > STATE_SHARE * since:
             state = None
-        journal.append(turn_record(turn) | {"asset_state": state})
+        journal.append(step_record(step) | {"asset_state": state})
         since *= state is None
 
     return keep

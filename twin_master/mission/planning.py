@@ -26,15 +26,15 @@ from twin_master.seeds import generator
 MISSIONS = 400
 """That are simulated for each rule."""
 PERIODS = (2, 3, 5, 8, 12, 20)
-"""Turns between two inspections of the rules that inspect by the clock."""
+"""Steps between two inspections of the rules that inspect by the clock."""
 _GAP, _PRICED_GAP = 0.005, 0.06
 """Between the bounds of a plan, as a share of the return, and of those that are tried for a limit."""
 _HARDEST, _HALVINGS = 2.0**12, 4
-"""The largest price of a turn beyond the limit, in rewards, and how often the interval of it is halved."""
+"""The largest price of a step beyond the limit, in rewards, and how often the interval of it is halved."""
 
 
 def discounts(scenario: Scenario) -> Float:
-    """Return the discount behind a turn under each control (U,): zero where it ends the mission."""
+    """Return the discount behind a step under each control (U,): zero where it ends the mission."""
     ends = [scenario.ends(index) for index in range(len(scenario.control))]
     return np.where(ends, 0.0, scenario.planner.gamma)
 
@@ -42,10 +42,10 @@ def discounts(scenario: Scenario) -> Float:
 def expected_plan(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel
 ) -> tuple[BeliefPlan, float]:
-    """Return the plan on the belief, and the price of a turn beyond a health limit that it is made with.
+    """Return the plan on the belief, and the price of a step beyond a health limit that it is made with.
 
     Without `planner.limit_probability` there is no price. With it the price is the least, of some that are
-    tried, under which the share of such turns stays below: a constraint on the mean by a multiplier, Altman
+    tried, under which the share of such steps stays below: a constraint on the mean by a multiplier, Altman
     1999.
 
     Raises
@@ -90,7 +90,7 @@ def _risk(rewards: RewardModel) -> Float:
 def risk_of(
     scenario: Scenario, problem: DecisionProblem, rewards: RewardModel, policy: BeliefPolicy
 ) -> float:
-    """Return the share of turns, discounted, beyond a health limit under a policy, in simulated missions."""
+    """Return the share of steps, discounted, beyond a health limit under a policy, in simulated missions."""
     shares = [
         promised(scenario, replace(problem, reward=reward), policy).mean
         for reward in (_risk(rewards), np.ones_like(problem.reward))
@@ -176,8 +176,8 @@ def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPoli
     known = value_iteration(problem.transition, problem.reward, problem.discount)
 
     def by_the_clock(every: int) -> Decide:
-        def rule(belief: Float, _filtered: Float, turn: int) -> Index:
-            if turn % every == 0:
+        def rule(belief: Float, _filtered: Float, step: int) -> Index:
+            if step % every == 0:
                 return np.full(len(belief), scenario.readings[0][0])
             return np.asarray(np.argmax(belief @ known.action_value, axis=1))
 
@@ -185,7 +185,7 @@ def compared(scenario: Scenario, problem: DecisionProblem) -> tuple[ComparedPoli
 
     ahead = scenario.planner.decide_on == "predicted"
     rules: dict[str, Decide] = {
-        "mode of the policy by states": lambda belief, filtered, _turn: np.argmax(
+        "mode of the policy by states": lambda belief, filtered, _step: np.argmax(
             (belief if ahead else filtered) @ known.policy, axis=1
         ),
         "QMDP": lambda belief, *_: np.argmax(belief @ known.action_value, axis=1),
@@ -200,7 +200,7 @@ def _simulated(scenario: Scenario, problem: DecisionProblem, rule: Decide) -> Fl
     first = scenario.control_names.index(scenario.mission.first_control)
     return simulated_returns(
         problem,
-        lambda belief, now, turn: rule(belief, now, turn) if turn else np.full(len(belief), first),
+        lambda belief, now, step: rule(belief, now, step) if step else np.full(len(belief), first),
         MISSIONS,
         scenario.mission.steps,
         generator(scenario.mission.seed, "damage"),

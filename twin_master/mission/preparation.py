@@ -26,7 +26,7 @@ from twin_master.learning.expectation import LearntExpectation
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.planning import discounts, expected_plan
-from twin_master.mission.turns import Plant, Truth
+from twin_master.mission.steps import Plant, Truth
 from twin_master.network.belief_planning import DecisionProblem
 from twin_master.network.estimator import Estimator, ExactFilter, Words
 from twin_master.network.graphical_model import GraphicalModel
@@ -195,7 +195,7 @@ class Knowledge:
         policy : (S, U) or callable, optional
             p(U | D), row-stochastic, or a planner; that of the plan if left out.
         lag : int or None
-            How many turns back it smooths and may be revised; None keeps all, as a mission of a known length
+            How many steps back it smooths and may be revised; None keeps all, as a mission of a known length
             wants.
         estimator : Estimator, optional
             What holds the belief in the place of the exact filter, or of what learns and gives notice where
@@ -228,7 +228,7 @@ class Knowledge:
         return int(np.argmax(self.rewards.planning_reward(1.0, 0.0).mean(axis=0)))
 
     def asked(self, unexplained: ArrayLike) -> Float:
-        """Return p(U | D) of turns to come (..., S, U), the safest so far as no state is believed (...)."""
+        """Return p(U | D) of steps to come (..., S, U), the safest so far as no state is believed (...)."""
         share = np.asarray(unexplained, dtype=np.float64)[..., None, None]
         safest = np.eye(len(self.model.controls))[self.safest]
         return np.asarray((1.0 - share) * self.plan.policy + share * safest)

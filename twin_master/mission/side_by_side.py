@@ -18,7 +18,7 @@ from twin_master.assets.asset_source import Asset, StatelessAsset
 from twin_master.errors import ImpossibleObservation, TwinMasterError
 from twin_master.mission.loop import ended_sentence, fly
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.turns import History, Truth, checked_values, decided_to_end
+from twin_master.mission.steps import History, Truth, checked_values, decided_to_end
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import filter_many
 from twin_master.network.planner import decision, rationed
@@ -36,7 +36,7 @@ class Flights:
     row : (B, T, G + I)
         What came, as in `History`, SI; NaN where nothing did.
     control_index : (B, T)
-        Control in force in each turn.
+        Control in force in each step.
     state : (B, T, F)
         True state, SI; NaN of a real asset.
     filtered : (B, T, S)
@@ -50,7 +50,7 @@ class Flights:
     ended : list of str
         How the asset of each twin has ended its simulation before that, with what was flown; mostly empty.
     notices : list of list
-        What each twin told its operator, each notice with its turn.
+        What each twin told its operator, each notice with its step.
     """
 
     row: Float
@@ -65,7 +65,7 @@ class Flights:
 
     @classmethod
     def empty(cls, knowledge: Knowledge, count: int) -> "Flights":
-        """Return B missions before their first turn."""
+        """Return B missions before their first step."""
         steps, size = knowledge.scenario.mission.steps, knowledge.model.states.size
         width, factors = knowledge.scenario.row_width, len(knowledge.scenario.state)
         return cls(
@@ -81,11 +81,11 @@ class Flights:
         )
 
     def put(self, twin: int, history: History) -> None:
-        """Take in the turns of a twin."""
-        turns = len(history.turns)
-        names = ["row", "control_index", "filtered", "log_evidence", "unexplained"] if turns else []
+        """Take in the steps of a twin."""
+        steps_flown = len(history.steps)
+        names = ["row", "control_index", "filtered", "log_evidence", "unexplained"] if steps_flown else []
         for name in names + ["state"] * history.simulated:
-            getattr(self, name)[twin, :turns] = getattr(history, name)
+            getattr(self, name)[twin, :steps_flown] = getattr(history, name)
         self.ended[twin], self.notices[twin] = history.ended, history.notices
 
 
@@ -102,7 +102,7 @@ class _Stateless:
         self._before: tuple[Index | None, Index | None] = None, None
         self._seen: dict[tuple[int, int, bytes], Float | str] = {}
 
-    def turn(
+    def fly_step(
         self, step: int, control: Index, flying: NDArray[np.bool_], failure: list[str]
     ) -> tuple[Float, Float]:
         """Return what is observed (B, G + I) and the true states (B, F), under the controls (B,).
@@ -165,7 +165,7 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
     control = np.full(count, scenario.control_names.index(scenario.mission.first_control))
     flying = np.ones(count, dtype=bool)
     ending = np.array([scenario.ends(index) for index in range(len(scenario.control))])
-    budget, on_belief = scenario.planner.inspections_a_turn, knowledge.plan.on_belief
+    budget, on_belief = scenario.planner.inspections_per_step, knowledge.plan.on_belief
     inspecting = sorted({place for place, *_ in scenario.readings})
     before: tuple[Float, Index] = model.log_prior, np.array(-1)
     for step in range(scenario.mission.steps):
@@ -174,7 +174,7 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
                 how = decided_to_end(scenario, before[1][twin])
                 flights.ended[twin] = ended_sentence(scenario, step, how)
                 flying[twin] = False
-        observed, state = plants.turn(step, control, flying, flights.failure)
+        observed, state = plants.fly_step(step, control, flying, flights.failure)
         flying &= np.array(flights.failure) == ""
         observed[~flying] = np.nan
         likelihood = knowledge.sensor_model.log_likelihood_sequence(observed, control)
@@ -213,7 +213,9 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
 def fly_one_by_one(
     knowledge: Knowledge, truths: Sequence[Truth], asset_of: Callable[[int, bool], Asset]
 ) -> Flights:
-    """Fly B missions in turn with `fly`: for assets with a memory, and twins that learn or give notice.
+    """Fly B missions one after the other with `fly`.
+
+    Assets with a memory need it, and twins that learn or give notice.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from twin_master.network.transition import TransitionModel
 _STEP = 1e-12
 """What a bound improves by at least."""
 _DEEPEST = 1000
-"""Turns that a descent looks ahead at most."""
+"""Steps that a descent looks ahead at most."""
 MOST_BELIEFS, MOST_UNSETTLED = 180, 1000
 """Beliefs to improve the bounds at, where the gap stays wider than asked for; where they cannot settle."""
 _SHARE = 0.9
@@ -43,22 +43,22 @@ _PASSES, _SWEEPS, _RAISED = 6, 15, 3
 class DecisionProblem:
     """What is decided on: a partially observed Markov decision problem of finite size.
 
-    In a turn the state is observed under the control, and then moves; or it moves and is observed then.
+    In a step the state is observed under the control, and then moves; or it moves and is observed then.
 
     Attributes
     ----------
     transition : TransitionModel
         Of U controls and S states.
     reward : (S, U)
-        Of one turn.
+        Of one step.
     discount : (U,)
-        In [0, 1): what the return behind a turn counts; zero where nothing comes behind it.
+        In [0, 1): what the return behind a step counts; zero where nothing comes behind it.
     likelihood : tuple of (K, S), dimensionless
         For each control p(observation | state): columns sum to one; K may differ from control to control.
     prior : (S,)
-        Belief before the first turn.
+        Belief before the first step.
     moves_first : bool
-        Whether what is observed in a turn is of the state that it leads to.
+        Whether what is observed in a step is of the state that it leads to.
     """
 
     transition: TransitionModel
@@ -80,7 +80,7 @@ class DecisionProblem:
         return self.transition.forward(control, likelihood * belief)
 
     def behind(self, control: int, chosen: Index, vectors: Float) -> Float:
-        """Return the mean of vectors (N, S), one chosen for each observation (K,), behind a turn: (S,)."""
+        """Return the mean of vectors (N, S), one chosen for each observation (K,), behind a step: (S,)."""
         likelihood, expected = self.likelihood[control], self.transition.expected
         if self.moves_first:
             return expected(control, np.einsum("ks,ks->s", likelihood, vectors[chosen]))
@@ -322,7 +322,7 @@ def plan_on_belief(
     ----------
     problem : DecisionProblem
     first : int, optional
-        Control of the first turn, where that is not decided on.
+        Control of the first step, where that is not decided on.
     gap : float
         Between the bounds at the end, as a share of the return.
     most_beliefs : int, optional
@@ -362,27 +362,27 @@ def _policy(bounds: _Bounds, beliefs: Float) -> BeliefPolicy:
 
 
 Decide = Callable[[Float, Float, int], Index]
-"""Returns the controls (B,) of a turn for the beliefs (B, S) of its states and of those of the turn before,
+"""Returns the controls (B,) of a step for the beliefs (B, S) of its states and of those of the step before,
 given all observations up to that one, and for its number from 0."""
 
 
 def simulated_returns(
-    problem: DecisionProblem, decide: Decide, missions: int, turns: int, generator: np.random.Generator
+    problem: DecisionProblem, decide: Decide, missions: int, steps: int, generator: np.random.Generator
 ) -> Float:
     """Return the discounted returns of missions whose beliefs are exact: (B,).
 
-    A turn counts what is expected of it under the belief, which has the mean of what is drawn and varies
+    A step counts what is expected of it under the belief, which has the mean of what is drawn and varies
     less. Missions of the same number share what chance brings, whatever is decided and of whatever problem of
     the same states, as long as the generator is the same: returns of two policies differ by less than either
     varies.
     """
-    chance = generator.random((turns + 1, 2, missions))
-    states = _drawn(np.tile(problem.prior, (missions, 1)), chance[turns, 0])
+    chance = generator.random((steps + 1, 2, missions))
+    states = _drawn(np.tile(problem.prior, (missions, 1)), chance[steps, 0])
     belief = np.tile(problem.prior, (missions, 1))
     filtered = belief.copy()
     total, weight = np.zeros(missions), np.ones(missions)
-    for turn in range(turns):
-        control = decide(belief, filtered, turn)
+    for step in range(steps):
+        control = decide(belief, filtered, step)
         total += weight * np.einsum("bs,sb->b", belief, problem.reward[:, control])
         weight *= problem.discount[control]
         for chosen in np.unique(control).tolist():
@@ -391,9 +391,9 @@ def simulated_returns(
             before = states[rows]
             different, place = np.unique(before, return_inverse=True)
             moves = np.array([problem.transition.row(chosen, state) for state in different.tolist()])
-            states[rows] = _drawn(moves[place], chance[turn, 0, rows])
+            states[rows] = _drawn(moves[place], chance[step, 0, rows])
             told = likelihood[:, states[rows] if problem.moves_first else before].T
-            seen = _drawn(told, chance[turn, 1, rows])
+            seen = _drawn(told, chance[step, 1, rows])
             after = problem.following(belief[rows], chosen, seen)
             now = after if problem.moves_first else belief[rows] * likelihood[seen]
             filtered[rows] = now / now.sum(axis=1, keepdims=True)
@@ -406,10 +406,10 @@ LIVES = 200
 
 
 def leaving_probability(
-    problem: DecisionProblem, policy: BeliefPolicy, belief: Float, control: int, turns: int,
+    problem: DecisionProblem, policy: BeliefPolicy, belief: Float, control: int, steps: int,
     generator: np.random.Generator,
 ) -> Float:  # fmt: skip
-    """Return the share of lives in which a policy leaves a control within some turns: (B,).
+    """Return the share of lives in which a policy leaves a control within some steps: (B,).
 
     Parameters
     ----------
@@ -417,15 +417,15 @@ def leaving_probability(
         Whose state is observed before it moves.
     policy : BeliefPolicy
     belief : (B, S)
-        Before the first of the turns.
+        Before the first of the steps.
     control : int
         In force until it is left.
-    turns : int
+    steps : int
         In which is decided, the first one by the belief that is given.
     generator : numpy.random.Generator
         The lives of all twins share what chance brings.
     """
-    result, chance = np.empty(len(belief)), generator.random((turns - 1, LIVES))
+    result, chance = np.empty(len(belief)), generator.random((steps - 1, LIVES))
     for twin, own in enumerate(belief):
         rows = np.tile(own, (LIVES, 1))
         left = policy.decide(rows) != control

@@ -1,6 +1,6 @@
 """What holds the belief of a twin, and its notices: one protocol, the exact filter of the graphical model.
 
-An estimator has no state of its own. What it carries from turn to turn are arrays that it hands out with each
+An estimator has no state of its own. What it carries from step to step are arrays that it hands out with each
 estimate and is given back for the next: a twin that keeps them can smooth over them, go back and take in what
 came late, and be stored and continued to the last bit.
 """
@@ -41,14 +41,14 @@ class SensorModel(Protocol):
 
 @dataclass(frozen=True)
 class Carried:
-    """What an estimator carries from one turn to the next.
+    """What an estimator carries from one step to the next.
 
     Attributes
     ----------
     control_index : int
-        Control u_t in force in the turn.
+        Control u_t in force in the step.
     arrays : dict of str to array
-        All that the estimator needs of the turn, to go on and to smooth.
+        All that the estimator needs of the step, to go on and to smooth.
     """
 
     control_index: int
@@ -93,7 +93,7 @@ class Notice:
     value : float or None
         The figure that it rests on.
     since : int or None
-        The turn since about which it is so, of an alarm.
+        The step since about which it is so, of an alarm.
     """
 
     kind: str
@@ -109,10 +109,10 @@ class Notice:
 
 @dataclass(frozen=True)
 class Suspicion:
-    """How well the model explains the sensors up to a turn.
+    """How well the model explains the sensors up to a step.
 
     A log e-value is the logarithm of the evidence for a fault over that for the model; its exponential has a
-    mean of one where the model holds, at every turn.
+    mean of one where the model holds, at every step.
 
     Attributes
     ----------
@@ -144,7 +144,7 @@ class Suspicion:
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """What may hold in a turn.
+    """What may hold in a step.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Estimate:
-    """What an estimator concludes in one turn t.
+    """What an estimator concludes in one step t.
 
     Attributes
     ----------
@@ -173,11 +173,11 @@ class Estimate:
     log_evidence : float
         log p(o_t | o_0..o_{t-1}), under the model, as the forecast.
     carried : Carried
-        For the turn after.
+        For the step after.
     learnt : dict of str to Learnt
         Posterior of what is learnt, by name.
     notices : tuple of Notice
-        What the operator should know of this turn.
+        What the operator should know of this step.
     suspicion : Suspicion or None
         How well the model explains the sensors, where that is watched.
     hypotheses : tuple of Hypothesis
@@ -206,19 +206,19 @@ class Estimator(Protocol):
     def model(self) -> GraphicalModel:
         """States, controls, prior and transitions: what the twin predicts with."""
 
-    def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
-        """Advance the belief to turn t and correct it by an observation.
+    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+        """Advance the belief to step t and correct it by an observation.
 
         Parameters
         ----------
         before : Carried or None
-            Of turn t - 1; None at the first turn, which starts from the prior.
+            Of step t - 1; None at the first step, which starts from the prior.
         observation : (G,)
             SI; NaN where a sensor is lost. With all of them lost the belief is predicted through.
         control_index : int
             Control u_t in force.
-        turn : int
-            Number t of the turn, for messages.
+        step : int
+            Number t of the step, for messages.
 
         Raises
         ------
@@ -227,7 +227,7 @@ class Estimator(Protocol):
         """
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
+        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
 
 
 class ExactFilter:
@@ -247,29 +247,29 @@ class ExactFilter:
         self.model = model
         self._sensor_model, self._name = sensor_model, name
 
-    def turn(self, before: Carried | None, observation: Float, control_index: int, turn: int) -> Estimate:
-        """Advance the belief to turn t and correct it by an observation, see `Estimator.turn`."""
+    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+        """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         likelihood = self._sensor_model.log_likelihood(observation, control_index)
         followed = None if before is None else (before.arrays["log_filtered"], before.control_index)
         try:
-            step = filter_sequence(self.model, [control_index], likelihood[None], followed)[0]
+            filtering = filter_sequence(self.model, [control_index], likelihood[None], followed)[0]
         except ImpossibleObservation:
             own = getattr(self._sensor_model, "worst_residuals", None)
             worst = None if own is None else own(observation, control_index)
-            raise ImpossibleObservation(self._name, turn, worst) from None
-        carried = Carried(control_index, {"log_filtered": step.log_filtered})
-        return Estimate(step.forecast, step.filtered, float(step.log_evidence), carried)
+            raise ImpossibleObservation(self._name, step, worst) from None
+        carried = Carried(control_index, {"log_filtered": filtering.log_filtered})
+        return Estimate(filtering.forecast, filtering.filtered, float(filtering.log_evidence), carried)
 
     def smoothed(self, carried: Sequence[Carried]) -> Float:
-        """Return p(D_k | o_0..o_t) for the turns of `carried`, which end at t: (n, S)."""
+        """Return p(D_k | o_0..o_t) for the steps of `carried`, which end at t: (n, S)."""
         size = self.model.states.size
-        rows = np.array([turn.arrays["log_filtered"] for turn in carried]).reshape(-1, size)
-        return smooth(self.model, [turn.control_index for turn in carried], rows)
+        rows = np.array([step.arrays["log_filtered"] for step in carried]).reshape(-1, size)
+        return smooth(self.model, [step.control_index for step in carried], rows)
 
 
 @dataclass(frozen=True)
 class Words:
-    """How sentences speak of turns and sensors.
+    """How sentences speak of steps and sensors.
 
     Attributes
     ----------
@@ -285,7 +285,7 @@ class Words:
         What looks for the cause of an alarm; empty where nothing can.
     """
 
-    step: str = "turn"
+    step: str = "step"
     sensor: str = "gauge"
     factor: float = 1.0
     units: tuple[str, ...] = ()
@@ -294,7 +294,7 @@ class Words:
 
     @classmethod
     def of(cls, scenario: Scenario) -> "Words":
-        """Return how sentences speak of the turns and sensors of a scenario."""
+        """Return how sentences speak of the steps and sensors of a scenario."""
         observation = scenario.observation
         own = scenario.mission.step_name, observation.word, *observation.printed, observation.titles
         return cls(*own) if scenario.searchable else cls(*own, command="")

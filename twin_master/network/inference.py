@@ -3,7 +3,7 @@
 Pure functions on arrays, in the log domain: beliefs whose linear value underflows come back later when the
 data call for it. No floor is added anywhere; what is impossible stays impossible.
 
-The order of one turn t: control u_t is in force, the state is D_t, the observation o_t is made under u_t.
+The order of one step t: control u_t is in force, the state is D_t, the observation o_t is made under u_t.
 Hence D_t follows D_{t-1} through u_{t-1}, and the first state follows the prior.
 """
 
@@ -103,9 +103,9 @@ def filter_many(
     rows : (B, T, S)
         log p(o_t | D_t, u_t).
     log_before : (B, S) or (S,)
-        Logarithm of the belief in the turn before the first, or of the prior where there is none.
+        Logarithm of the belief in the step before the first, or of the prior where there is none.
     control_before : int or (B,)
-        Control in force in that turn; -1 where there is none.
+        Control in force in that step; -1 where there is none.
 
     Returns
     -------

@@ -112,9 +112,9 @@ def forward_pass(
     log_evidence: Float,
     failed: Index,
 ) -> None:
-    """Filter B twins over T turns; `failed` (B,) becomes -1, or the row whose observation is impossible.
+    """Filter B twins over T steps; `failed` (B,) becomes -1, or the row whose observation is impossible.
 
-    log_first (B, S) is the belief in the turn before the first, and control_before (B,) its control; or the
+    log_first (B, S) is the belief in the step before the first, and control_before (B,) its control; or the
     prior, and -1.
     """
     twins, steps, size = log_likelihood.shape
@@ -158,7 +158,7 @@ def backward_pass(
 
     p(i) = filtered(i) sum_j T(i, j) later(j) / forecast(j). A smoothed probability that underflows never
     matters again: every entry of an earlier step is a weighted mean of entries of the later one. So only the
-    weights need care: where the forecast underflows of what is smoothed, the turn is taken in logarithms.
+    weights need care: where the forecast underflows of what is smoothed, the step is taken in logarithms.
     """
     twins, steps, size = log_filtered.shape
     forecast, ratio, work = np.empty(size), np.empty(size), np.empty((2, size))

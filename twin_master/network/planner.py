@@ -16,7 +16,7 @@ from twin_master.network.transition import TransitionModel, expect_shape
 
 @dataclass(frozen=True)
 class BeliefPolicy:
-    """What to do by the belief before a turn: the control of the vector that is largest there.
+    """What to do by the belief before a step: the control of the vector that is largest there.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class BeliefPolicy:
         return np.asarray((np.asarray(belief) @ self.vectors.T).max(axis=-1))
 
     def action_value(self, belief: ArrayLike, controls: int) -> Float:
-        """Return the same by the control of the first turn: (..., U), minus infinity without a vector."""
+        """Return the same by the control of the first step: (..., U), minus infinity without a vector."""
         every = np.asarray(belief) @ self.vectors.T
         result: Float = np.full((*every.shape[:-1], controls), -np.inf)
         for control in np.unique(self.control).tolist():
@@ -104,7 +104,7 @@ def decision(
     filtered : (B, S)
         p(D_t | o_0..o_t).
     control : (B,)
-        Control in force in turn t.
+        Control in force in step t.
     policy : (S, U)
         p(U | D), which is averaged over the belief.
     on_belief : BeliefPolicy, optional

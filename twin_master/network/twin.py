@@ -1,5 +1,6 @@
 """The twin: it is shown observations and the control in force, and says what to do; it holds no truth."""
 
+import re
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -37,9 +38,11 @@ _LARGEST = np.float64(1e150)
 Planner = Callable[[GraphicalModel], ArrayLike]
 """Returns the policy p(U | D), (S, U), for states, controls and transitions."""
 DecisionBasis = Literal["filtered", "predicted"]
-"""Belief that the twin decides on: of the present turn, or of the next one."""
+"""Belief that the twin decides on: of the present step, or of the next one."""
 DEFAULT_LAG = 50
-"""Turns back that a twin smooths and may be revised."""
+"""Steps back that a twin smooths and may be revised."""
+_FORMER_COUNT = re.compile(r"(?<![^/])turns$")
+"""The name that the arrays `steps` had in the saved states of earlier versions, also behind a prefix."""
 
 
 def factor_tables(scenario: Scenario, leaving: float = 1.0) -> dict[str, dict[str, Float]]:
@@ -91,12 +94,12 @@ def build_graphical_model(scenario: Scenario, leaving: float = 1.0) -> Graphical
 
 
 @dataclass(frozen=True, kw_only=True)
-class TwinTurn(Estimate):
-    """What the twin concludes in one turn t, and its decision.
+class TwinStep(Estimate):
+    """What the twin concludes in one step t, and its decision.
 
     Attributes
     ----------
-    turn : int
+    step : int
         The number t, from 0.
     prediction : Predicted
         Beliefs and controls of the steps t + 1 ... t + H.
@@ -106,7 +109,7 @@ class TwinTurn(Estimate):
         Its mode, the first of equals: the control to fly in step t + 1.
     """
 
-    turn: int
+    step: int
     prediction: Predicted
     decision_probability: Float
     next_control: int
@@ -119,16 +122,16 @@ class TwinTurn(Estimate):
 
 @dataclass(frozen=True)
 class _Seen:
-    """A turn that is kept: what was observed and what the estimator carries on."""
+    """A step that is kept: what was observed and what the estimator carries on."""
 
     observation: Float
     estimate: Carried
 
 
 class Twin:
-    """Belief about one asset, updated turn by turn, without end.
+    """Belief about one asset, updated step by step, without end.
 
-    A turn costs the same time and memory at the start and after years: what is kept are the last `lag` turns,
+    A step costs the same time and memory at the start and after years: what is kept are the last `lag` steps,
     over which the twin smooths and into which it takes what comes late.
 
     Parameters
@@ -147,9 +150,9 @@ class Twin:
         The next control is the mode of policy(U | D) averaged over p(D_t | o_0..o_t), the state last seen, as
         in the paper's graph; or over p(D_{t+1} | o_0..o_t), as in the authors' published code.
     lag : int or None
-        How many turns back the twin smooths and may be revised; None keeps all turns.
+        How many steps back the twin smooths and may be revised; None keeps all steps.
     first_control : int or str
-        Control of the first turn, where none is given with it.
+        Control of the first step, where none is given with it.
     estimator : Estimator, optional
         What holds the belief in the place of the exact filter of model and sensor model.
     safest : int or str, optional
@@ -182,7 +185,7 @@ class Twin:
     ) -> None:
         require_one_of(decide_on, get_args(DecisionBasis), "decide_on")
         if lag is not None and lag < 0:
-            raise InvalidModelError(f"expected a lag of 0 or more turns, or None for all, got {lag}")
+            raise InvalidModelError(f"expected a lag of 0 or more steps, or None for all, got {lag}")
         self.name = name
         self.sensor_model = sensor_model
         self.estimator: Estimator = estimator or ExactFilter(model, sensor_model, name)
@@ -191,15 +194,15 @@ class Twin:
         self.decide_on = decide_on
         self._on_belief = on_belief
         self.lag = lag
-        self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)  # with the turn before
-        self._turns = 0
+        self._seen: deque[_Seen] = deque(maxlen=None if lag is None else lag + 2)  # with the step before
+        self._steps = 0
         self._proposed = self._index_of(first_control)
         self._safest: Float | None = None
         if safest is not None:
             self._safest = np.eye(len(model.controls))[self._index_of(safest)]
 
     def __repr__(self) -> str:
-        return brief(self, name=self.name, model=self.model, turns=self._turns, lag=self.lag)
+        return brief(self, name=self.name, model=self.model, steps=self._steps, lag=self.lag)
 
     @property
     def model(self) -> GraphicalModel:
@@ -207,29 +210,29 @@ class Twin:
         return self.estimator.model
 
     @property
-    def turns(self) -> int:
-        """Number of turns seen so far."""
-        return self._turns
+    def steps(self) -> int:
+        """Number of steps seen so far."""
+        return self._steps
 
     @property
     def proposed_control(self) -> int:
-        """Index of the control for the next turn: that of the last decision, or the first control."""
+        """Index of the control for the next step: that of the last decision, or the first control."""
         return self._proposed
 
     @property
     def first_kept(self) -> int:
-        """The first turn of `smoothed`, and the first that may still be revised."""
-        return self._turns - len(self._recent())
+        """The first step of `smoothed`, and the first that may still be revised."""
+        return self._steps - len(self._recent())
 
-    def turn(self, observation: ArrayLike, control: int | str | None = None) -> TwinTurn:
-        """Advance by one turn, correct by an observation, predict and decide.
+    def step(self, observation: ArrayLike, control: int | str | None = None) -> TwinStep:
+        """Advance by one step, correct by an observation, predict and decide.
 
         Parameters
         ----------
         observation : (G,)
-            What the sensors say, SI; NaN where nothing was received. All NaN predicts through the turn.
+            What the sensors say, SI; NaN where nothing was received. All NaN predicts through the step.
         control : int or str, optional
-            Index or name of the control in force during this turn; the one that was proposed if left out.
+            Index or name of the control in force during this step; the one that was proposed if left out.
 
         Raises
         ------
@@ -243,7 +246,7 @@ class Twin:
         index = self._proposed if control is None else self._index_of(control)
         return self._assimilated(len(self._seen), [(given, index)])
 
-    def revise(self, turn: int, observation: ArrayLike, control: int | str | None = None) -> TwinTurn:
+    def revise(self, step: int, observation: ArrayLike, control: int | str | None = None) -> TwinStep:
         """Put an observation that came late in its place, and filter anew from there.
 
         The result is that of a twin which had it in time, to the last bit, where the controls in force were
@@ -251,35 +254,35 @@ class Twin:
 
         Parameters
         ----------
-        turn : int
-            Its turn, not before `first_kept`.
+        step : int
+            Its step, not before `first_kept`.
         observation, control
-            As in `turn`; the control that was assumed for that turn if left out.
+            As in `step`; the control that was assumed for that step if left out.
 
         Returns
         -------
-        TwinTurn
-            What the twin now concludes in its last turn, with the notices of all turns filtered anew: what
-            the late observation brings to light in a turn before would never be told.
+        TwinStep
+            What the twin now concludes in its last step, with the notices of all steps filtered anew: what
+            the late observation brings to light in a step before would never be told.
 
         Raises
         ------
         IndexError
-            The turn is not kept any more, or has not been.
+            The step is not kept any more, or has not been.
         ImpossibleObservation, InvalidObservationError, InvalidModelError
-            As in `turn`; the twin is unchanged.
+            As in `step`; the twin is unchanged.
         """
-        if not self.first_kept <= turn < self._turns:
-            raise IndexError(said("network.revised", turn=turn, first=self.first_kept, seen=self._turns))
-        at = turn - self._turns + len(self._seen)
+        if not self.first_kept <= step < self._steps:
+            raise IndexError(said("network.revised", step=step, first=self.first_kept, seen=self._steps))
+        at = step - self._steps + len(self._seen)
         index = self._seen[at].estimate.control_index if control is None else self._index_of(control)
         rows = [(np.array(observation, dtype=np.float64), index)]
         rows += [(seen.observation, seen.estimate.control_index) for seen in list(self._seen)[at + 1 :]]
         return self._assimilated(at, rows)
 
-    def _assimilated(self, at: int, rows: Sequence[tuple[Float, int]]) -> TwinTurn:
+    def _assimilated(self, at: int, rows: Sequence[tuple[Float, int]]) -> TwinStep:
         """Filter observations under their controls from a place of what is kept on, and decide."""
-        first, anew, notices = self._turns - len(self._seen) + at, list[_Seen](), list[Notice]()
+        first, anew, notices = self._steps - len(self._seen) + at, list[_Seen](), list[Notice]()
         before = self._seen[at - 1].estimate if at else None
         for number, (given, in_force) in enumerate(rows, start=first):
             estimate = self._estimate(before, given, in_force, number)
@@ -289,16 +292,16 @@ class Twin:
         for _ in range(len(self._seen) - at):
             self._seen.pop()
         self._seen.extend(anew)
-        self._turns = first + len(rows)
+        self._steps = first + len(rows)
         return self._decided(replace(estimate, notices=tuple(notices)))
 
-    def observed(self, turn: int) -> Float:
-        """Return what was observed in a turn that is kept: (G,), NaN where nothing was received."""
-        return self._seen[turn - self._turns + len(self._seen)].observation
+    def observed(self, step: int) -> Float:
+        """Return what was observed in a step that is kept: (G,), NaN where nothing was received."""
+        return self._seen[step - self._steps + len(self._seen)].observation
 
-    def control_of(self, turn: int) -> int:
-        """Return the index of the control in force in a turn that is kept."""
-        return self._seen[turn - self._turns + len(self._seen)].estimate.control_index
+    def control_of(self, step: int) -> int:
+        """Return the index of the control in force in a step that is kept."""
+        return self._seen[step - self._steps + len(self._seen)].estimate.control_index
 
     def predict(self, belief: ArrayLike, control: int | str, steps: int | None = None) -> Predicted:
         """Predict through the policy from any belief (S,) under a control in force: eqs. (37)-(39)."""
@@ -306,31 +309,31 @@ class Twin:
         return predict(self.model, belief, self._index_of(control), self.policy, ahead)
 
     def smoothed(self) -> Float:
-        """Return p(D_k | o_0..o_t) for the turns k = `first_kept`..t: (n, S).
+        """Return p(D_k | o_0..o_t) for the steps k = `first_kept`..t: (n, S).
 
-        The decision does not need it, and after each turn it would cost as many steps as are kept.
+        The decision does not need it, and after each step it would cost as much as all steps that are kept.
         """
         return self.estimator.smoothed(self.carried)
 
     @property
     def carried(self) -> tuple[Carried, ...]:
-        """What the estimator carried on from the turns `first_kept`..t."""
+        """What the estimator carried on from the steps `first_kept`..t."""
         return tuple(seen.estimate for seen in self._recent())
 
     def save_state(self) -> bytes:
         """Return all that the twin has seen and keeps, for `restore_state`."""
-        return self._packed(self._turns, self._seen)
+        return self._packed(self._steps, self._seen)
 
     def settled(self) -> tuple[int, bytes] | None:
-        """Return the last turn that cannot be revised any more, and the state behind it, for `restore_state`.
+        """Return the last step that cannot be revised any more, and the state behind it, for `restore_state`.
 
-        All later turns follow from it; None before there is such a turn.
+        All later steps follow from it; None before there is such a step.
         """
-        turn = self.first_kept - 1
-        return None if turn < 0 else (turn, self._packed(turn + 1, [self._seen[0]]))
+        step = self.first_kept - 1
+        return None if step < 0 else (step, self._packed(step + 1, [self._seen[0]]))
 
-    def _packed(self, turns: int, kept: Iterable[_Seen]) -> bytes:
-        arrays: dict[str, NDArray[Any]] = {"turns": np.array([turns, self._proposed])}
+    def _packed(self, steps: int, kept: Iterable[_Seen]) -> bytes:
+        arrays: dict[str, NDArray[Any]] = {"steps": np.array([steps, self._proposed])}
         for place, seen in enumerate(kept):
             arrays[f"{place}/observation"] = seen.observation
             arrays[f"{place}/control"] = np.array(seen.estimate.control_index)
@@ -347,8 +350,11 @@ class Twin:
         """
         causes = ReducedModelFileError, KeyError, ValueError, TypeError
         with InvalidModelError.instead_of(*causes, before="this is no saved state of a twin: "):
-            arrays = arrays_from_bytes(state, "the state of the twin")
-            turns, proposed = arrays["turns"].tolist()
+            arrays = {
+                _FORMER_COUNT.sub("steps", name): value
+                for name, value in arrays_from_bytes(state, "the state of the twin").items()
+            }
+            steps, proposed = arrays["steps"].tolist()
             seen: list[_Seen] = []
             while f"{len(seen)}/control" in arrays:
                 prefix = f"{len(seen)}/carried/"
@@ -359,7 +365,7 @@ class Twin:
                 }
                 control = int(arrays[f"{len(seen)}/control"])
                 seen.append(_Seen(arrays[f"{len(seen)}/observation"], Carried(control, own)))
-        self._turns, self._proposed = turns, proposed
+        self._steps, self._proposed = steps, proposed
         self._seen.clear()
         self._seen.extend(seen)
 
@@ -367,17 +373,17 @@ class Twin:
         seen = list(self._seen)
         return seen if self.lag is None else seen[-(self.lag + 1) :]
 
-    def _estimate(self, before: Carried | None, given: Float, control: int, turn: int) -> Estimate:
+    def _estimate(self, before: Carried | None, given: Float, control: int, step: int) -> Estimate:
         """Return what the estimator concludes, of which nothing is NaN or too large to be squared."""
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                estimate = self.estimator.turn(before, given, control, turn)
+                estimate = self.estimator.step(before, given, control, step)
             found = (estimate.log_evidence, estimate.filtered, *estimate.carried.arrays.values())
             held = all(np.all(np.asarray(values) < _LARGEST) for values in found)
         except (ArithmeticError, np.linalg.LinAlgError):
             held = False
         if not held:
-            raise InvalidObservationError(said("network.no_belief", name=self.name, turn=turn))
+            raise InvalidObservationError(said("network.no_belief", name=self.name, step=step))
         return estimate
 
     def _index_of(self, control: int | str) -> int:
@@ -389,7 +395,7 @@ class Twin:
         expect_controls(control, len(controls))
         return int(control)
 
-    def _decided(self, estimate: Estimate) -> TwinTurn:
+    def _decided(self, estimate: Estimate) -> TwinStep:
         control_index = estimate.carried.control_index
         prediction = predict(self.model, estimate.filtered, control_index, self.policy, self.prediction_steps)
         decision_probability = self._decision(estimate.filtered, control_index)
@@ -399,8 +405,8 @@ class Twin:
             prediction = prediction.mixed(none, self._safest)
         self._proposed = int(np.argmax(decision_probability))
         own = vars(estimate) | {"suspicion": self._with_decision(estimate)}
-        return TwinTurn(
-            **own, turn=self._turns - 1, prediction=prediction, decision_probability=decision_probability,
+        return TwinStep(
+            **own, step=self._steps - 1, prediction=prediction, decision_probability=decision_probability,
             next_control=self._proposed,
         )  # fmt: skip
 
@@ -417,6 +423,6 @@ class Twin:
         return replace(estimate.suspicion, decided_by=max(share, key=share.__getitem__))
 
     def _decision(self, belief: Float, control_index: int) -> Float:
-        """Return the probability of each control (U,), by the belief of this turn or the next."""
+        """Return the probability of each control (U,), by the belief of this step or the next."""
         alone = belief[None], np.array([control_index]), self.policy, self._on_belief
         return np.asarray(decision(self.model.transition, *alone, ahead=self.decide_on == "predicted")[0])

@@ -1,6 +1,6 @@
-"""The course of a mission as seen at one turn: past, present and prediction (Kapteyn et al. 2021, Fig. 6).
+"""The course of a mission as seen at one step: past, present and prediction (Kapteyn et al. 2021, Fig. 6).
 
-The belief over the joint states turn by turn, and the policy over the states.
+The belief over the joint states step by step, and the policy over the states.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ from twin_master.scenario.schema import REWARD_NAMES
 
 _ROW_HEIGHT = 1.22
 _NARROW = 0.19
-_MANY_TURNS = 120  # more have no room for gaps between bars
+_MANY_STEPS = 120  # more have no room for gaps between bars
 _MANY_DOTS = 1000
-_LEAST_PAST = 3  # turns that a figure must have behind its present to show a course
+_LEAST_PAST = 3  # steps that a figure must have behind its present to show a course
 _DASHES = (0, (3, 1.2))
 _DOT: dict[str, Any] = {
     "color": style.OBSERVED, "linestyle": "none", "marker": "o", "markersize": 2.3, "markeredgewidth": 0.6,
@@ -31,7 +31,7 @@ _DOT: dict[str, Any] = {
 
 
 def default_now(run: Run) -> int:
-    """Return the turn that shows most: a few turns before the flown control first changes.
+    """Return the step that shows most: a few steps before the flown control first changes.
 
     Two thirds into the mission, where it does not change, or at once.
     """
@@ -66,14 +66,14 @@ def choose_sensors(run: Run, count: int = 4) -> list[int]:
 
 @style.publication_style()
 def mission_figure(run: Run, now: int, sensors: Sequence[int] | None = None) -> Figure:
-    """Draw the mission as the twin sees it at turn `now`.
+    """Draw the mission as the twin sees it at step `now`.
 
     Parameters
     ----------
     run
         The run.
     now
-        The present turn, 0..T-1.
+        The present step, 0..T-1.
     sensors
         Indices of the sensors to show, from 0; by default `choose_sensors`.
     """
@@ -145,9 +145,9 @@ def _draw(axes: Axes, run: Run, now: int, course: Float, truth: Float | None) ->
 
 
 def _course(run: Run, name: str, index: int, now: int) -> Float:
-    """Return `quantity` or `reward` up to a turn and as predicted there, with 95 % intervals, SI: (3, n).
+    """Return `quantity` or `reward` up to a step and as predicted there, with 95 % intervals, SI: (3, n).
 
-    The past is seen in hindsight at the last turn, and as seen at the time before that.
+    The past is seen in hindsight at the last step, and as seen at the time before that.
     """
     past = "smoothed" if now == run.steps - 1 else "filtered"
 
@@ -166,8 +166,8 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
     """Draw mean and two standard deviations within the levels: p(D_t | o_0..o_now), p(D_{now+h} | ...)."""
     factor = run.factors[index]
     at_the_time = factor.scale * run["filtered/mean"][: now + 1, index]
-    turns = run.numbers[: now + 1]
-    axes.plot(turns, at_the_time, color=style.PRESENT, linewidth=0.9, label="as seen at the time")
+    steps = run.numbers[: now + 1]
+    axes.plot(steps, at_the_time, color=style.PRESENT, linewidth=0.9, label="as seen at the time")
     if now == run.steps - 1:
         past = run["smoothed/mean"], run["smoothed/standard_deviation"]
     else:
@@ -187,12 +187,12 @@ def _state_panel(axes: Axes, run: Run, index: int, now: int) -> str:
 def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
     sensors = run.sensors
     observation = sensors.scale * run.observed[: now + 1 + run.horizon, sensor]
-    turn = run.numbers[: len(observation)]
-    seen, later = turn <= turn[now], turn > turn[now]
-    many = len(turn) > _MANY_DOTS  # as outlines they would make the page too large
-    axes.plot(turn[seen], observation[seen], **_DOT, label="observed", rasterized=many)
-    axes.plot(turn[later], observation[later], **_DOT, markerfacecolor="none", label="observed later")
-    lost = turn[seen & np.isnan(observation)]
+    step = run.numbers[: len(observation)]
+    seen, later = step <= step[now], step > step[now]
+    many = len(step) > _MANY_DOTS  # as outlines they would make the page too large
+    axes.plot(step[seen], observation[seen], **_DOT, label="observed", rasterized=many)
+    axes.plot(step[later], observation[later], **_DOT, markerfacecolor="none", label="observed later")
+    lost = step[seen & np.isnan(observation)]
     if len(lost):
         look = {**_DOT, "marker": "x", "transform": axes.get_xaxis_transform()}
         axes.plot(lost, np.full(len(lost), 0.04), **look, label="lost")
@@ -206,7 +206,7 @@ def _sensor_panel(axes: Axes, run: Run, sensor: int, now: int) -> str:
 
 
 def _control_panel(axes: Axes, run: Run, _index: int, now: int) -> str:
-    present, tallest, width = run.numbers[now], 0.82, 0.8 if now + run.horizon < _MANY_TURNS else 1.0
+    present, tallest, width = run.numbers[now], 0.82, 0.8 if now + run.horizon < _MANY_STEPS else 1.0
     for control in range(len(run.controls)):
         past = run.numbers[:now][run.control_index[:now] == control]
         parts = np.split(past, np.flatnonzero(np.diff(past) > 1) + 1) if width == 1.0 else past[:, None]
@@ -255,32 +255,32 @@ _MEAN: dict[str, Any] = {"marker": "D", "markersize": 4.0, "color": "white", "ma
 _RING: dict[str, Any] = {"marker": "o", "markersize": 9.0, "markerfacecolor": "none", "linestyle": "none"}
 
 
-def belief_turns(run: Run) -> list[int]:
-    """Return different turns spread evenly from the first to the last."""
-    return [int(turn) for turn in np.unique(np.linspace(0, run.steps - 1, _SMALL_PANELS).round().astype(int))]
+def belief_steps(run: Run) -> list[int]:
+    """Return different steps spread evenly from the first to the last."""
+    return [int(step) for step in np.unique(np.linspace(0, run.steps - 1, _SMALL_PANELS).round().astype(int))]
 
 
 @style.publication_style()
 def belief_figure(run: Run) -> Figure:
-    """Draw small maps of the joint belief of two factors, else the marginal of each factor over the turns."""
+    """Draw small maps of the joint belief of two factors, else the marginal of each factor over the steps."""
     return _joint_figure(run) if len(run.factors) == 2 else _marginal_figure(run)
 
 
 def _joint_figure(run: Run) -> Figure:
-    turns = belief_turns(run)
-    columns = min(4, len(turns))
-    rows = -(-len(turns) // columns)
+    steps = belief_steps(run)
+    columns = min(4, len(steps))
+    rows = -(-len(steps) // columns)
     right = 0.115 + 0.785 * columns / 4
     figure, grid = style.panels(
         rows, columns, 0.95 + 1.62 * rows, 0.52, 0.43, left=0.075, right=right, wspace=0.12, hspace=0.30
     )
-    for axes, turn in zip(style.keep_first_panels(grid, len(turns)), turns, strict=True):
-        image = _map(axes, run, run["filtered/probability"][turn], **_PROBABILITY)
-        axes.set_title(f"{run.step} {run.first_step + turn}", fontweight="normal", pad=3.0)
-        x, y = run.scales * run["filtered/mean"][turn]
+    for axes, step in zip(style.keep_first_panels(grid, len(steps)), steps, strict=True):
+        image = _map(axes, run, run["filtered/probability"][step], **_PROBABILITY)
+        axes.set_title(f"{run.step} {run.first_step + step}", fontweight="normal", pad=3.0)
+        x, y = run.scales * run["filtered/mean"][step]
         axes.plot(x, y, **_MEAN, linestyle="none", markeredgewidth=1.1, label="mean of the belief")
         if run.truth is not None:
-            x, y = run.scales * run.truth[turn]
+            x, y = run.scales * run.truth[step]
             for color, width in (("white", 2.6), (style.TRUTH, 1.2)):
                 axes.plot(x, y, **_RING, markeredgecolor=color, markeredgewidth=width, label="truth")
         axes.set_xlabel(run.factors[0].label, labelpad=2.0)
@@ -293,10 +293,10 @@ def _joint_figure(run: Run) -> Figure:
     return figure
 
 
-def turn_map(axes: Axes, run: Run, values: Float, first: int, **look: Any) -> Any:
-    """Draw values (T, n) over the turns, those of a turn one above the other from `first` on."""
-    turns, places = np.arange(run.steps + 1) + run.first_step, np.arange(values.shape[1] + 1) + first
-    return axes.pcolormesh(turns - 0.5, places - 0.5, values.T, **look)
+def step_map(axes: Axes, run: Run, values: Float, first: int, **look: Any) -> Any:
+    """Draw values (T, n) over the steps, those of a step one above the other from `first` on."""
+    steps, places = np.arange(run.steps + 1) + run.first_step, np.arange(values.shape[1] + 1) + first
+    return axes.pcolormesh(steps - 0.5, places - 0.5, values.T, **look)
 
 
 def _marginal_figure(run: Run) -> Figure:
@@ -305,7 +305,7 @@ def _marginal_figure(run: Run) -> Figure:
     for index, (factor, (axes,)) in enumerate(zip(run.factors, grid, strict=True)):
         marginal = run.model.states.marginal(run["filtered/probability"], run.model.states.names[index])
         places = np.arange(len(factor.levels))
-        image = turn_map(axes, run, marginal, 0, **_PROBABILITY)
+        image = step_map(axes, run, marginal, 0, **_PROBABILITY)
         if run.truth is not None:
             truth = np.interp(factor.scale * run.truth[:, index], factor.levels, places)
             axes.plot(run.numbers, truth, color=style.TRUTH, linewidth=1.0, label="truth")

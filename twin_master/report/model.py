@@ -15,7 +15,7 @@ from scipy.stats import binom, truncnorm
 from reporting import figures as style
 from reporting.arrays import Float
 from reporting.words import between, parameter_title, rounded
-from twin_master.report.mission import turn_map
+from twin_master.report.mission import step_map
 from twin_master.report.reading import NORMAL_95, Run
 from twin_master.store.mission_result import LearntQuantity
 
@@ -117,7 +117,7 @@ _ROW_HEIGHT = 1.55
 
 @style.publication_style()
 def learnt_figure(run: Run) -> Figure:
-    """Draw each learnt quantity over the turns with its 90 % band.
+    """Draw each learnt quantity over the steps with its 90 % band.
 
     Of quantities of each sensor the one that departs most from its prior has the band, and beside it stand
     the last values of all sensors.
@@ -161,7 +161,7 @@ def learnt_figure(run: Run) -> Figure:
 
 
 def _course(axes: Axes, run: Run, course: Float, prior: Float, truth: Float | None) -> None:
-    """Draw a course (T, 4) with its band and truth, from its prior (4,) before the first turn on."""
+    """Draw a course (T, 4) with its band and truth, from its prior (4,) before the first step on."""
     steps = run.numbers
     style.band(axes, steps, course[:, 2], course[:, 3], style.PRESENT)
     axes.plot(steps, course[:, 0], color=style.PRESENT, label="learnt, 90 % band")
@@ -219,7 +219,7 @@ _MOST_CELLS = 6000  # as vectors; more would make the page too large
 
 @dataclass(frozen=True)
 class PredictiveCheck:
-    """Observations against the posterior predictive distribution of the same turn.
+    """Observations against the posterior predictive distribution of the same step.
 
     Attributes
     ----------
@@ -262,7 +262,7 @@ def predictive_check(run: Run) -> PredictiveCheck:
 
 @style.publication_style()
 def check_figure(run: Run, check: PredictiveCheck) -> Figure:
-    """Draw the residuals of every sensor and turn, the coverage of each sensor, and the transform of all."""
+    """Draw the residuals of every sensor and step, the coverage of each sensor, and the transform of all."""
     figure = style.new_figure(4.9)
     grid = figure.add_gridspec(
         2, 2, left=0.075, right=0.955, top=0.945, bottom=0.09, hspace=0.42, wspace=0.2,
@@ -278,7 +278,7 @@ def _residual_panel(figure: Figure, axes: Axes, run: Run, check: PredictiveCheck
     axes.set_facecolor("#c8c8c8")
     count = len(run.sensors.titles)
     look = {**style.RESIDUALS, "rasterized": check.residual.size > _MOST_CELLS}
-    image = turn_map(axes, run, np.ma.masked_invalid(check.residual), 1, **look)
+    image = step_map(axes, run, np.ma.masked_invalid(check.residual), 1, **look)
     ticks = np.arange(1, count + 1, 4 if count > 8 else 1)
     axes.set(xlabel=run.step, ylabel=run.sensors.word, yticks=ticks)
     axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))

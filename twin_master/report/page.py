@@ -155,12 +155,12 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
     run_folder
         Holds ``run.nc`` and ``config.json`` and, where they exist, ``summary.json`` and ``calibration.json``.
     now
-        The present turn of the first figure; by default shortly before the control first changes.
+        The present step of the first figure; by default shortly before the control first changes.
 
     Raises
     ------
     RunFolderError
-        There is no run, it is damaged or of another layout, or `now` is no turn of it.
+        There is no run, it is damaged or of another layout, or `now` is no step of it.
     FileNotWrittenError
         The disk is full or the folder cannot be written.
     """
@@ -187,12 +187,12 @@ def report_figures(run_folder: Path | str, now: int | None = None) -> Iterator[R
     run_folder
         The folder of the run.
     now
-        The present turn of the first figure; by default shortly before the control first changes.
+        The present step of the first figure; by default shortly before the control first changes.
 
     Raises
     ------
     RunFolderError
-        There is no run, it is damaged or of another layout, or `now` is no turn of it.
+        There is no run, it is damaged or of another layout, or `now` is no step of it.
     """
     yield from _figures(read_run(Path(run_folder)), now, Path(run_folder))
 
@@ -202,20 +202,20 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
     now = course.default_now(run) if now is None else now - first
     if now not in range(run.steps):
         ends = f"{first}..{first + last}"
-        raise RunFolderError(f"The present turn of the report must lie in {ends}, and {first + now} came.")
+        raise RunFolderError(f"The present step of the report must lie in {ends}, and {first + now} came.")
     units = ", ".join(
         dict.fromkeys("percent" if factor.unit == "%" else factor.unit for factor in run.factors)
     )
-    for name, turn in ((MAIN_FIGURE, now), *([("mission_whole", last)] if now != last else [])):
-        asked = run["filtered/decision_probability"][turn]
+    for name, step in ((MAIN_FIGURE, now), *([("mission_whole", last)] if now != last else [])):
+        asked = run["filtered/decision_probability"][step]
         chosen = int(np.argmax(asked))
         decided = WORDS.say(
-            "decided", run=run, now=first + turn, chosen=run.controls[chosen], probability=asked[chosen]
+            "decided", run=run, now=first + step, chosen=run.controls[chosen], probability=asked[chosen]
         )
-        past = "in hindsight" if turn == last else "as seen at the time"
+        past = "in hindsight" if step == last else "as seen at the time"
         yield WORDS.figure(
-            "mission", course.mission_figure(run, turn), run=run, now=first + turn, units=units,
-            whole=name != MAIN_FIGURE, last=turn == last, past=past, decided=decided,
+            "mission", course.mission_figure(run, step), run=run, now=first + step, units=units,
+            whole=name != MAIN_FIGURE, last=step == last, past=past, decided=decided,
         )._replace(name=name)  # fmt: skip
     yield WORDS.figure("belief", course.belief_figure(run), run=run, units=units)
     if run.learnt:
@@ -288,7 +288,7 @@ def render_page(run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, R
         "figures": figures, "opening": opening_sentences(run), "another": another,
         "referred": any(figure["reference"] is not None for figure in run.summary.get("figures", ())),
         "share": 100.0 * lost.mean(), "ranges": lost_ranges(run),
-        "blind": turn_ranges(run.first_step + blind, run.step) if len(blind) else "",
+        "blind": step_ranges(run.first_step + blind, run.step) if len(blind) else "",
         "learnt_asset": whole, "truth": any(learnt.truth is not None for learnt in whole),
         "plain": listing(f"{p:g} in {name}" for name, p in given.items() if isinstance(p, int | float)),
         "learnt_sensors": tailored.sensor_rows(run), "labels": [learnt.label for learnt in own],
@@ -323,9 +323,9 @@ def _monitors(run: Run) -> list[Sequence[str]]:
     return rows
 
 
-def turn_ranges(turns: ArrayLike, step_word: str = "turn") -> str:
-    """Return increasing turns in words: ``turns 3–4, 12–18``."""
-    values = np.asarray(turns, dtype=int)
+def step_ranges(steps: ArrayLike, step_word: str = "step") -> str:
+    """Return increasing steps in words: ``steps 3–4, 12–18``."""
+    values = np.asarray(steps, dtype=int)
     parts = np.split(values, np.flatnonzero(np.diff(values) > 1) + 1)
     words = [f"{part[0]}" if len(part) == 1 else f"{part[0]}–{part[-1]}" for part in parts]
     return f"{step_word} {words[0]}" if len(values) == 1 else f"{step_word}s {', '.join(words)}"
@@ -337,14 +337,14 @@ def lost_ranges(run: Run) -> str:
     blind = lost.all(axis=1)
     together: dict[tuple[int, ...], list[str]] = {}
     for sensor in range(lost.shape[1]):
-        turns = tuple((run.first_step + np.flatnonzero(lost[:, sensor] & ~blind)).tolist())
-        if turns:
-            together.setdefault(turns, []).append(str(sensor + 1))
+        steps = tuple((run.first_step + np.flatnonzero(lost[:, sensor] & ~blind)).tolist())
+        if steps:
+            together.setdefault(steps, []).append(str(sensor + 1))
     word = run.sensors.word
     phrases = [
-        f"{word}{'s' if len(labels) > 1 else ''} {', '.join(labels)} at {turn_ranges(turns, run.step)}"
-        for turns, labels in together.items()
+        f"{word}{'s' if len(labels) > 1 else ''} {', '.join(labels)} at {step_ranges(steps, run.step)}"
+        for steps, labels in together.items()
     ]
     if blind.any():
-        phrases.append(f"all {word}s at {turn_ranges(run.first_step + np.flatnonzero(blind), run.step)}")
+        phrases.append(f"all {word}s at {step_ranges(run.first_step + np.flatnonzero(blind), run.step)}")
     return "; ".join(phrases)

@@ -89,7 +89,7 @@ def design_of(folder: Path) -> WingDesign | None:
 
 
 def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
-    """Draw a wing after its last turn: regions by belief, gauges by reading and by residual (G,)."""
+    """Draw a wing after its last step: regions by belief, gauges by reading and by residual (G,)."""
     measured, sensors = run.sensors.scale * run.observed[-1], run.sensors
     shown: tuple[tuple[str, str, Float, str, dict[str, Any]], ...] = (
         ("a", f"Measured {sensors.quantity}", measured, f"{sensors.quantity} ({sensors.unit})", {}),
@@ -147,9 +147,9 @@ def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
     corners = [body.cells[cell, list(body.kind.faces[face])] for cell, face in zip(cells, faces, strict=True)]
     points = np.asarray(mesh.points + scale * displacement)
     # seen from above, in front and the right; what is farther is drawn first
-    turn, tilt = np.radians(-60.0), np.radians(28.0)
-    across = np.array([-np.sin(turn), np.cos(turn), 0.0])
-    towards = np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
+    angle, tilt = np.radians(-60.0), np.radians(28.0)
+    across = np.array([-np.sin(angle), np.cos(angle), 0.0])
+    towards = np.array([np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)])
     view = np.column_stack((across, np.cross(towards, across)))
     order = np.argsort([(points[nodes] @ towards).mean() for nodes in corners])
     with style.publication_style():

@@ -7,6 +7,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from reporting.former_names import with_present_names
 from reporting.toml_file import read_toml, validate
 from reporting.words import brief
 from scenarios import scenario_files
@@ -14,6 +15,14 @@ from twin_master.errors import ScenarioError, said
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
+
+PRESENT_NAMES = {
+    "notice.memory_turns": "memory_steps",
+    "notice.onset_turns": "onset_steps",
+    "planner.inspections_a_turn": "inspections_per_step",
+    "watch.seconds_per_turn": "seconds_per_step",
+}
+"""The present name of each key of a scenario, by the location that it had before."""
 
 _OF_SEVERAL = ("component", "connection", "algorithm", "iterations", "tolerance")
 _OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
@@ -127,7 +136,7 @@ def why_no_notices(scenario: Scenario) -> str:
     numbers = prod(len(factor.levels) for factor in scenario.state) * draws * observation.count * GAINS
     if numbers > NUMBERS_BY_DEFAULT:
         return (
-            f"they take {numbers:,} numbers a turn, more than {NUMBERS_BY_DEFAULT:,} (`[notice]` takes them)"
+            f"they take {numbers:,} numbers a step, more than {NUMBERS_BY_DEFAULT:,} (`[notice]` takes them)"
         )
     return ""
 
@@ -142,4 +151,5 @@ def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
     """
     if table.get("format") == 1 and table["format"] is not True and "belief" not in table:
         table = from_format_1(table)
+    table = with_present_names(table, PRESENT_NAMES, source, ScenarioError)
     return validate(Scenario, table, source, ScenarioError, what="a scenario")

@@ -70,7 +70,7 @@ class Mission(Section):
     prediction_steps: Count = 10
     first_control: Name
     seed: Seed = 0
-    step_name: Name = "turn"
+    step_name: Name = "step"
     """What a step of the mission is called in the report."""
 
 
@@ -212,11 +212,11 @@ class Scenario(Section):
 
     @property
     def row_width(self) -> int:
-        """Length of the row that comes of a turn."""
+        """Length of the row that comes of a step."""
         return self.observation.width + len(self.readings)
 
     def ends(self, control_index: int) -> bool:
-        """Return whether the mission ends with a turn under a control."""
+        """Return whether the mission ends with a step under a control."""
         name = self.control_names[control_index]
         return any(action.ends for action in self.action if action.name == name)
 
@@ -368,7 +368,7 @@ class Scenario(Section):
         for table in ("learning", "notice"):
             inside = getattr(self, table) and observation.average_over_draws == "inside"
             yield inside, said("scenario.inside", table=table)
-        shared = self.planner.inspections_a_turn is not None
+        shared = self.planner.inspections_per_step is not None
         yield shared and (self.learning or self.notice), said("scenario.inspections")
         yield one_or_each("truth.noise.standard_deviation", truth.noise.standard_deviation, count)
         # Noise in microstrain without its suffix; finer slips are seen when predictions are there.

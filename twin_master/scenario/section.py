@@ -220,7 +220,7 @@ class ModesSection(Section):
 
 
 class RecordSection(Section):
-    """How the record of each turn comes about, for a simulated asset."""
+    """How the record of each step comes about, for a simulated asset."""
 
     kind: Literal["ambient", "decay"]
     """`ambient`: the input is shaken by white noise; `decay`: it is let go."""
@@ -281,7 +281,7 @@ class ObservationSection(Section):
 
     @property
     def width(self) -> int:
-        """Length of the row that comes of a turn: values, and their covariance where it comes with them."""
+        """Length of the row that comes of a step: values, and their covariance where it comes with them."""
         return self.count if self.modes is None else row_width(self.count)
 
     @property

@@ -146,7 +146,7 @@ class TruthSection(Section):
     """`asset`: the observation of the binding that is 0 where a sensor is lost."""
 
     record: RecordSection | None = None
-    """Where modes are observed: the record of each turn."""
+    """Where modes are observed: the record of each step."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield keys that do not go together."""
@@ -161,25 +161,25 @@ class TruthSection(Section):
 
 
 class Action(Section):
-    """One choice of a turn beside the controls."""
+    """One choice of a step beside the controls."""
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "percent"}
     name: Name
     title: str = ""
     control: Name
-    """The control whose loads are on the asset in that turn."""
+    """The control whose loads are on the asset in that step."""
     cost: NotNegative
-    """What the reward of the turn is less than under the control."""
+    """What the reward of the step is less than under the control."""
     inspects: tuple[Name, ...] = ()
-    """States that are read in that turn, and only then."""
+    """States that are read in that step, and only then."""
     standard_deviation: PerSensor | None = None
     """Of these readings, one for all or one for each."""
     repairs: tuple[Name, ...] = ()
-    """States that are at their lowest level in the turn after."""
+    """States that are at their lowest level in the step after."""
     success: Probability = 1.0
     """Probability with which a repair succeeds, for each state."""
     ends: Flag = False
-    """Whether the mission ends with that turn."""
+    """Whether the mission ends with that step."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield what is not given together, and that it does nothing."""
@@ -210,19 +210,19 @@ class Planner(Section):
     """Control where no state explains the sensors; by default the one with the least load."""
     policy: Literal["mode", "qmdp", "belief"] = "mode"
     """The mode of the control of each state; the best control in the mean over the states, taken as if they
-    were known from the next turn on; or what is planned on the belief."""
+    were known from the next step on; or what is planned on the belief."""
     limit_probability: Annotated[Probability, Field(gt=0.0)] | None = None
-    """`belief`: share of the turns, discounted, in which a health limit may be exceeded."""
+    """`belief`: share of the steps, discounted, in which a health limit may be exceeded."""
 
-    inspections_a_turn: Count | None = None
-    """`belief` and `qmdp`: turns with an inspection that assets which fly side by side have among them."""
+    inspections_per_step: Count | None = None
+    """`belief` and `qmdp`: steps with an inspection that assets which fly side by side have among them."""
 
     def faults(self) -> Iterator[Fault]:
         """Yield keys of another policy."""
         limited = self.limit_probability is not None and self.policy != "belief"
         yield limited, "`planner.limit_probability` needs `planner.policy` `belief`"
-        shared = self.inspections_a_turn is not None and self.policy == "mode"
-        yield shared, "`planner.inspections_a_turn` needs `planner.policy` `belief` or `qmdp`"
+        shared = self.inspections_per_step is not None and self.policy == "mode"
+        yield shared, "`planner.inspections_per_step` needs `planner.policy` `belief` or `qmdp`"
 
 
 def with_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -253,7 +253,7 @@ class Learning(Section):
 
     units: ClassVar[Mapping[str, str]] = {"gauge_gain": "percent", "gauge_offset": "microstrain"}
     parameter: Flag = True
-    """The draws of the calibrated parameter keep their weights from turn to turn."""
+    """The draws of the calibrated parameter keep their weights from step to step."""
     noise: Flag = True
     """The noise scale of each sensor, about the standard deviation that is assumed."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
@@ -291,7 +291,7 @@ GAINS = 4
 MOST_DRAWS = 15
 """Draws of the parameter that are kept apart: evidence is compared, and no fine posterior is needed."""
 NUMBERS_BY_DEFAULT = 1_000_000
-"""Numbers of the beliefs about sensors up to which a scenario gives notices by itself: 0.1 s a turn."""
+"""Numbers of the beliefs about sensors up to which a scenario gives notices by itself: 0.1 s a step."""
 _LARGEST_GAIN = 0.4
 """The largest gain errors that are compared are two and a half times as large."""
 
@@ -306,10 +306,10 @@ class Noticing(Section):
     """Gain error of a single sensor that is to be found; less than half of it raises no alarm."""
     all_gain: Annotated[float, Field(strict=True, gt=0.0, le=1.0)] = 0.1
     """Prior standard deviation of the gains of sensors that have one, where no state explains all of them."""
-    memory_turns: Positive = 20.0
-    """Turns after which what was learnt of these gains has faded to 1 / e."""
-    onset_turns: Positive = 50.0
-    """Turns within which half of the faults begin that were not there from the start."""
+    memory_steps: Positive = 20.0
+    """Steps after which what was learnt of these gains has faded to 1 / e."""
+    onset_steps: Positive = 50.0
+    """Steps within which half of the faults begin that were not there from the start."""
     absurd_deviations: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=3.0)] = 8.0
     """A reading so many assumed standard deviations beyond what any state can show is left out."""
     prior: Annotated[float, Field(strict=True, gt=0.0, lt=0.5)] = 0.01
@@ -329,17 +329,17 @@ class WatchSection(FileSection):
     observations: str | None = None
     """A recorded file that is watched where nothing else is given, or the name of a shipped one."""
     lag: Count = 50
-    """Turns back over which the twin smooths, and which a message may be late."""
+    """Steps back over which the twin smooths, and which a message may be late."""
     longest_gap: Count = 1000
-    """Turns that a message may be ahead of the next one; those between are predicted through."""
-    seconds_per_turn: Positive | None = None
-    """Of messages that have a time in the place of a turn."""
+    """Steps that a message may be ahead of the next one; those between are predicted through."""
+    seconds_per_step: Positive | None = None
+    """Of messages that have a time in the place of a step."""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
     """Of the times of messages."""
     allow_unknown: bool = False
     """Keys and columns that are no sensor are passed over, and not refused."""
     quiet_after_seconds: Positive | None = None
-    """Without a turn for so long, a notice says that the last decision grows old."""
+    """Without a step for so long, a notice says that the last decision grows old."""
 
     @property
     def recording(self) -> Path | None:

@@ -16,7 +16,7 @@ from reporting.json_file import plain
 from reporting.words import capital, parameter_title
 from twin_master.mission.loop import BelievedModel, spans_of
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.turns import History, Truth
+from twin_master.mission.steps import History, Truth
 from twin_master.network.estimator import Learnt
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.tables import probability_of
@@ -55,9 +55,9 @@ class LearntQuantity:
     name, title, unit : str
         In `run.nc`, for people, and of all numbers.
     course : (T, 4) or (T, G, 4)
-        The figures of `MOMENTS` after each turn; NaN for sensors of which it is not learnt.
+        The figures of `MOMENTS` after each step; NaN for sensors of which it is not learnt.
     prior : (4,) or (G, 4)
-        Before the first turn.
+        Before the first step.
     truth : () or (G,), or None
         Of a simulated asset, as far as the scenario tells it; NaN for sensors of which it does not.
     """
@@ -179,7 +179,7 @@ class MissionResult:
     knowledge : Knowledge
         What the twin knew before.
     flight : History
-        The turns.
+        The steps.
     truth : Truth or None
         What the sensors really did; None where nobody knows.
     units : dict of str to str
@@ -197,7 +197,7 @@ class MissionResult:
 
     @property
     def spans(self) -> list[tuple[Knowledge, slice]]:
-        """What the twin knew, and in which of the turns."""
+        """What the twin knew, and in which of the steps."""
         return spans_of(self.flight, self.models or [BelievedModel(0, self.knowledge)])
 
     @property
@@ -220,4 +220,4 @@ class MissionResult:
     def learnt(self) -> tuple[LearntQuantity, ...]:
         """What was learnt; empty where nothing is."""
         learning = self.knowledge.learning
-        return () if learning is None or not self.flight.turns else _learnt(self, learning.prior)
+        return () if learning is None or not self.flight.steps else _learnt(self, learning.prior)

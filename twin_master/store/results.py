@@ -12,7 +12,7 @@ from reporting.netcdf import NetcdfGroup, Variable
 from reporting.table_file import table_text
 from twin_master.learning.expectation import joined
 from twin_master.mission.loop import expected_in
-from twin_master.mission.turns import SensorStatus, Truth
+from twin_master.mission.steps import SensorStatus, Truth
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.scenario.section import ObservationSection, printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
@@ -45,8 +45,8 @@ def groups_of(result: MissionResult) -> dict[str, NetcdfGroup]:
     }
     if result.learnt:
         groups["learnt"] = made.group("learnt", _learnt(result))
-    if turns := result.flight.suspicion:
-        told = {name: np.array([getattr(turn, name) for turn in turns]) for name in SCHEMA["notice"]}
+    if steps := result.flight.suspicion:
+        told = {name: np.array([getattr(step, name) for step in steps]) for name in SCHEMA["notice"]}
         told["left_out"] = told["left_out"].astype(np.int8)
         groups["notice"] = made.group("notice", _plain(told))
     if result.truth is not None:
@@ -71,7 +71,7 @@ class _Groups:
             "parameter_unit": result.parameter_unit,
         }
         labels: dict[str, Any] = {
-            "step": flight.first_turn + np.arange(len(flight.turns)),
+            "step": flight.first_step + np.arange(len(flight.steps)),
             "sensor": np.arange(1, observation.count + 1),
             "region": scenario.state_names,
             "control": scenario.control_names,
@@ -135,7 +135,7 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Netcdf
     ):
         flown = name != "predicted"
         parts = [
-            expected_in(replace(flight, turns=flight.turns[part]), own, name, belief[part])
+            expected_in(replace(flight, steps=flight.steps[part]), own, name, belief[part])
             for own, part in result.spans
         ]
         expected = joined([part for part, _ in parts])
@@ -177,7 +177,7 @@ def _learnt(result: MissionResult) -> Iterator[Entry]:
 
 def _truth(result: MissionResult, truth: Truth) -> Iterator[Entry]:
     flight = result.flight
-    status = truth.status[: len(flight.turns)]  # the asset may have ended the mission
+    status = truth.status[: len(flight.steps)]  # the asset may have ended the mission
     if truth.in_asset:
         status = np.where(np.isnan(flight.observed), SensorStatus.LOST, status).astype(status.dtype)
     yield "state", flight.state, {}

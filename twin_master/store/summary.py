@@ -154,7 +154,7 @@ def summarise(
     before
         What is told before them.
     """
-    flight, step = result.flight, {"step": result.scenario.mission.step_name}
+    flight, step_word = result.flight, {"step": result.scenario.mission.step_name}
     told = [*before, *(_scored(result) if flight.simulated else _watched(result))]
     for name, rewards in zip(REWARD_NAMES, reward_mean.T, strict=True):
         known = rewards[np.isfinite(rewards)]
@@ -165,8 +165,8 @@ def summarise(
     received = np.isfinite(flight.observed)
     if not received.all():
         told.append(("lost", {}, [100.0 * float(1.0 - received.mean())]))
-        if blind := (flight.first_turn + np.flatnonzero(~received.any(axis=1))).tolist():
-            told.append(("blind", step, [", ".join(map(str, blind))]))
+        if blind := (flight.first_step + np.flatnonzero(~received.any(axis=1))).tolist():
+            told.append(("blind", step_word, [", ".join(map(str, blind))]))
     if misfit is not None and (known := np.isfinite(misfit)).any():
         worst = np.max(np.abs(misfit), axis=(0, 1), where=known, initial=0.0)
         sensor, rms = int(np.argmax(worst)), float(np.sqrt(np.mean(misfit[known] ** 2)))
@@ -176,8 +176,8 @@ def summarise(
         told.append(("bound", {}, [1e6 * float(bound.max())]))
     if flight.suspicion:
         last = flight.suspicion[-1]
-        first = next((turn for turn, notice in flight.notices if notice.kind == "alarm"), None)
-        told.append(("notice", step, [first, last.none_of_these, last.gauge_off, last.decided_by]))
+        first = next((step for step, notice in flight.notices if notice.kind == "alarm"), None)
+        told.append(("notice", step_word, [first, last.none_of_these, last.gauge_off, last.decided_by]))
     references = {entry.figure: (entry.value, entry.source) for entry in result.scenario.reference}
     for group, words, values in told:
         for (key, (title, unit)), value in zip(FIGURES[group].items(), values, strict=True):
@@ -224,7 +224,7 @@ def noticed(result: MissionResult) -> dict[str, Any]:
     """Return what the operator was told, `notices`, for the summary; nothing where nothing is watched."""
     if result.scenario.notice is None and not result.flight.notices:
         return {}
-    return {"notices": [{"turn": turn} | notice.as_record() for turn, notice in result.flight.notices]}
+    return {"notices": [{"step": step} | notice.as_record() for step, notice in result.flight.notices]}
 
 
 def _scored(result: MissionResult) -> Iterator[Told]:
@@ -254,7 +254,7 @@ def _watched(result: MissionResult) -> Iterator[Told]:
 def control_changes(
     controls: Sequence[str], control_index: Index, step_name: str, first_step: int = 0
 ) -> str:
-    """Return in words when which control was left for which: ``left 3g for 2g at turn 31``.
+    """Return in words when which control was left for which: ``left 3g for 2g at step 31``.
 
     Parameters
     ----------

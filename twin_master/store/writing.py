@@ -94,7 +94,7 @@ def store_flight(
     origin
         What was flown, and what the twin believed.
     steps
-        Turns flown in all, or planned.
+        Steps flown in all, or planned.
     figures
         Of the summary, before those of every mission.
     attributes
@@ -132,7 +132,7 @@ def store_flight(
         "title": mission.title,
         "seed": mission.seed,
         "steps": steps,
-        "control": control_changes(controls, flight.control_index, mission.step_name, flight.first_turn),
+        "control": control_changes(controls, flight.control_index, mission.step_name, flight.first_step),
         **flown,
         "asset_and_model_differ": origin.differ,
         **learnt_record(result.learnt, result.scenario.observation.sensor_units),

@@ -3,7 +3,7 @@
 The flight itself computes nothing for its viewers. Beliefs and decisions stand in the journal; what follows
 from them is computed here, as the run does it, so that every number is that of the run.
 
-A viewer asks with the turns that it holds and the turn that it shows; the answer follows from these alone.
+A viewer asks with the steps that it holds and the step that it shows; the answer follows from these alone.
 One that was away, or is slow, asks for more at once, and nothing is kept for it.
 """
 
@@ -39,8 +39,8 @@ from twin_master.run_folder import kept_scenario
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.viewer.picture import Picture, picture_of
 
-TURNS_AT_ONCE = 200
-"""Turns that are read before the viewers are answered again."""
+STEPS_AT_ONCE = 200
+"""Steps that are read before the viewers are answered again."""
 
 
 Record = dict[str, Any]
@@ -48,7 +48,7 @@ Record = dict[str, Any]
 
 
 class Belief(NamedTuple):
-    """What is believed of n turns.
+    """What is believed of n steps.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Belief(NamedTuple):
     expected : Expected
         Of sensors and rewards, without quantiles; the reward of the error is NaN where nothing was observed.
     control_probability : (n, U)
-        Of a turn that was flown: what its next control was decided by. Of a predicted one: p(U).
+        Of a step that was flown: what its next control was decided by. Of a predicted one: p(U).
     """
 
     probability: Float
@@ -69,7 +69,7 @@ class Belief(NamedTuple):
 
 
 class Flight:
-    """A run or a watch that is looked at: its turns, and what the twin concluded in each when it was there.
+    """A run or a watch that is looked at: its steps, and what the twin concluded in each when it was there.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class Flight:
     pictures : list of Picture
         Of the missing forces that verdicts show, in the order in which they came.
     number : int
-        Grows when turns were taken back, as a resumed run may do, or changed, as by an observation that came
+        Grows when steps were taken back, as a resumed run may do, or changed, as by an observation that came
         late: what was told of the flight is then void.
     """
 
@@ -101,7 +101,7 @@ class Flight:
         self._file, self._end = file, 0
         self._models: list[tuple[int, Knowledge]] = []
         self._believe(0)
-        self._places: list[list[int]] = []  # of belief and observation of each turn, in bytes
+        self._places: list[list[int]] = []  # of belief and observation of each step, in bytes
         self._told: defaultdict[int, list[Record]] = defaultdict(list)  # notices behind it, where none came
         self.pictures: list[Picture] = []
         self.number += 1
@@ -115,9 +115,9 @@ class Flight:
         """What the twin knows now."""
         return self._models[-1][1]
 
-    def _known_in(self, turn: Record) -> Knowledge:
-        """Return what the twin knew when it told of a turn."""
-        told = self._places[turn["turn"]][0]
+    def _known_in(self, step: Record) -> Knowledge:
+        """Return what the twin knew when it told of a step."""
+        told = self._places[step["step"]][0]
         return next(knowledge for place, knowledge in reversed(self._models) if place <= told)
 
     def _begun_anew(self, found: os.stat_result) -> bool:
@@ -125,12 +125,12 @@ class Flight:
         return found.st_ino != self._file or found.st_size < self._end
 
     @property
-    def turns(self) -> int:
-        """Number of turns seen so far."""
+    def steps(self) -> int:
+        """Number of steps seen so far."""
         return len(self._places)
 
     def update(self) -> bool:
-        """Take in what is new in the journal, at most `TURNS_AT_ONCE`; return whether there was any.
+        """Take in what is new in the journal, at most `STEPS_AT_ONCE`; return whether there was any.
 
         Raises
         ------
@@ -141,35 +141,35 @@ class Flight:
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             if self._begun_anew(found := os.fstat(file.fileno())):
                 self._forget(found.st_ino)
-            for record, begin, behind in islice(records_of(file, self._path, self._end), TURNS_AT_ONCE):
+            for record, begin, behind in islice(records_of(file, self._path, self._end), STEPS_AT_ONCE):
                 self._take_in(record, begin)
                 self._end = behind
         return (self.number, self._end) != (number, end)
 
     def _take_in(self, record: Record, place: int) -> None:
-        """Take in a turn, an observation that came late, or what a watch noted where none came."""
-        if "filtered" in record and record["turn"] == self.turns:
+        """Take in a step, an observation that came late, or what a watch noted where none came."""
+        if "filtered" in record and record["step"] == self.steps:
             self._places.append([place, place])
             return
-        turn = max(self.turns - 1, 0)
+        step = max(self.steps - 1, 0)
         if "filtered" in record:
-            late = int(record.get("observation_turn", int(record["turn"])))
-            if not 0 <= late <= record["turn"] == self.turns - 1:
-                told = f"{self.scenario.mission.step_name} {record['turn']}"
-                raise RunFolderError(said("watch.turn", folder=self.folder, told=told, turns=self.turns))
+            late = int(record.get("observation_step", int(record["step"])))
+            if not 0 <= late <= record["step"] == self.steps - 1:
+                told = f"{self.scenario.mission.step_name} {record['step']}"
+                raise RunFolderError(said("watch.step", folder=self.folder, told=told, steps=self.steps))
             self._places[-1][0] = self._places[late][1] = place
-        self._told[turn] += [] if "filtered" in record else record.get("notices", [])
+        self._told[step] += [] if "filtered" in record else record.get("notices", [])
         if "model" in record:  # another one was adopted
             self._believe(place)
         verdict = record.get("model", {}).get("verdict", record.get("verdict", {}).get("folder", ""))
-        picture = picture_of(turn, self.folder / verdict) if verdict else None
+        picture = picture_of(step, self.folder / verdict) if verdict else None
         self.pictures += [picture] if picture else []
         self.number += 1
 
     def seen(self, first: int, end: int) -> list[Record]:
-        """Return what the journal says of the turns first..end - 1.
+        """Return what the journal says of the steps first..end - 1.
 
-        An observation that came late stands, with its control, in the line of its own turn.
+        An observation that came late stands, with its control, in the line of its own step.
 
         Raises
         ------
@@ -179,29 +179,29 @@ class Flight:
         with self._path.open("rb") as file:
             if self._begun_anew(os.fstat(file.fileno())):
                 raise FileNotFoundError(self._path)
-            return [self._turn(file, turn) for turn in range(first, end)]
+            return [self._step(file, step) for step in range(first, end)]
 
-    def _turn(self, file: BinaryIO, turn: int) -> Record:
-        believed, observed = self._places[turn]
+    def _step(self, file: BinaryIO, step: int) -> Record:
+        believed, observed = self._places[step]
         record = next(records_of(file, self._path, believed))[0]
         if observed != believed:
             own = next(records_of(file, self._path, observed))[0]
             record |= {name: own[name] for name in ("observed", "control_index")}
-        return record | {"notices": record.get("notices", []) + self._told.get(turn, [])}
+        return record | {"notices": record.get("notices", []) + self._told.get(step, [])}
 
-    def observed(self, turns: Sequence[Record]) -> Float:
-        """Return what the sensors said in n turns: (n, G), SI; NaN where lost."""
+    def observed(self, steps: Sequence[Record]) -> Float:
+        """Return what the sensors said in n steps: (n, G), SI; NaN where lost."""
         sensors = self.scenario.observation.count
-        return np.array([array_of(turn["observed"][:sensors]) for turn in turns])
+        return np.array([array_of(step["observed"][:sensors]) for step in steps])
 
-    def truth(self, turns: Sequence[Record]) -> Float:
-        """Return the true state of n turns: (n, K), SI; NaN where nobody knows it."""
+    def truth(self, steps: Sequence[Record]) -> Float:
+        """Return the true state of n steps: (n, K), SI; NaN where nobody knows it."""
         unknown = [None] * len(self.scenario.state)
-        return np.array([array_of(turn.get("state", unknown)) for turn in turns])
+        return np.array([array_of(step.get("state", unknown)) for step in steps])
 
-    def believed(self, turns: Sequence[Record]) -> Belief:
-        """Return what the twin believed of each of n turns when it was flown."""
-        models = groupby(turns, lambda turn: id(self._known_in(turn)))
+    def believed(self, steps: Sequence[Record]) -> Belief:
+        """Return what the twin believed of each of n steps when it was flown."""
+        models = groupby(steps, lambda step: id(self._known_in(step)))
         parts = [self._believed([*own]) for _, own in models]
         return Belief(
             probability=np.concatenate([part.probability for part in parts]),
@@ -210,42 +210,42 @@ class Flight:
             control_probability=np.concatenate([part.control_probability for part in parts]),
         )
 
-    def _believed(self, turns: Sequence[Record]) -> Belief:
-        """Return what the twin believed of turns in which it knew the same."""
-        known = self._known_in(turns[0])
-        filtered = np.array([turn["filtered"] for turn in turns])
-        controls = [turn["control_index"] for turn in turns]
+    def _believed(self, steps: Sequence[Record]) -> Belief:
+        """Return what the twin believed of steps in which it knew the same."""
+        known = self._known_in(steps[0])
+        filtered = np.array([step["filtered"] for step in steps])
+        controls = [step["control_index"] for step in steps]
         joint = known_control(filtered, controls, len(known.model.controls))
         if (learns := known.expectation) is None:
-            expected = _expected(known, joint, np.array([array_of(turn["observed"]) for turn in turns]))
+            expected = _expected(known, joint, np.array([array_of(step["observed"]) for step in steps]))
         else:
             parts = []
-            for turn, own, seen in zip(turns, joint, self.observed(turns), strict=True):
-                u = slice(turn["control_index"], turn["control_index"] + 1)
-                parts.append(learns.of_marginals(_learnt(turn), own[None, :, u], u, seen))
+            for step, own, seen in zip(steps, joint, self.observed(steps), strict=True):
+                u = slice(step["control_index"], step["control_index"] + 1)
+                parts.append(learns.of_marginals(_learnt(step), own[None, :, u], u, seen))
             expected = joined(parts)
-        believed = np.array([is_state_believed(_unexplained(turn)) for turn in turns])
-        decided = np.array([turn["decision_probability"] for turn in turns])
+        believed = np.array([is_state_believed(_unexplained(step)) for step in steps])
+        decided = np.array([step["decision_probability"] for step in steps])
         return Belief(filtered, believed, expected, decided)
 
-    def predicted(self, turn: Record) -> Belief:
-        """Return what the twin expected after a turn of the H turns to come."""
-        known, horizon = self._known_in(turn), self.scenario.mission.prediction_steps
-        flown, learns = (array_of(turn["filtered"]), turn["control_index"]), known.expectation
+    def predicted(self, step: Record) -> Belief:
+        """Return what the twin expected after a step of the H steps to come."""
+        known, horizon = self._known_in(step), self.scenario.mission.prediction_steps
+        flown, learns = (array_of(step["filtered"]), step["control_index"]), known.expectation
         coming = predict(known.model, *flown, known.plan.policy, horizon).predicted
-        none = _unexplained(turn)
+        none = _unexplained(step)
         joint = coming[..., None] * known.asked(none)
         if learns is None:
             expected = _expected(known, joint, None)
         else:
-            expected = learns.of_marginals(_learnt(turn), joint, slice(None), None)
+            expected = learns.of_marginals(_learnt(step), joint, slice(None), None)
         believed = np.full(len(coming), is_state_believed(none))
         return Belief(coming, believed, expected, joint.sum(axis=-2))
 
 
-def _unexplained(turn: Record) -> float:
-    """Return the probability in a turn that no state of the model explains the sensors."""
-    return float(turn.get("suspicion", {}).get("hypotheses", {}).get("none of these", 0.0))
+def _unexplained(step: Record) -> float:
+    """Return the probability in a step that no state of the model explains the sensors."""
+    return float(step.get("suspicion", {}).get("hypotheses", {}).get("none of these", 0.0))
 
 
 def _expected(known: Knowledge, joint: Float, rows: Float | None) -> Expected:
@@ -257,14 +257,14 @@ def _learnt(record: Record) -> dict[str, Learnt]:
 
 
 def is_prepared(folder: Path) -> bool:
-    """Return whether the flight of a run folder can be viewed: all that precedes its first turn is there."""
+    """Return whether the flight of a run folder can be viewed: all that precedes its first step is there."""
     return (folder / KNOWLEDGE_NAME).is_file()
 
 
 WINDOW = 240
-"""Turns that a page shows at once."""
+"""Steps that a page shows at once."""
 LATEST = -1
-"""Asked for in the place of a turn: the last one, whichever it is."""
+"""Asked for in the place of a step: the last one, whichever it is."""
 TALLEST_BAR = 0.82
 """Height of a probability of one, where a control has a row of height one."""
 
@@ -277,20 +277,20 @@ class Request(BaseModel, frozen=True, extra="forbid", strict=True):
     number : int
         Of the request; the answer has it again.
     flight : int
-        Of which flight the turns are that it holds.
+        Of which flight the steps are that it holds.
     first, end : int
-        It holds the turns first..end - 1.
-    turn : int
+        It holds the steps first..end - 1.
+    step : int
         To be shown; `LATEST` for the last.
     shown, count : int
-        The turn that it shows, and how many it knows of; -1 before the first answer.
+        The step that it shows, and how many it knows of; -1 before the first answer.
     """
 
     number: int
     flight: int
     first: int
     end: int
-    turn: int
+    step: int
     shown: int
     count: int
 
@@ -372,37 +372,37 @@ class Teller:
 
     def answer(self, request: Request) -> str | None:
         """Return the answer to a request; None while there is nothing new to say."""
-        count = self._flight.turns
+        count = self._flight.steps
         if not count:
             return None
-        turn = count - 1 if request.turn == LATEST else min(max(request.turn, 0), count - 1)
+        step = count - 1 if request.step == LATEST else min(max(request.step, 0), count - 1)
         same = request.flight == self._flight.number
-        if same and request.shown == turn and request.count == count:
+        if same and request.shown == step and request.count == count:
             return None
-        first, end = max(0, turn + 1 - WINDOW), turn + 1
+        first, end = max(0, step + 1 - WINDOW), step + 1
         if same and request.first <= first <= request.end:  # what is missing follows what it holds
             first = min(request.end, end)
         try:
-            seen = self._flight.seen(min(first, turn), end)
+            seen = self._flight.seen(min(first, step), end)
         except FileNotFoundError:
             return None
         answer: dict[str, Any] = {
             "number": request.number,
             "flight": self._flight.number,
             "count": count,
-            "turn": turn,
+            "step": step,
             "first": first,
-            "picture": self._picture(turn),
+            "picture": self._picture(step),
             "past": self._past(seen) if first < end else None,
             "ahead": None,
         }
-        if not (same and request.shown == turn):
+        if not (same and request.shown == step):
             answer["ahead"] = self._printed(self._flight.predicted(seen[-1]), None)
         return json.dumps(plain(answer), allow_nan=False)  # what there is not is null
 
-    def _picture(self, turn: int) -> dict[str, str] | None:
-        """Return the missing force that was known at a turn: where it is drawn, and what the verdict says."""
-        known = [number for number, item in enumerate(self._flight.pictures) if item.turn <= turn]
+    def _picture(self, step: int) -> dict[str, str] | None:
+        """Return the missing force that was known at a step: where it is drawn, and what the verdict says."""
+        known = [number for number, item in enumerate(self._flight.pictures) if item.step <= step]
         if not known:
             return None
         address = f"missing_force_{known[-1]}.svg?flight={self._flight.number}"
@@ -411,16 +411,16 @@ class Teller:
     def _past(self, seen: Sequence[Record]) -> dict[str, Any]:
         flight, folder = self._flight, f" {self._flight.folder}"
         return self._printed(flight.believed(seen), flight.observed(seen)) | {
-            "control": [turn["control_index"] for turn in seen],
+            "control": [step["control_index"] for step in seen],
             "notices": [
-                [notice["sentence"].replace(" DIR", folder) for notice in turn["notices"]] for turn in seen
+                [notice["sentence"].replace(" DIR", folder) for notice in step["notices"]] for step in seen
             ],
-            "learnt": [turn.get("learnt", {}) for turn in seen],
+            "learnt": [step.get("learnt", {}) for step in seen],
             "truth": self._scales * flight.truth(seen),
         }
 
     def _printed(self, belief: Belief, observed: Float | None) -> dict[str, Any]:
-        """Return arrays, a row for each turn, in printed units; NaN: there is none, or it is not believed."""
+        """Return arrays, a row for each step, in printed units; NaN: there is none, or it is not believed."""
         scales = self._scales
         levels = np.array([(factor.levels[0], factor.levels[-1]) for factor in self._factors]).T
         states, expected = self._flight.knowledge.model.states, belief.expected

@@ -10,17 +10,17 @@ from twin_master.run_folder import PICTURE, VERDICT
 
 
 class Picture(NamedTuple):
-    """The missing force that a verdict shows: behind which turn it came, its drawing, what it says."""
+    """The missing force that a verdict shows: behind which step it came, its drawing, what it says."""
 
-    turn: int
+    step: int
     drawing: Path
     said: str
 
 
-def picture_of(turn: int, verdict: Path) -> Picture | None:
+def picture_of(step: int, verdict: Path) -> Picture | None:
     """Return what the folder of a verdict shows of a missing force; None: nothing, or no whole verdict."""
     with suppress(DamagedFileError, KeyError, TypeError):
         if (verdict / PICTURE).is_file():
             record = read_json(verdict / VERDICT, DamagedFileError)["verdict"]
-            return Picture(turn, verdict / PICTURE, str(record["sentence"]))
+            return Picture(step, verdict / PICTURE, str(record["sentence"]))
     return None

@@ -1,4 +1,4 @@
-// Draws figures as SVG: bands, lines, dots and bars over turns or sensors, and a wing from above.
+// Draws figures as SVG: bands, lines, dots and bars over steps or sensors, and a wing from above.
 "use strict";
 
 const COLOURS = {

@@ -32,7 +32,7 @@ HEADERS = {
 }
 
 
-class _Turns(WebSocketHandler):
+class _StepsSocket(WebSocketHandler):
     """One open page."""
 
     def initialize(self, teller: Teller) -> None:
@@ -154,4 +154,4 @@ def serve(
         "/view.css": (text_of("twin_master.viewer", "view.css"), "text/css"),
         r"/missing_force_(\d+)\.svg": (picture, "image/svg+xml"),
     }
-    serve_page(texts, port, ready, wanted, [("/turns", _Turns, {"teller": teller})], teller.look)
+    serve_page(texts, port, ready, wanted, [("/steps", _StepsSocket, {"teller": teller})], teller.look)

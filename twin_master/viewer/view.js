@@ -1,6 +1,6 @@
-// Fills the figures of the page with the turns that the server tells, and moves through them.
+// Fills the figures of the page with the steps that the server tells, and moves through them.
 //
-// The page asks with the turns that it holds and the turn that it shows, and asks again once the answer is
+// The page asks with the steps that it holds and the step that it shows, and asks again once the answer is
 // painted: a slow browser skips what it could not have shown, and one that was away gets what it missed.
 "use strict";
 
@@ -8,14 +8,14 @@ const scene = JSON.parse(document.getElementById("content").textContent);
 const element = (id) => document.getElementById(id);
 const numbers = (values) => values.map((value) => (value === null ? NaN : value));
 
-const held = { first: 0, rows: [] }; // one row for each turn first, first + 1, ...
+const held = { first: 0, rows: [] }; // one row for each step first, first + 1, ...
 const state = { request: 0, flight: -1, wanted: scene.latest, shown: -1, count: -1, chosen: 0, ahead: null };
-const drawn = { past: [], ahead: [] }; // turns that are shown
+const drawn = { past: [], ahead: [] }; // steps that are shown
 let views = {};
 let socket = null;
 let player = null;
 
-// For whoever measures: [turn, time in ms since 1970 when it was painted], the last ones.
+// For whoever measures: [step, time in ms since 1970 when it was painted], the last ones.
 window.painted = [];
 
 function end() {
@@ -27,12 +27,12 @@ function ask() {
   state.request += 1;
   socket.send(JSON.stringify({
     number: state.request, flight: state.flight, first: held.first, end: end(),
-    turn: state.wanted, shown: state.shown, count: state.count,
+    step: state.wanted, shown: state.shown, count: state.count,
   }));
 }
 
 function connect() {
-  socket = new WebSocket(`ws://${location.host}/turns`);
+  socket = new WebSocket(`ws://${location.host}/steps`);
   socket.onopen = () => { notice(""); ask(); };
   socket.onmessage = (event) => take(JSON.parse(event.data));
   socket.onclose = () => {
@@ -48,10 +48,10 @@ function notice(text) {
 
 async function take(answer) {
   if (answer.error !== undefined) { notice(answer.error); return; }
-  if (answer.number !== state.request) return; // of a turn that is not wanted any more
+  if (answer.number !== state.request) return; // of a step that is not wanted any more
   keep(answer);
-  const moved = state.shown !== answer.turn || answer.ahead !== null;
-  state.shown = answer.turn;
+  const moved = state.shown !== answer.step || answer.ahead !== null;
+  state.shown = answer.step;
   state.count = answer.count;
   if (answer.ahead !== null) state.ahead = answer.ahead;
   control(answer);
@@ -59,7 +59,7 @@ async function take(answer) {
   if (moved) {
     draw();
     await onScreen();
-    window.painted.push([answer.turn, Date.now()]);
+    window.painted.push([answer.step, Date.now()]);
     if (window.painted.length > 5000) window.painted.splice(0, 2500);
   }
   if (answer.number === state.request) ask();
@@ -91,13 +91,13 @@ function keep(answer) {
 function control(answer) {
   const slider = element("slider");
   slider.max = answer.count - 1;
-  slider.value = answer.turn;
-  slider.setAttribute("aria-valuetext", `${scene.step_name} ${answer.turn}`);
-  element("count").textContent = `${scene.step_name} ${answer.turn} of ${answer.count - 1}`;
+  slider.value = answer.step;
+  slider.setAttribute("aria-valuetext", `${scene.step_name} ${answer.step}`);
+  element("count").textContent = `${scene.step_name} ${answer.step} of ${answer.count - 1}`;
   element("latest").setAttribute("aria-pressed", String(state.wanted === scene.latest));
 }
 
-// Of the last verdict that was known at the turn shown, where motion was observed.
+// Of the last verdict that was known at the step shown, where motion was observed.
 function picture(found) {
   element("force").hidden = found === null;
   if (found === null) return;
@@ -106,13 +106,13 @@ function picture(found) {
 }
 
 function draw() {
-  const turn = state.shown;
-  const begin = Math.max(0, turn + 1 - scene.window);
-  const rows = held.rows.slice(begin - held.first, turn + 1 - held.first);
+  const step = state.shown;
+  const begin = Math.max(0, step + 1 - scene.window);
+  const rows = held.rows.slice(begin - held.first, step + 1 - held.first);
   const coming = rowsOf(state.ahead);
   drawn.past = rows.map((_, index) => begin + index);
-  drawn.ahead = coming.map((_, index) => turn + 1 + index);
-  const range = [begin - 1, Math.max(turn + scene.horizon + 1, 20)];
+  drawn.ahead = coming.map((_, index) => step + 1 + index);
+  const range = [begin - 1, Math.max(step + scene.horizon + 1, 20)];
   const now = rows[rows.length - 1];
   scene.factors.forEach((_, index) => {
     const truth = rows.map((row) => row.truth[index]);
@@ -125,9 +125,9 @@ function draw() {
   course(views.chosen, range, rows, coming, "sensor", state.chosen, [
     marks(drawn.past, seen, "dot", 2, `fill="${COLOURS.observed}"`),
   ], seen);
-  drawControl(range, rows, coming, turn);
+  drawControl(range, rows, coming, step);
   drawSensors(now);
-  say(now, turn);
+  say(now, step);
   drawNotices(rows, drawn.past);
   drawLearnt(now);
 }
@@ -141,26 +141,26 @@ function rowsOf(columns) {
 function course(view, range, rows, coming, name, index, more, values = []) {
   const parts = [[drawn.past, rows, COLOURS.present, ""], [drawn.ahead, coming, COLOURS.prediction, 'stroke-dasharray="6 4"']];
   const found = [], room = [...values];
-  for (const [turns, own, colour, look] of parts) {
+  for (const [steps, own, colour, look] of parts) {
     const [mean, lower, upper] = ["", "_lower", "_upper"].map((part) => numbers(own.map((row) => row[name + part][index])));
-    found.push(band(turns, lower, upper, colour), line(turns, mean, colour, look));
+    found.push(band(steps, lower, upper, colour), line(steps, mean, colour, look));
     room.push(...mean, ...lower, ...upper);
   }
   const ahead = numbers(coming.map((row) => row[name][index])), now = numbers([rows.at(-1)[name][index]]);
   found.push(...more, marks(drawn.ahead, ahead, "dot", 2, `fill="${COLOURS.prediction}"`));
   found.push(marks([state.shown], now, "diamond", 6, `fill="${COLOURS.present}"`));
-  view.draw(range, room, found, (turn) => {
-    const row = turn <= state.shown ? rows[turn - drawn.past[0]] : coming[turn - state.shown - 1];
+  view.draw(range, room, found, (step) => {
+    const row = step <= state.shown ? rows[step - drawn.past[0]] : coming[step - state.shown - 1];
     if (row === undefined) return null;
     const [mean, low, high] = ["", "_lower", "_upper"].map((part) => shortNumber(row[name + part][index] ?? NaN));
-    return [`${scene.step_name} ${turn}`, `${mean} ${view.options.unit}`, `95 %: ${low} to ${high}`];
+    return [`${scene.step_name} ${step}`, `${mean} ${view.options.unit}`, `95 %: ${low} to ${high}`];
   });
 }
 
-function drawControl(range, rows, coming, turn) {
-  // What was concluded in a turn is the choice for the next one.
+function drawControl(range, rows, coming, step) {
+  // What was concluded in a step is the choice for the next one.
   const decided = rows.map((row, index) => [drawn.past[index] + 1, row.probability]);
-  const expected = coming.slice(1).map((row, index) => [turn + 2 + index, row.probability]);
+  const expected = coming.slice(1).map((row, index) => [step + 2 + index, row.probability]);
   const found = [[decided, COLOURS.decision], [expected, COLOURS.prediction]].flatMap(([entries, colour]) =>
     scene.controls.map((_, control) => {
       const tops = entries.map(([, probability]) => control + scene.tallest_bar * probability[control]);
@@ -169,8 +169,8 @@ function drawControl(range, rows, coming, turn) {
   const flown = scene.controls.map((_, control) => {
     const own = rows.map((row) => (row.control === control ? control : NaN));
     const half = 0.5 * (1 - 1e-3);
-    const turns = drawn.past.flatMap((at) => [at - half, at + half]);
-    return line(turns, own.flatMap((value) => [value, value]), COLOURS.truth, 'style="stroke-width:4"');
+    const steps = drawn.past.flatMap((at) => [at - half, at + half]);
+    return line(steps, own.flatMap((value) => [value, value]), COLOURS.truth, 'style="stroke-width:4"');
   });
   const all = new Map([...decided, ...expected]);
   views.control.draw(range, [0], [...found, ...flown], (at) => {
@@ -212,7 +212,7 @@ function estimate(factor, index, now) {
   return `${factor.symbol} ${mean} ± ${deviation} ${factor.unit}`;
 }
 
-function say(now, turn) {
+function say(now, step) {
   const next = now.probability.indexOf(Math.max(...now.probability));
   const health = isBelieved(now)
     ? scene.factors.map((factor, index) => estimate(factor, index, now)).join(", ")
@@ -220,19 +220,19 @@ function say(now, turn) {
   const lost = now.observed.filter((value) => value === null).length;
   const missing = lost ? ` ${lost} of ${now.observed.length} ${scene.sensors.word}s lost.` : "";
   element("said").textContent =
-    `${scene.step_name} ${turn}: ${health}. Flown ${scene.controls[now.control]}; ` +
+    `${scene.step_name} ${step}: ${health}. Flown ${scene.controls[now.control]}; ` +
     `next ${scene.controls[next]} with probability ${now.probability[next].toFixed(3)}.${missing}`;
 }
 
 const MOST_NOTICES = 8;
 
-// Each sentence once, with the turns in which it was said; the newest first.
-function drawNotices(rows, turns) {
+// Each sentence once, with the steps in which it was said; the newest first.
+function drawNotices(rows, steps) {
   const said = new Map();
   rows.forEach((row, index) => row.notices.forEach((sentence) => {
-    const [first] = said.get(sentence) ?? [turns[index]];
+    const [first] = said.get(sentence) ?? [steps[index]];
     said.delete(sentence);
-    said.set(sentence, [first, turns[index]]);
+    said.set(sentence, [first, steps[index]]);
   }));
   const newest = [...said].reverse().slice(0, MOST_NOTICES);
   element("notices").replaceChildren(...newest.map(([sentence, [first, last]]) => {
@@ -259,9 +259,9 @@ function drawLearnt(now) {
   element("learning").hidden = entries.length === 0;
 }
 
-function go(turn) {
+function go(step) {
   const last = state.count - 1;
-  state.wanted = turn >= last ? scene.latest : Math.max(0, turn);
+  state.wanted = step >= last ? scene.latest : Math.max(0, step);
   ask();
 }
 

@@ -19,13 +19,14 @@ import numpy as np
 import xarray as xr
 
 from reporting.errors import DamagedFileError
+from reporting.former_names import warn_of_former_names
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError, said
 from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.intake import GIVEN, MISSING, Feed
 from twin_master.watch.lines import GrowingFile, Pipe, Place, first_line, found, holds, rotated
-from twin_master.watch.message import LARGEST_MESSAGE, Fed, Message, MessageReader, Refused
+from twin_master.watch.message import LARGEST_MESSAGE, PRESENT_NAMES, Fed, Message, MessageReader, Refused
 
 Observations = Iterable[Mapping[str, Any]] | str | Path
 STANDARD_INPUT = "-"
@@ -110,13 +111,13 @@ def _whole(cell: str) -> int:
     return int(number if point and not zeros.strip("0") else cell)
 
 
-_OTHERS: dict[str, Callable[[str], object]] = {"turn": _whole, "time": float, "control": str}
+_OTHERS: dict[str, Callable[[str], object]] = {"step": _whole, "time": float, "control": str}
 """Columns that are no sensor."""
-_NAMES_OF_TURN, _LOST = ("turn", "step"), ("nan", "null", "none")
+_LOST = ("nan", "null", "none")
 
 
 class CsvFeed(RecordedFeed):
-    """A CSV file with a header: `turn` (or `step`) or `time`, `control`, and sensors by their names.
+    """A CSV file with a header: `step` or `time`, `control`, and sensors by their names.
 
     A file that takes the place of one that is followed has a header of its own, or the same columns.
 
@@ -162,7 +163,8 @@ class CsvFeed(RecordedFeed):
         if not any(map(_is_number, cells)):
             return False
         try:  # sensors may be called by numbers
-            return not all(cell in _OTHERS or self.reader.column(cell) is not None for cell in cells)
+            columns = [PRESENT_NAMES.get(cell, cell) for cell in cells]
+            return not all(name in _OTHERS or self.reader.column(name) is not None for name in columns)
         except Refused:  # a known name with a wrong unit
             return False
 
@@ -179,7 +181,10 @@ class CsvFeed(RecordedFeed):
             raise MissionInputError(f"{path} is empty: a CSV file begins with a line of its columns.")
         if names[0].startswith("{"):
             raise MissionInputError(said("watch.json_lines", path=path))
-        columns = ["turn" if name in _NAMES_OF_TURN else name for name in names]
+        columns = [PRESENT_NAMES.get(name, name) for name in names]
+        former = {name: PRESENT_NAMES[name] for name in names if name in PRESENT_NAMES}
+        if former:
+            warn_of_former_names(str(path), former)
         candidates = [name for name in columns if name not in _OTHERS and name[:1] != "_"]
         try:
             sensors = [found[0] for found in map(self.reader.column, candidates) if found is not None]
@@ -189,7 +194,7 @@ class CsvFeed(RecordedFeed):
                 raise Refused(self.reader.unknown(unknown, is_any_known=bool(sensors)))
         except Refused as refusal:
             raise MissionInputError(
-                f"{path}: the columns cannot be read, {refusal}; others are `turn`, `time` and `control`."
+                f"{path}: the columns cannot be read, {refusal}; others are `step`, `time` and `control`."
             ) from None
         if len({*sensors}) < len(sensors) or any(columns.count(name) > 1 for name in _OTHERS):
             raise MissionInputError(f"{path}: two columns say the same; {', '.join(names)[:300]} came.")
@@ -252,13 +257,13 @@ class RunFeed(RecordedFeed):
         role, names = scenario.observation.role, dict(enumerate(scenario.control_names))
         try:
             group: xr.Dataset = read_groups(path)["observed"].to_dataset()
-            rows, turns = group[role].values.tolist(), group["step"].values.tolist()
+            rows, steps = group[role].values.tolist(), group["step"].values.tolist()
             controls = group["control_index"].values.tolist() if "control_index" in group else []
             if {*map(len, rows)} - {scenario.observation.count} or {*controls} - {*names}:
                 raise ValueError(
                     said("watch.shape", count=scenario.observation.count, came=group[role].shape)
                 )
-            records = [{role: row, "turn": int(turn)} for row, turn in zip(rows, turns, strict=True)]
+            records = [{role: row, "step": int(step)} for row, step in zip(rows, steps, strict=True)]
             for name in (name for *_, name, _ in scenario.readings if name in group):
                 for record, value in zip(records, group[name].values.tolist(), strict=True):
                     record |= {name: value} if math.isfinite(value) else {}
@@ -299,7 +304,7 @@ class FolderFeed(RecordedFeed):
 
     def content(self, line: bytes, begin: int) -> Content | None:
         """Return the observation of a line; None where it is of none, or was cut off by a kill."""
-        record = whole_record(line)
+        record = whole_record(line, self.path)
         if record is None and line.endswith(b"\n"):
             number = self.path.read_bytes()[:begin].count(b"\n") + 1
             return Refused(f"line {number} of {self.path.name} was changed or is damaged")
@@ -307,19 +312,19 @@ class FolderFeed(RecordedFeed):
             return None
         try:
             observed, control = array_of(record["observed"]), int(record["control_index"])
-            turn, told = int(record.get("observation_turn", record["turn"])), GIVEN
+            step, told = int(record.get("observation_step", record["step"])), GIVEN
             if "intake" in record:
-                told = int(record["intake"]["given"][turn - int(record["turn"]) - 1])
+                told = int(record["intake"]["given"][step - int(record["step"]) - 1])
         except (KeyError, TypeError, ValueError, IndexError):
             return Refused("the line has another layout")
-        if told == MISSING:  # a turn for which nothing came
+        if told == MISSING:  # a step for which nothing came
             return None
         count, width = self.scenario.observation.count, self.scenario.row_width
         if len(observed) not in (count, width) or control >= len(self.scenario.control):
             return Refused("it is of an asset with other sensors or controls")
         row = np.full(width, np.nan)  # it may have been recorded without covariances
         row[: len(observed)] = observed
-        return Message(row, control, turn=turn, assumed=told != GIVEN)
+        return Message(row, control, step=step, assumed=told != GIVEN)
 
 
 def file_feed(path: Path, scenario: Scenario, *, follow: bool = False) -> CsvFeed | RunFeed | FolderFeed:

@@ -20,12 +20,12 @@ from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
     check_header,
-    last_turn,
+    last_step,
     records_backwards,
 )
 from twin_master.mission.loop import BelievedModel, journalled_decision, operate, replay
 from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
-from twin_master.mission.turns import Turn
+from twin_master.mission.steps import MissionStep
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
 from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
@@ -37,12 +37,12 @@ from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listen
 from twin_master.watch.teaching import Outcome, Teaching, both_patches, judged, patched_model
 
 WATCHED = "watched asset"
-STORED_TURNS = 1_000
-"""The last turns that `run.nc` and the report show if not told otherwise; the journal has all of them."""
+STORED_STEPS = 1_000
+"""The last steps that `run.nc` and the report show if not told otherwise; the journal has all of them."""
 FLUSH_SECONDS = 1.0
-"""Of a recorded file, which is read again after a power failure; live turns are flushed one by one."""
+"""Of a recorded file, which is read again after a power failure; live steps are flushed one by one."""
 Patched = tuple[Path, int]
-"""A patch of the twin's model, and the turn from which on it is believed."""
+"""A patch of the twin's model, and the step from which on it is believed."""
 
 
 class Watch:
@@ -66,9 +66,9 @@ class Watch:
     journal, intake, twin
         From `begun` on; another twin where it was taught.
     filtered : (S,) or None
-        What was believed after the last turn; None before the first one of this process.
+        What was believed after the last step; None before the first one of this process.
     is_quiet : bool
-        Whether the operator was told that no turn comes any more.
+        Whether the operator was told that no step comes any more.
     """
 
     journal: JournalFile
@@ -116,28 +116,28 @@ class Watch:
         self.teaching = Teaching(1.0 if notice is None else notice.threshold)
         self.teaching.read(self._path)
         for model in self.teaching.adopted[len(self.models) - 1 :]:
-            first, file = model["from_turn"], self.folder / model["patch"]
+            first, file = model["from_step"], self.folder / model["patch"]
             self.models.append(patched_model(self.scenario, file, first, self._progress))
 
     def run(
         self, feed: Feed, decide: Callable[[Mapping[str, Any]], object],
-        between: Callable[[], None] = lambda: None, *, turns: int | None = None,
+        between: Callable[[], None] = lambda: None, *, steps: int | None = None,
         patched: Patched | None = None, untold: Mapping[str, Any] | None = None,
     ) -> Counts:  # fmt: skip
-        """Watch until the feed ends, or SIGINT or SIGTERM ask for it between two turns.
+        """Watch until the feed ends, or SIGINT or SIGTERM ask for it between two steps.
 
         Parameters
         ----------
         feed : Feed
             Of the observations.
         decide : callable
-            Told each decision, once its turn is written down.
+            Told each decision, once its step is written down.
         between : callable, optional
-            Called before the first turn and behind each; it may teach the twin.
-        turns : int, optional
-            Turns in all after which to end.
+            Called before the first step and behind each; it may teach the twin.
+        steps : int, optional
+            Steps in all after which to end.
         patched : Patched, optional
-            To believe from a turn on.
+            To believe from a step on.
         untold : dict, optional
             The last decision, to be told again first.
         """
@@ -147,7 +147,7 @@ class Watch:
             feed.decide(decision)
 
         with self.begun(feed, patched):
-            self.intake.turns, self.intake.look = turns, lambda: self.quiet(tell)
+            self.intake.steps, self.intake.look = steps, lambda: self.quiet(tell)
             with listening(self.intake.ask):
                 if untold is not None:
                     tell(untold)
@@ -169,7 +169,7 @@ class Watch:
             intake.restore(last.get("intake"))
             if last:
                 self._progress.note(
-                    f"The watch goes on at {self.scenario.mission.step_name} {found.twin.turns}."
+                    f"The watch goes on at {self.scenario.mission.step_name} {found.twin.steps}."
                 )
             self.intake, self.twin, self.filtered = intake, found.twin, None
             self.is_quiet, self._heard = "quiet" in last, time.monotonic()
@@ -177,19 +177,19 @@ class Watch:
             if patched is not None:
                 self._patch(*patched)
             yield
-            if self.intake.state()["counts"] != self._told["counts"]:  # of messages behind the last turn
+            if self.intake.state()["counts"] != self._told["counts"]:  # of messages behind the last step
                 with suppress(FileNotWrittenError):  # which is no loss of what was observed
                     self.write()
 
     def decisions(self) -> Iterator[dict[str, Any]]:
-        """Yield what the operator is told of each turn, once it is written down, until no more comes.
+        """Yield what the operator is told of each step, once it is written down, until no more comes.
 
         Also the last decision again, with a notice, where the messages behind it are refused.
         """
         while True:
             twin = self.twin
-            for turn in operate(twin, self.intake):
-                yield self.decision_of(self._kept(turn))
+            for step in operate(twin, self.intake):
+                yield self.decision_of(self._kept(step))
                 if twin is not self.twin:  # it was taught meanwhile: another one goes on
                     break
             if self.intake.stream.refusals_are_untold:
@@ -201,22 +201,23 @@ class Watch:
         """Return what the operator is told with a line of the journal; nothing where it tells no decision."""
         return journalled_decision(line, self.scenario, self.models[-1].knowledge.model)
 
-    def _kept(self, turn: Turn) -> dict[str, Any]:
+    def _kept(self, step: MissionStep) -> dict[str, Any]:
         """Write down a reading and what became of it; return the line."""
-        record, told = self.intake.line(turn, self.twin), self.teaching.untold
+        record, told = self.intake.line(step, self.twin), self.teaching.untold
         if self.is_quiet:
-            sentence = f"Turn {record['turn']}: observations come again, after {self.silence:.0f} s."
+            when = f"{self.scenario.mission.step_name.capitalize()} {record['step']}"
+            sentence = f"{when}: observations come again, after {self.silence:.0f} s."
             told = [*told, Notice("heard", sentence).as_record()]
         if told:
             record["notices"] = record.get("notices", []) + told
         self._append(record)
-        self.filtered, self.is_quiet, self._heard = turn.concluded.filtered, False, time.monotonic()
+        self.filtered, self.is_quiet, self._heard = step.concluded.filtered, False, time.monotonic()
         return record
 
     def write(self, **record: Any) -> None:
-        """Write down something else than a turn."""
+        """Write down something else than a step."""
         state = {"next_control": self.twin.proposed_control, "intake": self.intake.state()}
-        self._append({"turn": self.twin.turns - 1, **state, **record})
+        self._append({"step": self.twin.steps - 1, **state, **record})
 
     def _append(self, record: Mapping[str, Any]) -> None:
         """Add a line to the journal, and take it in."""
@@ -227,7 +228,7 @@ class Watch:
 
     @property
     def silence(self) -> float:
-        """How long no turn has come [s]."""
+        """How long no step has come [s]."""
         return time.monotonic() - self._heard
 
     def last_decision(self) -> dict[str, Any] | None:
@@ -240,11 +241,11 @@ class Watch:
         return None if last is None else {**self.decision_of(last), "told_again": True}
 
     def quiet(self, decide: Callable[[dict[str, Any]], None]) -> None:
-        """Tell the last decision with the notice that it grows old, once no turn has come for too long."""
+        """Tell the last decision with the notice that it grows old, once no step has come for too long."""
         longest, step = self.scenario.watch.quiet_after_seconds, self.scenario.mission.step_name
         if longest is None or self.is_quiet or self.silence < longest:
             return
-        since = f"since {step} {self.twin.turns - 1}" if self.twin.turns else "and none before"
+        since = f"since {step} {self.twin.steps - 1}" if self.twin.steps else "and none before"
         sentence = f"No {step} has come for {longest:g} s, {since}: see whether logger and broker are there."
         decision = self._last_decision_with(Notice("quiet", sentence))
         self.write(notices=decision["notices"], quiet=decision)
@@ -253,28 +254,28 @@ class Watch:
 
     def _refusals(self) -> dict[str, Any]:
         """Write down that messages are refused; return the last decision with the notice that says so."""
-        decision = self._last_decision_with(self.intake.stream.refusals(self.twin.turns))
+        decision = self._last_decision_with(self.intake.stream.refusals(self.twin.steps))
         self.write(notices=decision["notices"], refused=decision)
         return decision
 
     def _last_decision_with(self, notice: Notice) -> dict[str, Any]:
         """Return the last decision, or what stands for it before the first one, with a notice alone."""
-        return {**(self.last_decision() or {"turn": -1}), "notices": [notice.as_record()]}
+        return {**(self.last_decision() or {"step": -1}), "notices": [notice.as_record()]}
 
-    def trial(self, file: Path, from_turn: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
-        """Return what tells what comes of a patch from a turn on, after all lines of the journal so far."""
+    def trial(self, file: Path, from_step: int, compared: tuple[int, int] = (0, 0)) -> Callable[..., Outcome]:
+        """Return what tells what comes of a patch from a step on, after all lines of the journal so far."""
         models = tuple(self.models)
-        believed = [model for model in models if model.from_turn <= from_turn][-1]
+        believed = [model for model in models if model.from_step <= from_step][-1]
         patch = both_patches(believed.patch, file)
         return partial(
-            judged, self._path, self.journal.size, self.scenario, models, patch, from_turn, compared
+            judged, self._path, self.journal.size, self.scenario, models, patch, from_step, compared
         )
 
     def _patch(self, file: Path, first: int) -> None:
-        """Believe a patch that is given from a turn on."""
-        turns = self.twin.turns
-        if not turns or not 0 <= first <= turns:
-            raise MissionInputError(said("watch.from_turn", turns=turns))
+        """Believe a patch that is given from a step on."""
+        steps = self.twin.steps
+        if not steps or not 0 <= first <= steps:
+            raise MissionInputError(said("watch.from_step", steps=steps))
         outcome = self.trial(file, first)(progress=self._progress)
         # The missing force that its verdict shows is kept for viewers.
         kept, shown = f"{TEACHING}/given_{len(self.models)}", [file.with_name(VERDICT), file.parent / PICTURE]
@@ -286,18 +287,18 @@ class Watch:
 
     def adopt(self, outcome: Outcome, notice: Mapping[str, Any] | None, verdict: str = "") -> None:
         """Believe a patched model: with its twin it is gone on."""
-        name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_turn
+        name, first = f"asset/model_patch_{len(self.models)}.json", outcome.model.from_step
         atomic_write_bytes(self.folder / name, outcome.patch)
         again, _ = replay(self._path, self.models, self.scenario.watch.lag, question=outcome.model)
-        alarms = [n for turn, n in again.notices if turn >= first and n.kind == "alarm"]
+        alarms = [n for step, n in again.notices if step >= first and n.kind == "alarm"]
         self.twin = again.twin
         self.models.append(replace(outcome.model, patch=self.folder / name))
         model: dict[str, Any] = {
-            "patch": name, "from_turn": first, "alarms": [vars(alarm) for alarm in alarms], **outcome.record,
+            "patch": name, "from_step": first, "alarms": [vars(alarm) for alarm in alarms], **outcome.record,
             **({} if notice is None else {"notice": dict(notice)}),
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
-        # Before viewers read the line; they show earlier turns as they were told.
+        # Before viewers read the line; they show earlier steps as they were told.
         keep_knowledge(self.folder, self.models[-2].knowledge, len(self.models) - 2)
         keep_knowledge(self.folder, outcome.model.knowledge)
         self.write(model=model)
@@ -309,20 +310,20 @@ class Watch:
         since = f"The patched model is believed from {self.scenario.mission.step_name} {first} on"
         self._progress.note(f"{since}: {', '.join(gaps)}. {model['policy_change']}".rstrip())
 
-    def store(self, counts: Counts, *, last: int = STORED_TURNS, report: bool = True) -> None:
-        """Write `run.nc`, tables, summary and report of the last turns."""
-        turns = last_turn(self._path)[0] + 1
-        if not turns:
+    def store(self, counts: Counts, *, last: int = STORED_STEPS, report: bool = True) -> None:
+        """Write `run.nc`, tables, summary and report of the last steps."""
+        steps = last_step(self._path)[0] + 1
+        if not steps:
             self._progress.note("Nothing was observed: there is nothing to report.")
             return
-        result, attributes = self.result(turns, last), {}
+        result, attributes = self.result(steps, last), {}
         for model in self.teaching.adopted[-1:]:
-            attributes = {"model_patch": model["patch"], "model_patch_from_step": model["from_turn"]}
+            attributes = {"model_patch": model["patch"], "model_patch_from_step": model["from_step"]}
         origin = FlownAndBelieved(WATCHED, self._source.origin.model)
         with self._progress.stage("Storing"):
             store_flight(
-                self.folder, self._config, result, origin, steps=turns,
-                figures=self._figures(counts, turns), attributes=attributes,
+                self.folder, self._config, result, origin, steps=steps,
+                figures=self._figures(counts, steps), attributes=attributes,
             )  # fmt: skip
         if report:
             from twin_master.report.page import write_report
@@ -330,34 +331,34 @@ class Watch:
             with self._progress.stage("Writing the report"):
                 write_report(self.folder)
 
-    def result(self, turns: int, last: int) -> MissionResult:
-        """Return the last of so many turns, as a mission."""
-        first = max(0, turns - last)
-        found, _ = replay(self._path, self.models, None, first_turn=first)
-        flight = replace(found.behind(first - found.first_turn), notices=self.told(first))
+    def result(self, steps: int, last: int) -> MissionResult:
+        """Return the last of so many steps, as a mission."""
+        first = max(0, steps - last)
+        found, _ = replay(self._path, self.models, None, first_step=first)
+        flight = replace(found.behind(first - found.first_step), notices=self.told(first))
         return MissionResult(self.scenario, self.models[-1].knowledge, flight, models=self.models)
 
     def told(self, first: int) -> list[tuple[int, Notice]]:
-        """Return what the operator was told in the turns from `first` on, each sentence once.
+        """Return what the operator was told in the steps from `first` on, each sentence once.
 
-        What was told before the first turn counts to it. The first alarm is told whenever it was raised.
+        What was told before the first step counts to it. The first alarm is told whenever it was raised.
         """
         early, told = self.teaching.first_alarm, dict[str, tuple[int, Notice]]()
-        lines = takewhile(lambda line: max(line[0].get("turn", 0), 0) >= first, records_backwards(self._path))
+        lines = takewhile(lambda line: max(line[0].get("step", 0), 0) >= first, records_backwards(self._path))
         found = [early] if early is not None and early[0] < first else []
         for record in reversed([record for record, *_ in lines if "notices" in record]):
-            found += [(max(record["turn"], 0), notice) for notice in record["notices"]]
-        for turn, notice in found:
+            found += [(max(record["step"], 0), notice) for notice in record["notices"]]
+        for step, notice in found:
             known = Notice(**{**notice, "sensors": tuple(notice["sensors"])})
-            told.setdefault(known.sentence, (turn, known))
+            told.setdefault(known.sentence, (step, known))
         return [*told.values()]
 
-    def _figures(self, counts: Counts, turns: int) -> list[Told]:
+    def _figures(self, counts: Counts, steps: int) -> list[Told]:
         """Return what the summary tells of a watch."""
         step = {"step": self.scenario.mission.step_name, "file": REJECTED_NAME}
-        came = [turns, counts.missing, counts.late, counts.duplicates, counts.rejected]
+        came = [steps, counts.missing, counts.late, counts.duplicates, counts.rejected]
         told: list[Told] = [("watch", step, came)]
         for model in self.teaching.adopted:
             gaps = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
-            told.append(("patch", step | {"first": model["from_turn"]}, gaps))
+            told.append(("patch", step | {"first": model["from_step"]}, gaps))
         return told

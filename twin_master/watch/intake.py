@@ -1,4 +1,4 @@
-"""From messages to readings: turns in order, gaps predicted through, late ones in their place."""
+"""From messages to readings: steps in order, gaps predicted through, late ones in their place."""
 
 import json
 import signal
@@ -17,8 +17,8 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text, explained_write_errors
 from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError, said
-from twin_master.mission.journal import state_text, turn_record
-from twin_master.mission.turns import Reading, Turn
+from twin_master.mission.journal import state_text, step_record
+from twin_master.mission.steps import MissionStep, Reading
 from twin_master.network.estimator import Notice, Words
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
@@ -33,10 +33,10 @@ REJECTED_NAME = "rejected.jsonl"
 REJECTED_KEPT = 10_000
 """Refused messages that are written down; further ones are counted only, so that a flood fills no disk."""
 _TEXT_KEPT = 200
-SNAPSHOT_TURNS = 32
-"""Turns between two lines of the journal that also hold the state of the twin."""
+SNAPSHOT_STEPS = 32
+"""Steps between two lines of the journal that also hold the state of the twin."""
 MISSING, _ASSUMED, GIVEN = 0, 1, 2
-"""Of a turn: not received; received with a control that was assumed and may be corrected; with its own."""
+"""Of a step: not received; received with a control that was assumed and may be corrected; with its own."""
 
 
 class Feed:
@@ -80,7 +80,7 @@ class Counts:
     received : int
         Messages read.
     missing : int
-        Turns that were predicted through because nothing came, less those that came late.
+        Steps that were predicted through because nothing came, less those that came late.
     late, duplicates, rejected : int
         Messages that were put in their place later, that said nothing new, and that were refused.
     """
@@ -95,7 +95,7 @@ class Counts:
 class Intake:
     """The messages of a feed as the source of a twin.
 
-    A message belongs to the turn that it names, or to that of its time, or to the next one. One about a turn
+    A message belongs to the step that it names, or to that of its time, or to the next one. One about a step
     that was received before must agree with it: what it has beyond is taken in, a contradiction is refused.
     Nothing that was received can be changed afterwards.
 
@@ -112,8 +112,8 @@ class Intake:
     ----------
     counts : Counts
         What came so far, up to the last reading.
-    observation_turn : int
-        The turn of the last reading.
+    observation_step : int
+        The step of the last reading.
     notices : list of Notice
         Of the last reading: sensors of which no number came any more, or came again; what is wrong with the
         stream of messages, see `StreamNotices`.
@@ -125,7 +125,7 @@ class Intake:
         Whether the feed has ended; if not, more may come after `read` has returned None.
     look : callable or None
         Called now and then while nothing comes; without it nothing is waited for.
-    turns : int or None
+    steps : int or None
         In all, after which it ends.
     asked : bool
         Whether the end was asked for.
@@ -151,10 +151,10 @@ class Intake:
         self._came = self._useful = 0  # messages in this process, and those that told something of a sensor
         self._before: Float = np.empty(0)
         self.counts = Counts()
-        self.observation_turn = -1
+        self.observation_step = -1
         self.ended = self.asked = self._waiting = False
         self.look: Callable[[], None] | None = None
-        self.turns: int | None = None
+        self.steps: int | None = None
 
     @property
     def settled(self) -> bool:
@@ -163,7 +163,7 @@ class Intake:
 
     def state(self) -> dict[str, Any]:
         """Return what is needed to go on, as JSON."""
-        # The message behind a gap is read again, until its own turn is written down.
+        # The message behind a gap is read again, until its own step is written down.
         waiting = bool(self._pending)
         counts = vars(self.counts) | {"received": self.counts.received - waiting}
         stream = self.stream.state(waiting=waiting)
@@ -172,23 +172,23 @@ class Intake:
             "given": "".join(map(str, self._given)),
             "origin": self._clock.origin,
             "source": self._before_last if waiting else self._place,
-            **({} if self._clock.only_turn is None else {"first_timed": self._clock.only_turn}),
+            **({} if self._clock.only_step is None else {"first_timed": self._clock.only_step}),
             **({"unreadable": sorted(self._unreadable)} if self._unreadable else {}),
             **({"stream": stream} if stream else {}),
         }
 
-    def line(self, turn: Turn, twin: Twin) -> dict[str, Any]:
+    def line(self, step: MissionStep, twin: Twin) -> dict[str, Any]:
         """Return what a line of the journal says of the last reading and what became of it."""
-        concluded = turn.concluded
-        record = turn_record(turn) | {
-            "observation_turn": self.observation_turn,
-            "control_index": twin.control_of(self.observation_turn),
+        concluded = step.concluded
+        record = step_record(step) | {
+            "observation_step": self.observation_step,
+            "control_index": twin.control_of(self.observation_step),
             "intake": self.state(),
         }
-        if turn.reading.revises is not None:
+        if step.reading.revises is not None:
             record["control_in_force"] = concluded.control_index
-        elif (concluded.turn + 1) % SNAPSHOT_TURNS == 0 and (settled := twin.settled()):
-            record["settled"] = {"turn": settled[0], "state": state_text(settled[1])}
+        elif (concluded.step + 1) % SNAPSHOT_STEPS == 0 and (settled := twin.settled()):
+            record["settled"] = {"step": settled[0], "state": state_text(settled[1])}
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         if told := [n.as_record() for n in self.notices if (n.kind, n.sensors) not in known]:
             record["notices"] = record.get("notices", []) + told
@@ -203,7 +203,7 @@ class Intake:
         if state is not None:
             self.counts = Counts(**state["counts"])
             self._clock.origin = state["origin"]
-            self._clock.only_turn = state.get("first_timed")
+            self._clock.only_step = state.get("first_timed")
             self._given.extend(map(int, state["given"]))
             self._unreadable = set(state.get("unreadable", ()))
             self.stream.restore(state.get("stream", {}))
@@ -214,14 +214,14 @@ class Intake:
             kept = lines[: self.counts.rejected] if again else lines  # those behind are read again
             kept = [line for line in kept if line.endswith("\n")]  # not cut off by a kill
             self._kept = len(kept)
-            untold = max(len(kept) - self.counts.rejected, 0)  # behind the last turn
+            untold = max(len(kept) - self.counts.rejected, 0)  # behind the last step
             self.counts.rejected += untold
             self.counts.received += untold
             if kept != lines:
                 atomic_write_text(self._rejected, "".join(kept))
 
     def ask(self) -> None:
-        """Ask for the end: between two turns, never within one."""
+        """Ask for the end: between two steps, never within one."""
         self.asked = True
         if self._waiting:
             raise _Asked
@@ -229,7 +229,7 @@ class Intake:
     def read(self, twin: Twin) -> Reading | None:
         """Return the next reading, see `Source.read`; None also where the end was asked for."""
         with suppress(_Asked):
-            while not self.asked and (self.turns is None or twin.turns < self.turns):
+            while not self.asked and (self.steps is None or twin.steps < self.steps):
                 if self.stops_at_refusals and self.stream.refusals_are_untold:  # also as no state could show
                     return None
                 begin = time.monotonic()
@@ -260,45 +260,45 @@ class Intake:
         self.counts.received += 1
         self._came += 1
         self._before_last, self._place = self._place, self._feed.place
-        turn: int | None = None
+        step: int | None = None
         try:
             if isinstance(message, Refused):
                 raise message
-            turn = self._turn_of(twin, message)
-            self._sort(twin, message, turn)
+            step = self._step_of(twin, message)
+            self._sort(twin, message, step)
         except Refused as refusal:
-            self._refuse(str(refusal), turn)
+            self._refuse(str(refusal), step)
         return True
 
     def _next(self, twin: Twin) -> Reading:
         """Return the next of the readings that have come."""
-        turn, reading, given = self._pending.popleft()
-        self.observation_turn = turn
+        step, reading, given = self._pending.popleft()
+        self.observation_step = step
         self._known = self._unreadable
         self._stream_before = self.stream.state(waiting=False)
         self.notices = [*self._noticed(reading)]
         if given == MISSING:
             self.notices += self.stream.coming()
         else:
-            self.notices += self._taken(turn, reading)
+            self.notices += self._taken(step, reading)
         if reading.revises is None:
             self._given.append(given)
             self.counts.missing += given == MISSING
         else:
-            place = turn - twin.turns
+            place = step - twin.steps
             self.counts.missing -= self._given[place] == MISSING
             self.counts.late += 1
             self._given[place] = max(given, self._given[place])
         return reading
 
-    def _taken(self, turn: int, reading: Reading) -> list[Notice]:
+    def _taken(self, step: int, reading: Reading) -> list[Notice]:
         """Take in that a message is assimilated; return what is to be told of the stream of messages."""
         is_blind = bool(np.isnan(reading.observed).all())
         self._useful += not is_blind
         passed_over = reading.passed_over if isinstance(reading, Message) else {}
         if reading.revises is not None:  # it says nothing of how the sensors are now
             is_blind = self.stream.is_blind
-        return self.stream.take(turn, is_blind=is_blind, passed_over=passed_over)
+        return self.stream.take(step, is_blind=is_blind, passed_over=passed_over)
 
     def complaint(self) -> str:
         """Return why the messages of this process were of no use, in a sentence; empty where they were.
@@ -323,7 +323,7 @@ class Intake:
         if reading.revises is not None:
             return  # it says nothing of how the sensors are now
         came, words = reading.unreadable, self._words
-        when = f"{words.step.capitalize()} {self.observation_turn}"
+        when = f"{words.step.capitalize()} {self.observation_step}"
         for g in sorted(came.keys() - self._unreadable):
             sentence = said("watch.left_out", when=when, sensor=words.sensors([g]), came=came[g])
             yield Notice("gauge_left_out", sentence, (g + 1,))
@@ -334,19 +334,19 @@ class Intake:
         self._unreadable = (self._unreadable | came.keys()) - back
 
     def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
-        """Refuse an observation that no state allows; its turn is predicted through, or stays as it was."""
+        """Refuse an observation that no state allows; its step is predicted through, or stays as it was."""
         self.stream.restore(self._stream_before)
         self._useful -= 1
-        self._refuse(str(error), self.observation_turn)
+        self._refuse(str(error), self.observation_step)
         self.notices = [notice for notice in self.notices if notice.kind == "clock"]
         self._unreadable = self._known
         if reading.revises is not None:
             return Reading(self._before, None, reading.revises)
         return Reading(np.full(self._width, np.nan), reading.control)
 
-    def _refuse(self, reason: str, turn: int | None) -> None:
+    def _refuse(self, reason: str, step: int | None) -> None:
         self.counts.rejected += 1
-        self.stream.refuse(turn, one_line(reason))
+        self.stream.refuse(step, one_line(reason))
         if self._rejected is None or self._kept >= REJECTED_KEPT:
             return
         self._kept += 1
@@ -354,48 +354,48 @@ class Intake:
         with explained_write_errors(self._rejected), self._rejected.open("a", encoding="utf-8") as file:
             file.write(json.dumps(record, ensure_ascii=True) + "\n")
 
-    def _turn_of(self, twin: Twin, message: Message) -> int:
-        """Return the turn that a message names, or that of its time, or the next one."""
-        if message.turn is not None:
-            return message.turn
+    def _step_of(self, twin: Twin, message: Message) -> int:
+        """Return the step that a message names, or that of its time, or the next one."""
+        if message.step is not None:
+            return message.step
         if message.time is None:
-            return twin.turns
-        return self._clock.turn_of(message.time, twin.turns, self.stream)
+            return twin.steps
+        return self._clock.step_of(message.time, twin.steps, self.stream)
 
-    def _sort(self, twin: Twin, message: Message, turn: int) -> None:
-        """Take in a message: the next turn, one ahead with the gap before it, or one that was before."""
+    def _sort(self, twin: Twin, message: Message, step: int) -> None:
+        """Take in a message: the next step, one ahead with the gap before it, or one that was before."""
         most = self._section.longest_gap
-        ahead, told = turn - twin.turns, message.control is not None and not message.assumed
+        ahead, told = step - twin.steps, message.control is not None and not message.assumed
         given = GIVEN if told else _ASSUMED
         unit = ""
-        if message.turn is None and message.time is not None:
-            unit = self._clock.slipped_unit(message.time, twin.turns)
+        if message.step is None and message.time is not None:
+            unit = self._clock.slipped_unit(message.time, twin.steps)
         if ahead > most:
-            far = f"turn {turn} is {ahead} turns ahead of the next one, {twin.turns}"
+            far = f"step {step} is {ahead} steps ahead of the next one, {twin.steps}"
             raise Refused(f"{far}, and `watch.longest_gap` is {most}{unit_advice(unit)}")
-        if turn < twin.first_kept and ahead < 0:
-            raise Refused(said("watch.late", turn=turn, late=-1 - ahead, lag=self._section.lag))
+        if step < twin.first_kept and ahead < 0:
+            raise Refused(said("watch.late", step=step, late=-1 - ahead, lag=self._section.lag))
         if ahead > 0:
-            self.stream.gap(twin.turns, turn, unit)
+            self.stream.gap(twin.steps, step, unit)
         if ahead >= 0:
             lost = Reading(np.full(self._width, np.nan))
-            self._pending += [(twin.turns + gap, lost, MISSING) for gap in range(ahead)]
-            self._pending.append((turn, message, given))
+            self._pending += [(twin.steps + gap, lost, MISSING) for gap in range(ahead)]
+            self._pending.append((step, message, given))
             return
-        before = twin.observed(turn)
+        before = twin.observed(step)
         both = ~np.isnan(before) & ~np.isnan(message.observed)
         if not np.array_equal(before[both], message.observed[both]):
-            raise Refused(f"it contradicts what was received of turn {turn} before")
-        another = message.control not in (None, twin.control_of(turn))
+            raise Refused(f"it contradicts what was received of step {step} before")
+        another = message.control not in (None, twin.control_of(step))
         if another and self._given[ahead] == GIVEN:
-            raise Refused(f"it contradicts the control of turn {turn}")
+            raise Refused(f"it contradicts the control of step {step}")
         merged = np.where(np.isnan(before), message.observed, before)
         if not another and np.array_equal(merged, before, equal_nan=True):
             self.counts.duplicates += 1
             self._useful += 1
             return
         self._before = before
-        self._pending.append((turn, replace(message, observed=merged, revises=turn), given))
+        self._pending.append((step, replace(message, observed=merged, revises=step), given))
 
 
 class _Asked(BaseException):

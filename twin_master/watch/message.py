@@ -15,9 +15,10 @@ from unicodedata import normalize
 import numpy as np
 
 from reporting.arrays import Float
+from reporting.former_names import with_present_names
 from reporting.json_file import parse_json
 from reporting.words import listing
-from twin_master.mission.turns import Reading
+from twin_master.mission.steps import Reading
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import LARGEST_SEED
 
@@ -31,8 +32,10 @@ _PREFIXES = {"": 1.0, "n": 1e-9, "u": 1e-6, "m": 1e-3, "k": 1e3, "M": 1e6, "G": 
 _POWER = re.compile(r"[^\W\d_]+(?:\^|\*\*)?([+-]?\d)")
 """A unit whose first name has a power, which its prefix has, too: a mm2 is 1e-6 m2."""
 _WITHOUT_UNIT = {"1": 1.0, "percent": 1e-2, "microstrain": 1e-6}
-OTHER_KEYS = "turn", "time", "control"
+OTHER_KEYS = "step", "time", "control"
 """What stands in a message beside its sensors."""
+PRESENT_NAMES = {"turn": "step"}
+"""The present name of each key of a message, and of each column of a file, by its former name."""
 _SECOND = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
 """A second in each unit of times."""
 _LIKELY = 0.8
@@ -52,8 +55,8 @@ class Message(Reading):
 
     Attributes
     ----------
-    turn : int or None
-        Its turn, if it says so.
+    step : int or None
+        Its step, if it says so.
     time : float or None
         Its time [s], if it says so.
     assumed : bool
@@ -62,7 +65,7 @@ class Message(Reading):
         Names in it that are no sensor; with each what it probably is, in words, where it looks like a slip.
     """
 
-    turn: int | None = None
+    step: int | None = None
     time: float | None = None
     assumed: bool = False
     passed_over: Mapping[str, str] = field(default_factory=dict)
@@ -171,6 +174,7 @@ class MessageReader:
         return record
 
     def _read(self, record: Mapping[str, object]) -> Message:
+        record = with_present_names(record, PRESENT_NAMES, "A message", Refused)
         observed = np.full(self._width, np.nan)
         given: set[int] = set()
         unreadable: dict[int, str] = {}
@@ -199,13 +203,13 @@ class MessageReader:
             example = next(iter(self._index))
             raise Refused(
                 f"`{nested[:_NAME_SHOWN]}` holds an object, and no sensor stands beside it: sensors stand at "
-                f'the top level of a message, as in {{"turn": 0, "{example}": 0.0}}'
+                f'the top level of a message, as in {{"step": 0, "{example}": 0.0}}'
             )
         if passed_over and not self.allows_unknown:
             raise Refused(self.unknown([*passed_over], is_any_known=bool(given)))
-        turn, time, control = (record.get(name) for name in OTHER_KEYS)
-        if turn is not None and (type(turn) is not int or not 0 <= turn <= LARGEST_SEED):
-            raise Refused(f"`turn` is a whole number from 0, and {turn!r:.40} came")
+        step, time, control = (record.get(name) for name in OTHER_KEYS)
+        if step is not None and (type(step) is not int or not 0 <= step <= LARGEST_SEED):
+            raise Refused(f"`step` is a whole number from 0, and {step!r:.40} came")
         time = float(time) if type(time) is int else time
         if time is not None and not (isinstance(time, float) and math.isfinite(time)):
             raise Refused("`time` is a number")
@@ -216,7 +220,7 @@ class MessageReader:
             observed,
             number,
             unreadable=unreadable,
-            turn=turn,
+            step=step,
             time=None if time is None else time / self._second,
             passed_over=passed_over,
         )

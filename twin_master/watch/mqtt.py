@@ -18,7 +18,7 @@ from typing import Any
 
 from reporting.files import atomic_write_text, explained_write_errors
 from twin_master.errors import MissionInputError, said
-from twin_master.mission.journal import JOURNAL_NAME, last_turn, records
+from twin_master.mission.journal import JOURNAL_NAME, last_step, records
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import PASSWORD_VARIABLE, Broker, shown
 from twin_master.watch.folder import Watch
@@ -291,19 +291,19 @@ class Topic(Feed):
             yield self._read_message(self.came.popleft() if self.came else None)
 
     def _read_message(self, payload: bytes | None) -> Fed:
-        """Return the observation in a message, which must name its turn or time."""
+        """Return the observation in a message, which must name its step or time."""
         if payload is None:
             return None, ""
         message = self._reader.message(payload)
-        if isinstance(message, Message) and message.turn is None and message.time is None:
-            message = Refused("a broker may deliver it twice: `turn` or `time` is needed over MQTT")
+        if isinstance(message, Message) and message.step is None and message.time is None:
+            message = Refused("a broker may deliver it twice: `step` or `time` is needed over MQTT")
         return message, shown(payload)
 
     def begun(self, watch: Watch) -> None:
         """Publish what the journal of a watch has, which is begun or taken up again."""
         self.watch = watch
         self._path, self._journal = watch.folder / PUBLISHED_NAME, watch.folder / JOURNAL_NAME
-        _, size = last_turn(self._journal)  # decisions before may have been published
+        _, size = last_step(self._journal)  # decisions before may have been published
         if not self._path.is_file():
             atomic_write_text(self._path, f"{size:020d}\n")
         text = self._path.read_text(encoding="utf-8", errors="replace").strip()
@@ -389,8 +389,8 @@ class MqttFeed(Topic):
         assert self.watch is not None
         watch, counts = self.watch, self.watch.intake.counts
         return {
-            "state": "quiet" if watch.is_quiet else "watching", "turn": watch.twin.turns - 1,
-            "seconds_since_turn": round(watch.silence, 1), "lag": len(self._session.came),
+            "state": "quiet" if watch.is_quiet else "watching", "step": watch.twin.steps - 1,
+            "seconds_since_step": round(watch.silence, 1), "lag": len(self._session.came),
             "received": counts.received, "refused": counts.rejected,
         }  # fmt: skip
 

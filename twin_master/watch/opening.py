@@ -1,4 +1,4 @@
-"""A watch from its sources to its report, begun or taken up again, and as it stood after a turn."""
+"""A watch from its sources to its report, begun or taken up again, and as it stood after a step."""
 
 import math
 import shutil
@@ -19,13 +19,13 @@ from twin_master.assets.resolution import (
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, NotResumableError, said
-from twin_master.mission.journal import JOURNAL_NAME, last_turn
+from twin_master.mission.journal import JOURNAL_NAME, last_step
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.store.writing import SUMMARY_NAME
 from twin_master.store.writing import open_run as stored_run
 from twin_master.watch.feeds import Broker, Observations, RecordedFeed, feed_of
-from twin_master.watch.folder import STORED_TURNS, Watch
+from twin_master.watch.folder import STORED_STEPS, Watch
 from twin_master.watch.intake import Counts
 from twin_master.watch.mqtt import BEGIN_ANEW, CLIENT_SUFFIX, MqttFeed
 from twin_master.watch.teaching import check_teachable
@@ -79,14 +79,14 @@ def resumed_watch(
 
 @contextmanager
 def flown(folder: Path, first: int | None, last: int | None, progress: Progress) -> Iterator[Path]:
-    """Give the run folder of a flight up to a turn: of a watch, which may go on, a copy that ended there.
+    """Give the run folder of a flight up to a step: of a watch, which may go on, a copy that ended there.
 
     Parameters
     ----------
     folder : Path
         Of a run, which is given as it is, or of a watch, which is only read.
     first, last : int or None
-        The first turn that is wanted, and the last one; None for all that are in the journal.
+        The first step that is wanted, and the last one; None for all that are in the journal.
     progress : Progress
         Shows stages.
 
@@ -95,16 +95,16 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
     NotResumableError
         The journal was changed or is damaged.
     MissionInputError
-        There is no turn from the first one on.
+        There is no step from the first one on.
     """
     config = _config(folder)
     if config is None:
         yield folder
         return
-    turn, end = last_turn(folder / JOURNAL_NAME, math.inf if last is None else last)
-    if first is not None and turn < first:
-        known = f"the turns 0 to {turn}" if turn >= 0 else "no turn"
-        limit = "" if last is None else f" up to turn {last}"
+    step, end = last_step(folder / JOURNAL_NAME, math.inf if last is None else last)
+    if first is not None and step < first:
+        known = f"the steps 0 to {step}" if step >= 0 else "no step"
+        limit = "" if last is None else f" up to step {last}"
         raise MissionInputError(f"{folder} has {known}{limit}, and none from {first} on.")
     with TemporaryDirectory(prefix="uav_twin_") as place:
         copy = Path(place) / folder.resolve().name
@@ -122,7 +122,7 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
 def open_run(folder: Path | str) -> "xr.DataTree":
     """Return everything that a run or a watch left, `run.nc`, as labelled arrays in memory.
 
-    A watch that goes on, or was killed, is read as it would be had it ended after the last turn of its
+    A watch that goes on, or was killed, is read as it would be had it ended after the last step of its
     journal, and is not touched.
 
     Returns
@@ -145,12 +145,12 @@ def open_run(folder: Path | str) -> "xr.DataTree":
 
 
 def stored(folder: Path) -> bool:
-    """Return whether the files of a watch have the last turn of its journal."""
+    """Return whether the files of a watch have the last step of its journal."""
     try:
         ended = read_json(folder / SUMMARY_NAME, DamagedFileError)["steps"]
     except (DamagedFileError, KeyError, TypeError):
         return False
-    return bool(ended == last_turn(folder / JOURNAL_NAME)[0] + 1)
+    return bool(ended == last_step(folder / JOURNAL_NAME)[0] + 1)
 
 
 def _config(folder: Path) -> dict[str, Any] | None:
@@ -171,14 +171,14 @@ def watch(
     decide: Decide = lambda _decision: None,
     resume: bool = False,
     follow: bool = False,
-    turns: int | None = None,
+    steps: int | None = None,
     model_patch: Path | str | None = None,
-    from_turn: int | None = None,
+    from_step: int | None = None,
     teach: bool = False,
     allow_unknown: bool = False,
     ca_file: Path | str | None = None,
     replace: bool = False,
-    last: int = STORED_TURNS,
+    last: int = STORED_STEPS,
     report: bool = True,
     otherwise: str | None = None,
     begun: Callable[[Watch], object] = lambda _watch: None,
@@ -200,19 +200,19 @@ def watch(
     overrides
         What differs from the file: ``seed``, ``calibration``, ``library``, ``learnt``.
     decide
-        Told the decision of each turn, once the turn is written down; first the last one again where a kill
+        Told the decision of each step, once the step is written down; first the last one again where a kill
         may have left it untold.
     resume
         Take up the watch in the folder.
     follow
         Wait at the end of a CSV file for more.
-    turns
-        Turns in all after which to end.
-    model_patch, from_turn
-        A patch, such as `patch.json` of `discrepancy run`, and the turn from which on it is believed; with
+    steps
+        Steps in all after which to end.
+    model_patch, from_step
+        A patch, such as `patch.json` of `discrepancy run`, and the step from which on it is believed; with
         `resume`.
     teach
-        Look for the cause of an alarm, and believe what is named and proved on later turns.
+        Look for the cause of an alarm, and believe what is named and proved on later steps.
     allow_unknown
         Pass over keys and columns that are no sensor.
     ca_file
@@ -220,7 +220,7 @@ def watch(
     replace
         Take the place of an existing folder.
     last
-        Turns, the last ones, in `run.nc` and report.
+        Steps, the last ones, in `run.nc` and report.
     report
         Draw the report.
     otherwise
@@ -242,9 +242,9 @@ def watch(
     """
     loaded = None if scenario is None else load_scenario(scenario)
     given, progress = given_overrides(overrides), progress or SilentProgress()
-    patch = None if model_patch is None or from_turn is None else (Path(model_patch), from_turn)
-    if (model_patch, from_turn) != (None, None) and (patch is None or not resume):
-        raise MissionInputError("--model-patch and --from-turn go together, with --resume.")
+    patch = None if model_patch is None or from_step is None else (Path(model_patch), from_step)
+    if (model_patch, from_step) != (None, None) and (patch is None or not resume):
+        raise MissionInputError("--model-patch and --from-step go together, with --resume.")
     if loaded is None and (folder is None or not resume):
         raise MissionInputError("a scenario is needed, or --resume with the folder of a watch.")
     folder, known = _read(loaded, folder, allow_unknown=allow_unknown)
@@ -272,10 +272,10 @@ def watch(
             untold = None if stored(watched.folder) else watched.last_decision()
             with closing(feed), closing(Tutor(watched, wait=feed.replayable)) as tutor:
                 between = tutor.act if teach else lambda: None
-                counts = watched.run(feed, decide, between, turns=turns, patched=patch, untold=untold)
+                counts = watched.run(feed, decide, between, steps=steps, patched=patch, untold=untold)
             watched.store(counts, last=last, report=report)
         except Exception as error:
-            kept = watched.teaching.turn >= 0
+            kept = watched.teaching.step >= 0
             error.add_note(said("watch.kept", folder=watched.folder) if kept else said("watch.begun"))
             raise
     return watched.folder

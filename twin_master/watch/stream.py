@@ -27,12 +27,12 @@ class StreamNotices:
     Parameters
     ----------
     words : Words
-        How sentences speak of turns and sensors.
+        How sentences speak of steps and sensors.
 
     Attributes
     ----------
     is_blind : bool
-        Whether the last message of a next turn had no reading of any sensor.
+        Whether the last message of a next step had no reading of any sensor.
     refused_in_a_row : int
         Messages that were refused since one was taken.
     last_reason : str
@@ -42,13 +42,13 @@ class StreamNotices:
     def __init__(self, words: Words) -> None:
         self._words = words
         self._coming: list[Notice] = []  # with the next reading
-        self._gap_end = -1  # the turn behind the last gap that was told
+        self._gap_end = -1  # the step behind the last gap that was told
         self._clock_is_told = False
         self.is_blind = False
         self._names_told: list[str] = []
         self.refused_in_a_row = 0
         self.last_reason = ""
-        self._refused_turns: list[int | None] = []
+        self._refused_steps: list[int | None] = []
         self._refusals_are_told = False
 
     def state(self, *, waiting: bool) -> dict[str, Any]:
@@ -61,7 +61,7 @@ class StreamNotices:
         """
         refused = {
             "count": self.refused_in_a_row,
-            "turns": self._refused_turns,
+            "steps": self._refused_steps,
             "reason": self.last_reason,
             "told": self._refusals_are_told,
         }
@@ -82,17 +82,17 @@ class StreamNotices:
         self._names_told = list(state.get("names", ()))
         refused = state.get("refused", {})
         self.refused_in_a_row = refused.get("count", 0)
-        self._refused_turns = list(refused.get("turns", ()))
+        self._refused_steps = list(refused.get("steps", ()))
         self.last_reason = refused.get("reason", "")
         self._refusals_are_told = refused.get("told", False)
 
     def gap(self, first: int, end: int, unit: str) -> None:
-        """Take in that nothing came of the turns from `first` on to the one before `end`.
+        """Take in that nothing came of the steps from `first` on to the one before `end`.
 
         Parameters
         ----------
         first, end : int
-            The first turn that is missing, and the one that has come.
+            The first step that is missing, and the one that has come.
         unit : str
             The unit that the times of the messages seem to have, see `Clock.slipped_unit`.
         """
@@ -109,27 +109,27 @@ class StreamNotices:
             )
         self._coming.append(Notice("gap", f"{sentence}{unit_advice(unit)}.", value=float(count)))
 
-    def clock(self, turn: int, turns: float, unit: str) -> None:
-        """Take in that a time lies too far from the only one before it; the message is the next turn.
+    def clock(self, step: int, steps: float, unit: str) -> None:
+        """Take in that a time lies too far from the only one before it; the message is the next step.
 
         Parameters
         ----------
-        turn : int
-            The next turn.
-        turns : float
-            Turns by which the time lies behind the other one.
+        step : int
+            The next step.
+        steps : float
+            Steps by which the time lies behind the other one.
         unit : str
             The unit that the times seem to have.
         """
         if self._clock_is_told:
             return
         self._clock_is_told = True
-        step = self._words.step
-        where = f"{abs(turns):.4g} {step}s {'behind' if turns > 0.0 else 'before'} that of the message before"
+        word = self._words.step
+        where = f"{abs(steps):.4g} {word}s {'behind' if steps > 0.0 else 'before'} that of the message before"
         cause = unit_advice(unit) or "; see whether the clock of the logger was set"
         sentence = (
-            f"{step.capitalize()} {turn}: the time of the message lies {where}{cause}. Until two times "
-            f"agree, each message is taken as the next {step}, and no gap can be seen."
+            f"{word.capitalize()} {step}: the time of the message lies {where}{cause}. Until two times "
+            f"agree, each message is taken as the next {word}, and no gap can be seen."
         )
         self._coming.append(Notice("clock", sentence))
 
@@ -137,74 +137,74 @@ class StreamNotices:
         """Take in that two times agree."""
         self._clock_is_told = False
 
-    def refuse(self, turn: int | None, reason: str) -> None:
-        """Take in that a message was refused, of which the turn may be known."""
+    def refuse(self, step: int | None, reason: str) -> None:
+        """Take in that a message was refused, of which the step may be known."""
         self.refused_in_a_row += 1
         self.last_reason = reason
-        if len(self._refused_turns) < REFUSALS_IN_A_ROW:
-            self._refused_turns.append(turn)
+        if len(self._refused_steps) < REFUSALS_IN_A_ROW:
+            self._refused_steps.append(step)
 
     @property
     def refusals_are_untold(self) -> bool:
         """Whether enough messages were refused in a row, and the operator was not told yet."""
         return self.refused_in_a_row >= REFUSALS_IN_A_ROW and not self._refusals_are_told
 
-    def refusals(self, next_turn: int) -> Notice:
+    def refusals(self, next_step: int) -> Notice:
         """Return the notice that no message is taken any more.
 
         Parameters
         ----------
-        next_turn : int
-            The turn that is expected next.
+        next_step : int
+            The step that is expected next.
         """
         self._refusals_are_told = True
-        step, count = self._words.step, self.refused_in_a_row
-        since = f"Since {step} {next_turn - 1}," if next_turn else "From the beginning on,"
+        word, count = self._words.step, self.refused_in_a_row
+        since = f"Since {word} {next_step - 1}," if next_step else "From the beginning on,"
         sentence = (
             f"{since} {counted(count, 'message')} came, and all were refused (rejected.jsonl), the last one "
-            f"because {self.last_reason}.{self._likely_cause(next_turn)}"
+            f"because {self.last_reason}.{self._likely_cause(next_step)}"
         )
         return Notice("refused", sentence, value=float(count))
 
-    def _likely_cause(self, next_turn: int) -> str:
-        """Return what the turns of the refused messages have in common, as a sentence; or nothing."""
-        turns = [turn for turn in self._refused_turns if turn is not None]
-        if len(turns) < REFUSALS_IN_A_ROW or max(turns) >= next_turn:
+    def _likely_cause(self, next_step: int) -> str:
+        """Return what the steps of the refused messages have in common, as a sentence; or nothing."""
+        steps = [step for step in self._refused_steps if step is not None]
+        if len(steps) < REFUSALS_IN_A_ROW or max(steps) >= next_step:
             return ""
-        step = self._words.step
-        if len({*turns}) == 1:
+        word = self._words.step
+        if len({*steps}) == 1:
             return (
-                f" All belong to {step} {turns[0]}: see whether its counter stands still, and whether "
-                "`watch.seconds_per_turn` and `watch.time_unit` are right."
+                f" All belong to {word} {steps[0]}: see whether its counter stands still, and whether "
+                "`watch.seconds_per_step` and `watch.time_unit` are right."
             )
-        if turns == sorted({*turns}):
-            listed = listing(map(str, turns))
+        if steps == sorted({*steps}):
+            listed = listing(map(str, steps))
             return (
-                f" They belong to the {step}s {listed}, which were watched before: where the counter or the "
+                f" They belong to the {word}s {listed}, which were watched before: where the counter or the "
                 "clock of the logger has begun again, begin another watch in another folder (--out), or send "
-                "messages without `turn`, which go on with this one."
+                "messages without `step`, which go on with this one."
             )
         return ""
 
-    def take(self, turn: int, *, is_blind: bool, passed_over: Mapping[str, str]) -> list[Notice]:
-        """Take in the message of the next turn; return the notices that go with it.
+    def take(self, step: int, *, is_blind: bool, passed_over: Mapping[str, str]) -> list[Notice]:
+        """Take in the message of the next step; return the notices that go with it.
 
         Parameters
         ----------
-        turn : int
+        step : int
         is_blind : bool
             Whether it has no reading of any sensor.
         passed_over : dict of str to str
             Names in it that are no sensor, with what each is beside that: "a JSON object", or the known name
             that it looks like, in words; empty where there is nothing to say.
         """
-        when = f"{self._words.step.capitalize()} {turn}"
+        when = f"{self._words.step.capitalize()} {step}"
         notices = self.coming()
         if self._refusals_are_told:
             sentence = f"{when}: messages are taken again, after {self.refused_in_a_row} were refused."
             notices.append(Notice("taken", sentence, value=float(self.refused_in_a_row)))
         self.refused_in_a_row = 0
-        self._refused_turns = []
+        self._refused_steps = []
         self._refusals_are_told = False
         if is_blind and not self.is_blind:
             names = listing(f"`{name}`" for name in passed_over)

@@ -42,9 +42,9 @@ class Outcome:
     model : BelievedModel
         The patched one.
     gained : float
-        Log evidence of the turns that were compared, with the patch less without [nats].
+        Log evidence of the steps that were compared, with the patch less without [nats].
     record : dict
-        For the journal: `before` and `after`, the gap of the turns from that of the patch on (`gap_of`), and
+        For the journal: `before` and `after`, the gap of the steps from that of the patch on (`gap_of`), and
         `policy_change`, how the policy changes, in a sentence; empty where it stays.
     """
 
@@ -55,7 +55,7 @@ class Outcome:
 
 
 def patched_model(
-    scenario: Scenario, file: Path, from_turn: int, progress: Progress | None = None
+    scenario: Scenario, file: Path, from_step: int, progress: Progress | None = None
 ) -> BelievedModel:
     """Return the model of a scenario with a patch.
 
@@ -68,12 +68,12 @@ def patched_model(
         raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
     scenario = scenario.having("belief", patch=str(file))
     source: AssetSource = scenario.belief.source(scenario, None)
-    return BelievedModel(from_turn, prepared_alone(scenario, source, progress), file)
+    return BelievedModel(from_step, prepared_alone(scenario, source, progress), file)
 
 
 def judged(
     journal: Path, end: int, scenario: Scenario, models: Sequence[BelievedModel], patch: bytes,
-    from_turn: int, compared: tuple[int, int] = (0, 0), progress: Progress | None = None,
+    from_step: int, compared: tuple[int, int] = (0, 0), progress: Progress | None = None,
 ) -> Outcome:  # fmt: skip
     """Return what comes of a patch.
 
@@ -87,10 +87,10 @@ def judged(
         What was believed so far.
     patch : bytes
         Content of the patch file that would be believed, with what is believed already.
-    from_turn : int
+    from_step : int
         From which on.
     compared : tuple of int
-        The first turn whose evidence is compared, behind that one, and how many.
+        The first step whose evidence is compared, behind that one, and how many.
     progress : Progress, optional
 
     Raises
@@ -101,19 +101,19 @@ def judged(
     with TemporaryDirectory(prefix="uav_twin_") as folder:
         file = Path(folder) / "patch.json"
         file.write_bytes(patch)
-        model = patched_model(scenario, file, from_turn, progress)
+        model = patched_model(scenario, file, from_step, progress)
     begin, count = compared
     before, after = (
-        replay(journal, models, scenario.watch.lag, first_turn=from_turn, end=end, question=question)[0]
+        replay(journal, models, scenario.watch.lag, first_step=from_step, end=end, question=question)[0]
         for question in (None, model)
     )
     evidence = [
-        sum(turn.concluded.log_evidence for turn in found.turns[begin - found.first_turn :][:count])
+        sum(step.concluded.log_evidence for step in found.steps[begin - found.first_step :][:count])
         for found in (before, after)
     ]
     record = {
-        "before": gap_of(before, from_turn, models),
-        "after": gap_of(after, from_turn, [*models, model]),
+        "before": gap_of(before, from_step, models),
+        "after": gap_of(after, from_step, [*models, model]),
         "policy_change": policy_change(models[-1].knowledge, model.knowledge),
     }
     return Outcome(patch, model, float(evidence[1] - evidence[0]), record)
@@ -153,8 +153,8 @@ def policy_change(before: Knowledge, after: Knowledge) -> str:
     )
 
 
-SETTLE_TURNS = 10
-"""Turns that an alarm must hold before its cause is looked for; they also show what it is."""
+SETTLE_STEPS = 10
+"""Steps that an alarm must hold before its cause is looked for; they also show what it is."""
 CLEARLY = math.log(10.0)
 """Evidence by which several gauges must be a better explanation than one, as of the alarm itself [nats]."""
 CHECKED = 250_000
@@ -190,24 +190,24 @@ class Teaching:
 
     Attributes
     ----------
-    turn : int
-        The last turn.
+    step : int
+        The last step.
     question : tuple or None
-        The first and the last turn that hold what the model lacks, if its cause is to be looked for.
+        The first and the last step that hold what the model lacks, if its cause is to be looked for.
     trial : dict or None
         The verdict whose patch is on trial.
     untold : list
-        Notices that go with the next turn.
+        Notices that go with the next step.
     adopted : list of dict
         The models that were adopted, as the journal has them.
     first_alarm : tuple or None
-        The turn of the first alarm, and its notice.
+        The step of the first alarm, and its notice.
     of_many : bool
         Whether the gauges together speak for the alarm whose cause is looked for, and no single one does.
     """
 
     threshold: float
-    turn: int = -1
+    step: int = -1
     question: tuple[int, int] | None = None
     trial: dict[str, Any] | None = None
     untold: list[dict[str, Any]] = field(default_factory=list)
@@ -242,16 +242,16 @@ class Teaching:
         if "model" in record:
             self.adopted.append(record["model"])
             self.question = self.trial = self._alarm = None
-            self._since = int(record["model"]["from_turn"])
+            self._since = int(record["model"]["from_step"])
             self.untold += [record["model"]["notice"]] if "notice" in record["model"] else []
-            # An alarm of the turns that were filtered anew: the patch was not all that the model lacks.
+            # An alarm of the steps that were filtered anew: the patch was not all that the model lacks.
             again = record["model"].get("alarms", [])
             self.untold += again
             self._alarms(again)
         elif "verdict" in record:
             self._verdict(record["verdict"])
         elif "filtered" in record:
-            self.turn = int(record["turn"])
+            self.step = int(record["step"])
             told = {notice["sentence"] for notice in self.untold}
             notices = [n for n in record.get("notices", []) if n["sentence"] not in told]
             self.untold = []
@@ -261,25 +261,25 @@ class Teaching:
     def _alarms(self, notices: Sequence[Mapping[str, Any]]) -> None:
         for notice in notices:
             if notice["kind"] == "alarm":
-                self._alarm = self.turn, int(notice.get("since") or 0)
-                self._ask_at = self.turn + SETTLE_TURNS
-                self.first_alarm = self.first_alarm or (self.turn, notice)
+                self._alarm = self.step, int(notice.get("since") or 0)
+                self._ask_at = self.step + SETTLE_STEPS
+                self.first_alarm = self.first_alarm or (self.step, notice)
 
     def _ask(self, suspicion: Mapping[str, Any]) -> None:
-        if self._alarm is None or self.question or self.trial or self.turn < self._ask_at:
+        if self._alarm is None or self.question or self.trial or self.step < self._ask_at:
             return
         of_many = suspicion.get("log_evidence_none", -math.inf)
         of_one = suspicion.get("log_evidence_any_gauge", -math.inf)
         if max(of_many, of_one) >= math.log(self.threshold):
             self.of_many = of_many >= of_one + CLEARLY
-            self.question = max(self._alarm[1], self._since), self.turn
+            self.question = max(self._alarm[1], self._since), self.step
 
     def _verdict(self, verdict: dict[str, Any]) -> None:
         self.untold.append(verdict["notice"])
         if verdict["tried"]:
             self.trial, self.question = verdict, None
             return
-        # More turns may tell what these could not: asked again with twice as many behind the alarm.
-        asked, self.question, self.trial = int(verdict["to_turn"]), None, None
+        # More steps may tell what these could not: asked again with twice as many behind the alarm.
+        asked, self.question, self.trial = int(verdict["to_step"]), None, None
         if self._alarm is not None:
-            self._ask_at = asked + max(SETTLE_TURNS, asked - self._alarm[0])
+            self._ask_at = asked + max(SETTLE_STEPS, asked - self._alarm[0])

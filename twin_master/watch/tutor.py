@@ -1,7 +1,7 @@
-"""What teaches a watch between two of its turns: it has the cause looked for, tries a patch, and adopts it.
+"""What teaches a watch between two of its steps: it has the cause looked for, tries a patch, and adopts it.
 
 The search for the cause is a process of its own, of low priority beside a live watch: the very command that
-the alarm names. Its verdict is a line of the journal behind the turn in which it came.
+the alarm names. Its verdict is a line of the journal behind the step in which it came.
 """
 
 import os
@@ -22,14 +22,14 @@ from twin_master.run_folder import PATCH, TEACHING, VERDICT
 from twin_master.watch.folder import Watch
 from twin_master.watch.teaching import CANNOT, Outcome
 
-TRIAL_TURNS = 10
-"""Turns behind a verdict, none of which it has seen, in which model and patched model are compared."""
+TRIAL_STEPS = 10
+"""Steps behind a verdict, none of which it has seen, in which model and patched model are compared."""
 LEAST_GAIN = 3.0
-"""Evidence of these turns from which on a patch is adopted [nats]: as much as a name needs in the search."""
+"""Evidence of these steps from which on a patch is adopted [nats]: as much as a name needs in the search."""
 GROUP = "group"
 TRIED = ("named", "named in part", GROUP)
 """Verdicts whose patch is tried; that of a group is its most probable member. All members explain the gap
-alike, so that the state is estimated alike whichever is true; turns that none has seen must bear it out. A
+alike, so that the state is estimated alike whichever is true; steps that none has seen must bear it out. A
 group of which some members saturate is not tried: they agree at the loads of the search, and at no other."""
 ABSOLUTE_FIT = "absolute fit"
 """Gate of a verdict that says whether what is named leaves noise alone."""
@@ -41,13 +41,13 @@ _LOOK_AGAIN = 0.05
 
 
 class Tutor:
-    """Asks, tries and adopts between two turns of a watch.
+    """Asks, tries and adopts between two steps of a watch.
 
     Parameters
     ----------
     watch : Watch
     wait : bool
-        Whether the next turn waits for an answer, as those of a recording do. Those of a live watch go on
+        Whether the next step waits for an answer, as those of a recording do. Those of a live watch go on
         beside a process that searches and a thread that tries a patch.
     command : sequence of str
         What begins with a search.
@@ -64,28 +64,28 @@ class Tutor:
         self.outcome: Future[Outcome] | None = None
 
     def act(self) -> None:
-        """Do what is due behind the last turn of the watch, which has begun."""
+        """Do what is due behind the last step of the watch, which has begun."""
         watch, teaching, step = self._watch, self._watch.teaching, self._watch.scenario.mission.step_name
         if teaching.question is not None:
             first, last = teaching.question
-            folder = watch.folder / TEACHING / f"turns_{first}_to_{last}"
+            folder = watch.folder / TEACHING / f"steps_{first}_to_{last}"
             log = folder.with_name(folder.name + ".log")
-            if self._searched(folder, log, ["--from-turn", str(first), "--to-turn", str(last)]):
+            if self._searched(folder, log, ["--from-step", str(first), "--to-step", str(last)]):
                 found = verdict_of(folder, log, first, last, step)
-                watch.write(verdict={"turn": teaching.turn, "of_many": teaching.of_many, **found})
-        if teaching.trial is not None and teaching.turn >= teaching.trial["turn"] + TRIAL_TURNS:
+                watch.write(verdict={"step": teaching.step, "of_many": teaching.of_many, **found})
+        if teaching.trial is not None and teaching.step >= teaching.trial["step"] + TRIAL_STEPS:
             self._judge(teaching.trial, step)
 
-    def _searched(self, folder: Path, log: Path, turns: Sequence[str]) -> bool:
+    def _searched(self, folder: Path, log: Path, steps: Sequence[str]) -> bool:
         """Return whether the search that fills a folder with a verdict has ended; begin it if there is none.
 
-        No key of the terminal ends the process; where turns do not wait for it, it has a low priority.
+        No key of the terminal ends the process; where steps do not wait for it, it has a low priority.
         """
         log.parent.mkdir(exist_ok=True)
         while not (folder / VERDICT).is_file():
             if self._search is None:
                 run, seed = str(self._watch.folder), str(self._watch.scenario.mission.seed)
-                words = ["--from-run", run, *turns, "--out", str(folder), "--seed", seed]
+                words = ["--from-run", run, *steps, "--out", str(folder), "--seed", seed]
                 with log.open("wb") as file:
                     self._search = subprocess.Popen(
                         [*self._command, *words],
@@ -103,12 +103,12 @@ class Tutor:
         return True
 
     def _judge(self, trial: dict[str, Any], step: str) -> None:
-        """Adopt the patch of a trial that has all of its turns, or say why not, once that is known."""
+        """Adopt the patch of a trial that has all of its steps, or say why not, once that is known."""
         watch = self._watch
         if self.outcome is None:
-            file, compared = watch.folder / trial["folder"] / PATCH, (trial["turn"] + 1, TRIAL_TURNS)
+            file, compared = watch.folder / trial["folder"] / PATCH, (trial["step"] + 1, TRIAL_STEPS)
             worker = ThreadPoolExecutor(1)
-            self.outcome = worker.submit(watch.trial(file, trial["from_turn"], compared))
+            self.outcome = worker.submit(watch.trial(file, trial["from_step"], compared))
             worker.shutdown(wait=self._wait)
         if not self.outcome.done():
             return
@@ -142,9 +142,9 @@ def verdict_of(folder: Path, log: Path, first: int, last: int, step: str) -> dic
     log : Path
         What the search said, where there is none.
     first, last : int
-        The turns that were searched.
+        The steps that were searched.
     step : str
-        What a turn is called.
+        What a step is called.
     """
     try:
         verdict = read_json(folder / VERDICT, DamagedFileError)["verdict"]
@@ -162,11 +162,11 @@ def verdict_of(folder: Path, log: Path, first: int, last: int, step: str) -> dic
         sentence = " ".join([sentence, *(caveat for caveat in caveats if caveat not in sentence)])
     if tried:
         which = "patch of the most probable of these" if kind == GROUP else "patch"
-        sentence += f" The {which} is tried beside the model for {TRIAL_TURNS} {step}s."
+        sentence += f" The {which} is tried beside the model for {TRIAL_STEPS} {step}s."
     elif patch.is_file():
         sentence += f" To believe it none the less: {command_to_believe(place, first)}"
     return {
-        "from_turn": first, "to_turn": last, "tried": tried, "kind": kind, "folder": place,
+        "from_step": first, "to_step": last, "tried": tried, "kind": kind, "folder": place,
         "notice": Notice("verdict", sentence).as_record(),
     }  # fmt: skip
 
@@ -193,7 +193,7 @@ def caveats_of(verdict: Mapping[str, Any]) -> list[str]:
     if verdict["kind"] == GROUP and has_some_saturating_members(verdict):
         caveats.append(
             "A sensor that saturates and the other effects of the group differ at other loads, and these "
-            "turns do not tell them apart; more turns at more than one load may."
+            "steps do not tell them apart; more steps at more than one load may."
         )
     return caveats
 
@@ -206,8 +206,8 @@ def has_some_saturating_members(verdict: Mapping[str, Any]) -> bool:
 
 
 def command_to_believe(place: str, first: int) -> str:
-    """Return the command that believes the patch in a folder of a watch from a turn on."""
-    return f"uav-twin watch --resume --out DIR --model-patch DIR/{place}/{PATCH} --from-turn {first}"
+    """Return the command that believes the patch in a folder of a watch from a step on."""
+    return f"uav-twin watch --resume --out DIR --model-patch DIR/{place}/{PATCH} --from-step {first}"
 
 
 def is_adopted(trial: Mapping[str, Any], outcome: Outcome) -> bool:
@@ -221,9 +221,9 @@ def is_adopted(trial: Mapping[str, Any], outcome: Outcome) -> bool:
 
 def trial_sentence(trial: Mapping[str, Any], outcome: Outcome, step: str) -> str:
     """Return what the operator is told at the end of a trial."""
-    first = trial["from_turn"]
+    first = trial["from_step"]
     compared = (
-        f"Beside the model for {TRIAL_TURNS} {step}s the patch gained {outcome.gained:.3g} nats of evidence"
+        f"Beside the model for {TRIAL_STEPS} {step}s the patch gained {outcome.gained:.3g} nats of evidence"
     )
     if outcome.gained < LEAST_GAIN:
         return f"{compared}, {LEAST_GAIN:g} are needed, and is not adopted."

@@ -15,7 +15,8 @@ from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Prior
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, EffectTerm
-from discrepancy.fits.fitting import attempt, cholesky_factor, fit
+from discrepancy.fits.fitting import attempt, fit
+from discrepancy.fits.normal_equations import cholesky_factor
 from discrepancy.fits.predictive import residual_set
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate

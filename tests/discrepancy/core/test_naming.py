@@ -10,10 +10,11 @@ import pytest
 from discrepancy.campaign.records import NoiseRecord
 from discrepancy.errors import SENTENCES
 from discrepancy.fits.candidate import Candidate, EffectTerm
-from discrepancy.judgement.comparison import SimulationComparison
-from discrepancy.judgement.conclusion import look_alike_remark, with_untested
-from discrepancy.judgement.naming import Case, reach_verdict
-from discrepancy.missing_force.shares import OF_READINGS, GapShare
+from discrepancy.judgement.naming import reach_verdict
+from discrepancy.judgement.remarks import look_alike_remark, with_untested
+from discrepancy.judgement.rules import Case
+from discrepancy.judgement.simulation_comparison import SimulationComparison
+from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import NamedEffect, Verdict, VerdictKind
 from fe.runtime.patch import ModelPatch, SensorSaturation

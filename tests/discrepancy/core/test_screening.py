@@ -265,7 +265,7 @@ def test_held_out_trials_move_nothing_that_is_shared():
     shown = {item.trial.name: item for item in residual_set(problem, found, sensitivities=False).trials}
     for number, data in enumerate(there.trials):
         parts = there.linearise(number, start, Candidate())
-        columns, index = there.columns(number, start, parts, Candidate())
+        columns, index = there.prediction_derivatives(number, start, parts, Candidate())
         local, shared = np.split(data.standardised(columns).reshape(len(columns), -1), [data.unknowns.size])
         residual = there.residual(number, start, parts.response).ravel()
         taken = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local)

@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 from benchmarks.force_events import KINDS, counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
-from discrepancy.judgement.conclusion import begins_inside, when_sentence
+from discrepancy.judgement.remarks import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch
 from discrepancy.missing_force.explained import with_most_probable_forces
 from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, regression
@@ -16,7 +16,7 @@ from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
 from discrepancy.missing_force.trial import SeenTrial, decaying_part
 from discrepancy.missing_force.view import View
-from discrepancy.missing_force.windows import _most_telling, residual_windows
+from discrepancy.missing_force.windows import _most_probable_place, residual_windows, sized_windows
 from discrepancy.report.residual_figures import time_line_figure
 from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
@@ -305,6 +305,19 @@ def test_a_window_whose_readings_are_all_missing_is_drawn():
     assert len(figure.axes[0].collections) >= len(windows)
 
 
+def test_a_window_without_a_reading_is_none():
+    fitted = Bench(count=300).fit(np.random.default_rng(4))
+    trial = fitted.trials[0].trial
+    first, second, third = (float(time) for time in trial.time[100:103])
+    between = (Moment(value, value, value) for value in (first + 0.1 * (second - first), second - 1e-9))
+    around = (Moment(value, value, value) for value in (first, third))
+    ends = {"first": float(trial.time[0]), "last": float(trial.time[-1]), "size": 1.0}
+    windows = [GapWindow(trial.name, trial.channels, *moments, **ends) for moments in (between, around)]
+    (window,) = sized_windows(windows, fitted, fitted)
+    assert window.begin.value == first
+    assert window.size > 0.0
+
+
 def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
     """Where none can be weighed (the filter breaks down beside millions of noises), it is told as a whole."""
     event = np.zeros((300, 4))
@@ -349,7 +362,7 @@ def test_an_event_on_a_reading_is_looked_for_by_name_in_records_of_other_channel
         system=replace(system, outputs=system.outputs[::-1], through=system.through[:, ::-1]),
     )  # fmt: skip
     forced = with_most_probable_forces(View(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
-    number, found = _most_telling(0, forced, names)
+    number, found = _most_probable_place(0, forced, names)
     shown = [trial.system.through[0] != 0.0 for trial in found.view.trials]
     assert number == 0
     np.testing.assert_array_equal(shown, [[False, True], [True, False]])

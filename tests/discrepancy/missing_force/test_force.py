@@ -13,23 +13,26 @@ from discrepancy.campaign.reading import read_campaign
 from discrepancy.campaign.records import Campaign, Channel, Hold, NoiseRecord, Quantity, Trial, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.catalogue.library import library
+from discrepancy.files.verdict import primitive_intervals
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
+from discrepancy.judgement.conclusion import named_effects
 from discrepancy.missing_force.hypotheses import log_prior
 from discrepancy.missing_force.naming import WIDTHS, ForceSearch
-from discrepancy.missing_force.shares import ForceShares, explained_variance, missing_force
+from discrepancy.missing_force.port_force import explained_variance, missing_force
+from discrepancy.missing_force.shares import ForceShares
 from discrepancy.missing_force.trial import seen_trial
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
-from discrepancy.report.text import force_sentence
+from discrepancy.report.text import force_sentence, size_sentence
 from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
-from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import checked, investigate
+from discrepancy.verdict import Verdict, VerdictKind
+from discrepancy.workflow import Investigation, checked, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.discrepancy.core.kit import fitted, problem_of
 from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass, simulated
@@ -132,6 +135,27 @@ def test_one_effect_at_two_places_has_a_prior():
     setting = chain("ringdown", 0.004).setting
     both = Candidate(tuple(EffectTerm(FRICTION, place) for place in FRICTION.places(setting)[:2]))
     assert log_prior(both, 1, setting) == log_prior(both, 2, setting) > -20.0
+
+
+def test_a_law_with_a_free_shape_has_the_name_of_its_family(tmp_path):
+    """Its effect is one member: a force that goes with the square of the speed is no dry friction."""
+    problem = blind(tmp_path, CART_IN_AIR, samples=96)
+    (friction,) = chosen("coulomb_friction")
+    port, *_ = problem.model.ports
+    free = Candidate((EffectTerm(friction, port, free_shape=True),))
+    force = ForceSearch(problem)
+    law = force.followed(force.whole, free, free.terms[0].start())
+    family = f"a law of the family {friction.family}"
+    missing = missing_force(force, law)
+    assert missing.law == missing.at_port.law == family
+    effects = named_effects(problem, law)
+    verdict = Verdict(VerdictKind.FAMILY, "", 1.0, 9.0, effects=effects, family=friction.family)
+    investigation = Investigation(problem.campaign, problem.model, (), verdict)
+    intervals = [primitive_intervals(effect.patch) for effect in effects]
+    sentence = size_sentence(investigation, effects, intervals)
+    assert sentence.startswith("In SI units: force ")
+    twice = size_sentence(investigation, effects * 2, intervals * 2)
+    assert twice.startswith(f"In SI units: {family}, force ")
 
 
 def test_a_report_opens_with_the_missing_force(tmp_path):

@@ -14,7 +14,7 @@ from benchmarks.studies.hidden_effects import fly_mission
 from discrepancy.campaign.records import Quantity
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from discrepancy.model_choice import choice_of_run
-from discrepancy.sources.from_run import held_out_turns, run_campaign, run_model
+from discrepancy.sources.from_run import held_out_steps, run_campaign, run_model
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from discrepancy.verdict import VerdictKind
@@ -24,14 +24,14 @@ from tests.discrepancy.rigs import chosen
 
 pytestmark = pytest.mark.xdist_group("wing")
 
-TURNS = 24
-DRIFT = SensorDrift("strain[17]", -1.2e-3, float(TURNS))
+STEPS = 24
+DRIFT = SensorDrift("strain[17]", -1.2e-3, float(STEPS))
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs") / "drifting"
-    fly_mission(folder, 7, (DRIFT,), turns=TURNS)
+    fly_mission(folder, 7, (DRIFT,), steps=STEPS)
     return folder
 
 
@@ -53,35 +53,35 @@ def flown(model, tree):
     return outputs, Conditions(np.array(values), health=np.asarray(tree["truth"]["state"].values))
 
 
-def test_every_turn_is_in_one_trial_and_the_model_has_the_strains_of_the_fmu(run, tmp_path):
+def test_every_step_is_in_one_trial_and_the_model_has_the_strains_of_the_fmu(run, tmp_path):
     tree, campaign = tree_of(run), run_campaign(run)
     assert [trial.held_out for trial in campaign.trials] == [False, True]
     time = np.concatenate([trial.time for trial in campaign.trials])
     order = np.argsort(time)
-    np.testing.assert_array_equal(time[order], np.arange(1.0, TURNS + 1.0))
+    np.testing.assert_array_equal(time[order], np.arange(1.0, STEPS + 1.0))
     for name, field in (("strain", "values"), ("load_factor", "load_factor")):
         rows = np.concatenate([getattr(trial, field) for trial in campaign.trials])[order]
         np.testing.assert_array_equal(rows, tree["observed"][name].values)
     assert all(np.all(trial.health_deviation >= 0.25) for trial in campaign.trials)
     draws = np.asarray(tree["calibration"]["draw_value"].values)
     assert campaign.parameters["young_modulus_factor"][0] == pytest.approx(draws.mean())
-    # some turns alone
-    some = run_campaign(run, first_turn=5, last_turn=18)
+    # some steps alone
+    some = run_campaign(run, first_step=5, last_step=18)
     time = np.sort(np.concatenate([trial.time for trial in some.trials]))
     np.testing.assert_array_equal(time, np.arange(6.0, 20.0))
-    with pytest.raises(CampaignDataError, match=r"^drifting has the turns 0 to 23, and none from 30 on\."):
-        run_campaign(run, first_turn=30)
+    with pytest.raises(CampaignDataError, match=r"^drifting has the steps 0 to 23, and none from 30 on\."):
+        run_campaign(run, first_step=30)
     # the truth is not read
     without(shutil.copytree(run, tmp_path / "bare"), "truth")
     for one, other in zip(campaign.trials, run_campaign(tmp_path / "bare").trials, strict=True):
         np.testing.assert_array_equal(one.values, other.values)
         np.testing.assert_array_equal(one.health, other.health)
-    # turns of several steps, behind a start
+    # steps of several steps, behind a start
     binding, header = tmp_path / "bare/asset/binding.toml", "step_size = 1.0"
     several = binding.read_text().replace(header, "step_size = 0.5\ndecimation = 4\nstart_time = 30.0")
     binding.write_text(several)
     (trial,) = run_campaign(tmp_path / "bare", held_out_share=0.0).trials
-    np.testing.assert_array_equal(trial.time, 32.0 + 2.0 * np.arange(TURNS))
+    np.testing.assert_array_equal(trial.time, 32.0 + 2.0 * np.arange(STEPS))
     # the model gives what the FMU had
     trial, model = run_campaign(run, held_out_share=0.0).trials[0], run_model(run)[0]
     outputs, conditions = flown(model, tree)
@@ -98,7 +98,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path):
         SensorDrift("strain[17]", 4e-4, 1.0, exponent=0.0), SensorGain("*", 0.05, "strain"),
     )  # fmt: skip
     folder = tmp_path / "known"
-    fly_mission(folder, 7, known, known, turns=4, draws=10)
+    fly_mission(folder, 7, known, known, steps=4, draws=10)
     tree, model = tree_of(folder), run_model(folder)[0]
     campaign = run_campaign(folder, held_out_share=0.0)
     outputs, conditions = flown(model, tree)
@@ -114,7 +114,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path):
     patched = choice_of_run(folder).source_hash
     (folder / "asset" / "model_patch.json").rename(folder / "asset" / "model_patch_1.json")
     assert choice_of_run(folder).source_hash != patched
-    # A watch whose twin adopted the patch on the way: the turns before were believed with another model.
+    # A watch whose twin adopted the patch on the way: the steps before were believed with another model.
     with h5py.File(folder / "run.nc", "a") as file:
         file.attrs["model_patch"], file.attrs["model_patch_from_step"] = "asset/model_patch_1.json", 3
     assert choice_of_run(folder).source_hash == patched
@@ -127,7 +127,7 @@ def test_sensors_that_the_twin_knew_are_in_the_model_of_the_run(tmp_path):
 @pytest.mark.parametrize("mass", [0.2, 0.0])
 def test_a_mass_that_the_twin_does_not_know_is_found_in_the_run(tmp_path, mass):
     folder = tmp_path / "heavy"
-    fly_mission(folder, 7, (PointMass(mass, 2.0),) if mass else (), turns=12)
+    fly_mission(folder, 7, (PointMass(mass, 2.0),) if mass else (), steps=12)
     effects = chosen("point_mass", "inertia_relief")
     found = investigate(run_campaign(folder), run_model(folder)[0], effects, thorough=False)
     if not mass:
@@ -141,7 +141,7 @@ def test_a_mass_that_the_twin_does_not_know_is_found_in_the_run(tmp_path, mass):
 
 @given(st.integers(1, 200), st.integers(1, 12), st.floats(0.0, 0.9))
 def test_whole_blocks_are_held_out_and_never_the_first(count, block, share):
-    held = held_out_turns(count, block, share)
+    held = held_out_steps(count, block, share)
     assert held.shape == (count,)
     assert not held[:block].any()
     blocks = held[: count // block * block].reshape(-1, block)

@@ -227,10 +227,10 @@ def test_where_all_places_move_alike_the_forces_add_up_to_the_law(kind):
     assert spread_over_stations(ModelPatch((before, after)), share) == ModelPatch((before, after))
     assert [force.port for force in spread if isinstance(force, PortForce)] == list(STATION_PORTS)
     one, parts = laws(item), port_laws(ModelPatch(tuple(spread)), STATION_PORTS)
-    np.testing.assert_allclose(parts.values[:, 0], share * one.values[0, 0], rtol=1e-12)
-    assert np.all(parts.values[:, 1:PARAMETERS] == one.values[0, 1:PARAMETERS])
+    np.testing.assert_allclose(parts.parameters[:, 0], share * one.parameters[0, 0], rtol=1e-12)
+    assert np.all(parts.parameters[:, 1:PARAMETERS] == one.parameters[0, 1:PARAMETERS])
     assert np.allclose(
-        parts.values[:, PARAMETERS:], one.values[:, PARAMETERS:]
+        parts.parameters[:, PARAMETERS:], one.parameters[:, PARAMETERS:]
     )  # each slips where the whole does
 
 

@@ -235,7 +235,7 @@ def test_a_mission_with_a_hidden_drift(mission, tmp_path):
     folders = mission("plain"), folder, mission("off", FILE, '"effect.hidden.active" = 0')
     plain, hidden, off = (open_run(place)["observed"]["strain"].values for place in folders)
     np.testing.assert_array_equal(off, plain)
-    # the control of later turns may differ, since the twin is misled; that of the first ones does not
+    # the control of later steps may differ, since the twin is misled; that of the first ones does not
     np.testing.assert_allclose(hidden[:2, 4] - plain[:2, 4], [3e-5, 6e-5], rtol=1e-6)
     assert np.all(hidden[0, [0, 1, 20]] == plain[0, [0, 1, 20]])
     assert figures_of(folder)["model_misfit_rms"] > 1.0  # percent

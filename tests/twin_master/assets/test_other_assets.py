@@ -40,7 +40,7 @@ from twin_master.assets.system_export import export_scenario
 from twin_master.errors import FleetError, MissionInputError, TwinMasterError
 from twin_master.fleet.plan import ensemble
 from twin_master.mission.sensor_design import with_candidates
-from twin_master.mission.turns import Plant, Truth
+from twin_master.mission.steps import Plant, Truth
 from twin_master.network.identified import packed_row
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import LoadedScenario
@@ -137,7 +137,7 @@ def test_three_fmus_live_the_script_of_a_scenario(tmp_path):
     controls = np.random.default_rng(3).integers(2, size=50).tolist()
     for step, control in enumerate(controls):
         previous = controls[step - 1] if step else None
-        ours, theirs = (plant.turn(control, previous) for plant in (split, single))
+        ours, theirs = (plant.fly_step(control, previous) for plant in (split, single))
         np.testing.assert_array_equal(ours.observed, theirs.observed, err_msg=str(step))
         np.testing.assert_array_equal(ours.happened.state, theirs.happened.state)
         np.testing.assert_array_equal(ours.happened.observation, theirs.happened.observation)
@@ -286,7 +286,7 @@ def test_a_belief_in_another_unit_than_that_of_the_model_is_refused():
         believed_source(resolve_scenario(watched)).check()
 
 
-# ------------------------------- modes identified of a record of accelerations, as the observation of a turn
+# ------------------------------- modes identified of a record of accelerations, as the observation of a step
 
 TWO = {
     "acceleration = [{": 'acceleration = [{ name = "mid", point = [60, 10, 5], direction = [0, 0, 1] }, {',
@@ -329,7 +329,7 @@ def test_the_twin_finds_the_loss_from_records_of_accelerations(file, tmp_path):
     # mode 5, at 8 kHz and strongly damped, is in the record and told by none of the bands: a small bias
     assert np.abs((seen - true) / np.hypot(errors, 5e-3 * np.abs(true))).max() < 5.0
     assert np.all(errors[:, 0] < 1e-3 * true[:, 0])
-    # a record has its own rate, however many steps of the binding make a turn
+    # a record has its own rate, however many communication steps of the binding make a step of the mission
     several = ("step_size = 1.0", "step_size = 1.0\ndecimation = 4")
     binding = written(tmp_path, structure_binding_text(load_structure(file)), several)
     once = {"mission": {"steps": 1}, "truth": {"gains": []}, "asset": {"binding": str(binding)}}

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import sys
 from collections.abc import Mapping
@@ -15,6 +16,7 @@ import xarray as xr
 
 from calibration.errors import PosteriorError
 from fmu_asset.errors import FmuEndedError
+from reporting.former_names import FormerNameWarning
 from tests.command_line import refused, said
 from tests.refusals import Inputs
 from tests.twin_master.runs import check_same, edited, of_library, text_of, written
@@ -39,7 +41,7 @@ from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
-from twin_master.mission.turns import DamageGrowth
+from twin_master.mission.steps import DamageGrowth
 from uav_twin import fly as new_run
 from uav_twin import fly_fleet, load_scenario, open_fleet, open_run, prepare_twin
 
@@ -52,6 +54,17 @@ def growing(library_file: Path, count: int = 10, shard: int = 4) -> Fleet:
 def whole(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of the flown fleet."""
     return fly_fleet(growing(library_file), tmp_path_factory.mktemp("whole") / "fleet").folder
+
+
+def test_a_store_of_an_earlier_version_is_read_with_one_sentence(whole, tmp_path):
+    folder = shutil.copytree(whole, tmp_path / "former")
+    for path in folder.rglob("zarr.json"):
+        text = path.read_text(encoding="utf-8")
+        path.write_text(re.sub(r'(?<!: )"step"', '"turn"', text), encoding="utf-8")  # of the dimensions
+    with pytest.warns(FormerNameWarning, match=r"fleet\.zarr: `turn` is now called `step`"):
+        group = open_fleet(folder)["growing_damage"]
+    assert group.identical(open_fleet(folder)["growing_damage"])  # a second warning were an error
+    assert group.identical(open_fleet(whole)["growing_damage"])
 
 
 def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_path):
@@ -194,7 +207,7 @@ def test_all_assets_that_cannot_fly_are_in_one_list_and_a_truth_beyond_the_model
     north = edited(text_of("growing_damage"), ('kind = "random_growth"', 'kind = "scripted"'))
     written(fleet_file.parent, north, ("[truth.noise]", loss), name="north.toml")
     with pytest.raises(
-        FleetError, match=r"north: the z1 that .* in turn \d+ is .* gives z1 the range 0 to 0.8"
+        FleetError, match=r"north: the z1 that .* in step \d+ is .* gives z1 the range 0 to 0.8"
     ):
         fly_fleet(changed(fleet_file), fleet_file.parent / "out")
     assert not (fleet_file.parent / "out").exists()
@@ -223,10 +236,10 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
     assert flight.told_of(outcome.folder) == {"failures": failures, "ended": {}}
 
 
-def test_a_fallback_that_was_called_for_in_the_last_turns_is_no_failure():
+def test_a_fallback_that_was_called_for_in_the_last_steps_is_no_failure():
     knowledge = prepare_twin("growing_damage")
     flights = Flights.empty(knowledge, 5)
-    flights.state[:], flights.control_index[:, :7] = 0.0, 1  # seven turns, then the asset ends
+    flights.state[:], flights.control_index[:, :7] = 0.0, 1  # seven steps, then the asset ends
     for twin, (called, left) in enumerate([(1, 9), (4, 9), (5, 9), (5, 6), (9, 9)]):
         flights.state[twin, called:, 0] = 0.8
         flights.control_index[twin, left:7] = 0
@@ -347,7 +360,7 @@ def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_
     flown = np.where(softened.any(axis=1), softened.argmax(axis=1), 35)
     assert 0 < np.sum(flown < 35) < 6
     ends, over = isinstance(error, FmuEndedError), "The asset ended the mission after"
-    said = [f"{over} {n} of 35 turns: It is over." if ends and n < 35 else "" for n in flown]
+    said = [f"{over} {n} of 35 steps: It is over." if ends and n < 35 else "" for n in flown]
     assert found.ended == said
     assert [text != "" for text in found.failure] == [not ends and n < 35 for n in flown]
     for twin, end in enumerate(flown):
@@ -355,11 +368,11 @@ def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_
         assert np.isnan(found.filtered[twin, end:]).all()
         assert (found.control_index[twin, end:] == -1).all()
     kept = outcomes_of(knowledge, found, [Member(row, "", row, {}) for row in range(6)])
-    for row, turns in enumerate(flown):
-        if ends or turns == 35:
+    for row, steps in enumerate(flown):
+        if ends or steps == 35:
             assert kept["status"][row] == (ENDED if found.ended[row] else FLOWN)
-            np.testing.assert_array_equal(kept["belief"][row], found.filtered[row, turns - 1].astype("f4"))
-            inside = in_credible_set(knowledge.model, found.filtered[row, :turns], found.state[row, :turns])
+            np.testing.assert_array_equal(kept["belief"][row], found.filtered[row, steps - 1].astype("f4"))
+            inside = in_credible_set(knowledge.model, found.filtered[row, :steps], found.state[row, :steps])
             assert kept["credible"][row] == np.float32(inside.mean())
 
 

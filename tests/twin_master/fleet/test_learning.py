@@ -198,7 +198,7 @@ def test_groups_share_their_rates_and_each_has_a_population_of_the_parameter(tmp
     rates = [record["groups"][name]["probability"]["3g"]["mean"] for name in means]
     assert min(rates) < record["shared"]["3g"]["mean"] < max(rates)
     few = [record["groups"][name]["probability"]["2g"]["mean"] for name in means]
-    assert max(few) < 0.1  # alone, of few turns, they would be 0.19 and 0.45
+    assert max(few) < 0.1  # alone, of few steps, they would be 0.19 and 0.45
 
 
 def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
@@ -321,7 +321,7 @@ def test_states_of_other_units_count_alike_for_who_is_badly_off():
 
 
 def test_figures_of_a_fleet_have_standard_errors():
-    """Also of an asset that ended behind its first turn; one that failed takes no part."""
+    """Also of an asset that ended behind its first step; one that failed takes no part."""
     random = np.random.default_rng(1)
     error = random.standard_normal((52, 3, 2))
     error[50, 1:] = np.nan
@@ -360,7 +360,7 @@ def test_the_report_names_who_needs_attention(grown):
     control, mean = group["control_index"].values[:, -1], group["mean"].values[:, -1].astype(float)
     opening = (
         f"60 of 60 assets have flown. In {len(delay)} assets the damage called for another control; the "
-        f"fallback came within 2 turns of it in {100 * np.mean(delay <= 2):.0f}\u00a0%. The worst off is "
+        f"fallback came within 2 steps of it in {100 * np.mean(delay <= 2):.0f}\u00a0%. The worst off is "
         f"{fleet.groups[0].members[int(np.argmax(mean.sum(axis=1)))].name} of growing_damage: "
     )
     for words in (opening, "60 assets in 1 group", "The assets by health", "Who needs attention next"):

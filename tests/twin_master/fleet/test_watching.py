@@ -25,9 +25,9 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.folder import Watch
 from uav_twin import fly_fleet, learn_from_fleet, open_fleet
 
-TURNS = 6
+STEPS = 6
 FLOWN = [1, 1, 1, 1, 1, 0]
-"""Control of each turn: what the last one does to the wing nobody sees."""
+"""Control of each step: what the last one does to the wing nobody sees."""
 LOGS = 'observations = "logs/*.csv"'
 Decision = Mapping[str, Any]
 
@@ -36,14 +36,14 @@ Decision = Mapping[str, Any]
 def fleet_file(library_file: Path, tmp_path: Path) -> Path:
     """A fleet of three wings with a recording each.
 
-    Of one a line is garbage and a gauge unreadable for a turn, of another a turn is late.
+    Of one a line is garbage and a gauge unreadable for a step, of another a step is late.
     """
     text = text_of("growing_damage")
     flown = text[text.index("[asset]") : text.index("[calibration]")]
     library = f'[asset]\nkind = "strain_library"\nfile = "{library_file}"\n\n[belief]\nkind = "asset"\n\n'
     written(tmp_path, text, (flown, library), name="wing.toml")
     (tmp_path / "logs").mkdir()
-    noise = np.random.default_rng(3).normal(1e-3, 1e-4, (3, TURNS, 24))
+    noise = np.random.default_rng(3).normal(1e-3, 1e-4, (3, STEPS, 24))
     for number, rows in enumerate(noise):
         write_csv(log_of(tmp_path, number), rows, np.array(FLOWN), number == 1)
     unread, late = (log_of(tmp_path, number).read_text().splitlines() for number in (1, 2))
@@ -97,7 +97,7 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
         watched(fleet_file, again, stop)
     assert journals(again) == alone
     state = json.loads((again / "watched.json").read_text())["assets"]
-    assert [state[f"north/wing-{number}"]["last"]["turn"] for number in range(3)] == [TURNS - 1] * 3
+    assert [state[f"north/wing-{number}"]["last"]["step"] for number in range(3)] == [STEPS - 1] * 3
     (again / "watched.json").unlink()  # as if a kill had come: nobody knows whether the last ones were told
     told = list[tuple[str, bool]]()
 
@@ -108,12 +108,16 @@ def test_each_asset_has_the_journal_of_a_watch_alone(fleet_file, alone, tmp_path
     assert sorted(told) == [(f"north/wing-{number}", True) for number in range(3)]
     with pytest.raises(RunFolderError, match="another fleet"):
         FleetWatch(load_fleet(fleet_file, seed=8), again, print, print)
-    done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out", "--turns", 3)
+    done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out", "--steps", 3)
     assert done.returncode == 0, done.stderr
     decisions = [json.loads(line) for line in done.stdout.splitlines()]
-    last = {decision["asset"]: decision["turn"] for decision in decisions}
+    last = {decision["asset"]: decision["step"] for decision in decisions}
     assert last == {f"north/wing-{number}": 2 for number in range(3)}
-    assert "3 assets, 9 turns, 3 alarms" in done.stderr
+    assert "3 assets, 9 steps, 3 alarms" in done.stderr
+    former = command("fleet", "watch", fleet_file, "--out", tmp_path / "former", "--turns", 3)
+    assert former.stdout == done.stdout
+    assert "The option --turns: `--turns` is now called `--steps`. The former name" in former.stderr
+    assert "--turns" not in said("fleet", "watch", "--help")
     screen = seen("fleet", "watch", fleet_file, "--out", tmp_path / "seen")  # people see a table
     rows = re.findall(r"(north/wing-\d) +5 +2g +.* 2g +1 ", screen)
     assert rows[-3:] == ["north/wing-0", "north/wing-1", "north/wing-2"]
@@ -128,19 +132,19 @@ def broker(fleet_file: Path, tmp_path: Path) -> Iterator[Mosquitto]:
         yield broker
 
 
-def publish(client: Any, name: str, turn: int, control: str = "2g", strain: Any = (1e-3,) * 24) -> None:
-    record = {"turn": turn, "control": control, "strain": [*strain]}
+def publish(client: Any, name: str, step: int, control: str = "2g", strain: Any = (1e-3,) * 24) -> None:
+    record = {"step": step, "control": control, "strain": [*strain]}
     client.publish(f"wings/{name}", json.dumps(record), qos=1)
 
 
 def make_unwell(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """Let the watch of an asset meet an error of ours once, behind its third turn."""
+    """Let the watch of an asset meet an error of ours once, behind its third step."""
     decisions, unwell = Watch.decisions, iter([True])
 
     def once_unwell(watch: Watch, *given: Any) -> Iterator[dict[str, Any]]:
         for decision in decisions(watch, *given):
             yield decision
-            if watch.folder.name == name and decision["turn"] >= 2 and next(unwell, False):
+            if watch.folder.name == name and decision["step"] >= 2 and next(unwell, False):
                 raise ZeroDivisionError("division by zero")
 
     monkeypatch.setattr(Watch, "decisions", once_unwell)
@@ -151,14 +155,14 @@ def test_an_asset_that_was_lost_is_taken_up_again(fleet_file, alone, tmp_path, m
     for name in ("SEARCH_SECONDS", "AGAIN_SECONDS"):
         monkeypatch.setattr(f"twin_master.fleet.watching.{name}", 0.0)
     logs = [log_of(tmp_path, number) for number in range(3)]
-    (tmp_path / "logs" / "wing-1.txt").write_text("turn,strain_1\n")  # another of that name
+    (tmp_path / "logs" / "wing-1.txt").write_text("step,strain_1\n")  # another of that name
     contents, at, notes = [log.read_bytes() for log in logs], 0, list[str]()
-    logs[1].write_text("turn,strian_1\n")
+    logs[1].write_text("step,strian_1\n")
     logs[2].write_bytes(contents[2][:9])  # its header is not whole yet
     make_unwell(monkeypatch, "wing-2")
 
     def tell(asset: WatchedAsset, decision: Decision) -> None:
-        if asset.name == "north/wing-0" and decision["turn"] == 2 and "told_again" not in decision:
+        if asset.name == "north/wing-0" and decision["step"] == 2 and "told_again" not in decision:
             logs[0].unlink()
 
     def mend() -> None:
@@ -195,18 +199,18 @@ def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
             sent.append(1)
             for number in (0, 2):
                 for row in log_of(tmp_path, number).read_text().splitlines()[1:]:
-                    turn, control, *cells = row.split(",")
-                    publish(publisher, f"wing-{number}", int(turn), control, map(float, cells))
+                    step, control, *cells = row.split(",")
+                    publish(publisher, f"wing-{number}", int(step), control, map(float, cells))
         topics = fleet._sources[0]._topics  # type: ignore[union-attr]
-        if [len(topic.came) for _, topic in sorted(topics.items())] == [TURNS - 3, TURNS]:
+        if [len(topic.came) for _, topic in sorted(topics.items())] == [STEPS - 3, STEPS]:
             (north / "wing-2").unlink(missing_ok=True)
             (north / "wing-0" / "published").write_text("")
             for lost in fleet._lost.values():
                 lost.again = 0.0
 
     def tell(_asset: WatchedAsset, decision: Decision) -> None:
-        told.append(decision["turn"])
-        fleet.asked = len(told) in (2, 2 * TURNS + 1)  # one more decision for the late message
+        told.append(decision["step"])
+        fleet.asked = len(told) in (2, 2 * STEPS + 1)  # one more decision for the late message
 
     for wrong in (False, True):
         notes: list[str] = []
@@ -240,25 +244,25 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
         return 1.0 if watch.folder.name == "two" and len(told) > 5 else 0.0
 
     monkeypatch.setattr(Watch, "silence", property(silence))
-    client, turns, further = broker.client("client", heard), iter(range(1000)), list[int]()
+    client, steps, further = broker.client("client", heard), iter(range(1000)), list[int]()
     client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
 
     def send() -> None:
-        turn = next(turns)
-        for name in ("one", "two") if turn == 0 else ("one",):
-            publish(client, name, turn)
+        step = next(steps)
+        for name in ("one", "two") if step == 0 else ("one",):
+            publish(client, name, step)
 
     def tell(asset: WatchedAsset, decision: Decision) -> None:
         quiet = any(notice["kind"] == "quiet" for notice in decision["notices"])
-        told.append((asset.name, decision["turn"], quiet))
+        told.append((asset.name, decision["step"], quiet))
         fleet.asked = told[-1] == ("north/two", 0, True)
 
     def end() -> None:
         """Ask for it once the silence was published again, which a kill could have kept from the broker."""
         if not further:
-            publish(client, "one", 999)  # who has all turns is left alone
+            publish(client, "one", 999)  # who has all steps is left alone
             further.append(len(states()))
-        kinds = [notice["kind"] for one in heard if one.get("turn") == 0 for notice in one["notices"]]
+        kinds = [notice["kind"] for one in heard if one.get("step") == 0 for notice in one["notices"]]
         again.asked = kinds.count("quiet") >= 2 and len(states()) > further[0] + 5
 
     def states() -> list[str]:
@@ -270,7 +274,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
     assert fleet.failures == {}
     (tmp_path / "out" / "north" / "two" / "published").write_text("?")
     planned = load_fleet(tmp_path / "fleet.toml")
-    again = FleetWatch(planned, tmp_path / "out", lambda *_: None, notes.append, turns=1)
+    again = FleetWatch(planned, tmp_path / "out", lambda *_: None, notes.append, steps=1)
     again.run(end)
     topics = again._sources[0]._topics  # type: ignore[union-attr]
     assert [len(topic.came) for topic in topics.values()] == [0, 0]
@@ -287,25 +291,25 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     """The store has what watches have and counts the notices that they gave."""
     short = log_of(tmp_path, 0)
     short.write_text("".join(short.read_text().splitlines(keepends=True)[:4]))
-    fleet_of(tmp_path, LOGS, f"steps = {TURNS}")
+    fleet_of(tmp_path, LOGS, f"steps = {STEPS}")
     outcome = fly_fleet(load_fleet(fleet_file), tmp_path / "flown", Engine(0))
     group, alarmed = open_fleet(outcome.folder)["north"], 0
-    for row, turns in enumerate((3, TURNS, TURNS)):
+    for row, steps in enumerate((3, STEPS, STEPS)):
         lines = journal(tmp_path / "alone" / f"wing-{row}")
-        last = {record["turn"]: record for record in lines}
-        assert group["control_index"].values[row].tolist() == FLOWN[:turns] + [-1] * (TURNS - turns)
-        assert np.isnan(group["log_evidence"].values[row, turns:]).all()
-        assert np.array_equal(group["belief"].values[row], np.array(last[turns - 1]["filtered"], np.float32))
-        for turn in range(turns):
-            evidence = group["log_evidence"].values[row, turn]
-            late = row == 2 and turn in (2, 3)  # written down before the late message came
-            assert late or evidence == np.float32(last[turn]["log_evidence"])
-            seen = np.array(last[turn]["observed"], np.float32)
-            assert late or np.array_equal(group["observed"].values[row, turn], seen, equal_nan=True)
-        told = [(line["turn"], notice["kind"]) for line in lines for notice in line.get("notices", ())]
+        last = {record["step"]: record for record in lines}
+        assert group["control_index"].values[row].tolist() == FLOWN[:steps] + [-1] * (STEPS - steps)
+        assert np.isnan(group["log_evidence"].values[row, steps:]).all()
+        assert np.array_equal(group["belief"].values[row], np.array(last[steps - 1]["filtered"], np.float32))
+        for step in range(steps):
+            evidence = group["log_evidence"].values[row, step]
+            late = row == 2 and step in (2, 3)  # written down before the late message came
+            assert late or evidence == np.float32(last[step]["log_evidence"])
+            seen = np.array(last[step]["observed"], np.float32)
+            assert late or np.array_equal(group["observed"].values[row, step], seen, equal_nan=True)
+        told = [(line["step"], notice["kind"]) for line in lines for notice in line.get("notices", ())]
         for place, kind in enumerate(("alarm", "gauge_left_out")):
-            noticed = [turn for turn, one in told if one == kind and turn < turns]
-            if row != 2:  # whose late message tells of turns before it
+            noticed = [step for step, one in told if one == kind and step < steps]
+            if row != 2:  # whose late message tells of steps before it
                 assert group["notices"].values[row, place] == len(noticed)
                 assert group["first_notice"].values[row, place] == min(noticed, default=-1)
         alarmed += bool(group["notices"].values[row, 0])
@@ -323,10 +327,10 @@ def test_recordings_are_flown_as_a_fleet(fleet_file, alone, tmp_path):
     assert "raised an alarm, first in" in write_fleet_report(outcome.folder).read_text()
     records = [asset.record() for asset in watched(fleet_file, tmp_path / "out").assets.values()]
     assert sum(record["alarms"] > 0 for record in records) == alarmed
-    (tmp_path / "logs" / "wing-9.csv").write_text("turn,control\n")
+    (tmp_path / "logs" / "wing-9.csv").write_text("step,control\n")
     few = fly_fleet(load_fleet(fleet_of(tmp_path, LOGS, "steps = 5")), tmp_path / "few", Engine(0)).failures
-    none = "its recording has no turn yet."
-    long = "it has 6 turns, and 5 at most are flown: set `steps` of the group."
+    none = "its recording has no step yet."
+    long = "it has 6 steps, and 5 at most are flown: set `steps` of the group."
     assert few == {"north/wing-1": long, "north/wing-2": long, "north/wing-9": none}
 
 
@@ -345,7 +349,7 @@ def test_a_watched_asset_says_how_probably_it_leaves_its_control_as_the_store_do
     """Also one that is taken up again, of which nothing is left to read."""
     path = tmp_path / "wing.toml"
     path.write_text("notice = false\n" + path.read_text())  # so that a state is believed whatever comes
-    _, soon = leaving_soon(fleet_of(tmp_path, LOGS, f"steps = {TURNS}"), tmp_path / "flown")
+    _, soon = leaving_soon(fleet_of(tmp_path, LOGS, f"steps = {STEPS}"), tmp_path / "flown")
     for _ in range(2):
         records = watched_records(fleet_file, tmp_path / "out")
         assert [record["leaving"] for record in records] == pytest.approx(soon, abs=1e-6)
@@ -353,7 +357,7 @@ def test_a_watched_asset_says_how_probably_it_leaves_its_control_as_the_store_do
 
 def test_of_an_asset_in_no_state_that_is_believed_a_fleet_tells_no_state(fleet_file, tmp_path):
     """The recordings are noise, which no state explains."""
-    folder, soon = leaving_soon(fleet_of(tmp_path, LOGS, f"steps = {TURNS}"), tmp_path / "flown")
+    folder, soon = leaving_soon(fleet_of(tmp_path, LOGS, f"steps = {STEPS}"), tmp_path / "flown")
     assert np.isnan(soon).all()
     records = watched_records(fleet_file, tmp_path / "out")
     assert [(record["leaving"], record["severity"]) for record in records] == [(None, None)] * 3
@@ -364,7 +368,7 @@ def test_of_an_asset_in_no_state_that_is_believed_a_fleet_tells_no_state(fleet_f
 
 
 def test_a_fleet_with_an_asset_that_cannot_be_read_ends_with_exit_code_1(fleet_file, tmp_path):
-    log_of(tmp_path, 0).write_text("turn,colour\n0,red\n")
+    log_of(tmp_path, 0).write_text("step,colour\n0,red\n")
     done = command("fleet", "watch", fleet_file, "--out", tmp_path / "out")
     assert done.returncode == 1
     assert "north/wing-0 is not watched: " in done.stderr
@@ -381,7 +385,7 @@ def test_a_fleet_with_an_asset_whose_messages_are_refused_ends_with_exit_code_1(
 
 def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, alone, tmp_path):
     for name, text in {
-        "wing-0": "turn,colour\n0,red\n", "not a name!": "turn\n", "void": "", "wing-9": "turn,control\n"
+        "wing-0": "step,colour\n0,red\n", "not a name!": "step\n", "void": "", "wing-9": "step,control\n"
     }.items():  # fmt: skip
         (tmp_path / "logs" / f"{name}.csv").write_text(text)
     failures = watched(fleet_file, tmp_path / "out").failures
@@ -406,7 +410,7 @@ def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, al
             "wing-1",
             "colour",  # why that one is not watched
             "3 of 6 assets are not watched",
-            "Without a turn yet: 1 asset (north/wing-9)",
+            "Without a step yet: 1 asset (north/wing-9)",
             "<strong>1</strong><span>messages refused",
         ):
             assert words in page

@@ -45,12 +45,12 @@ def observations() -> Float:
 
 
 @cache
-def enumerated(turns: int) -> Float:
+def enumerated(steps: int) -> Float:
     """Return p(path, draw, factor, o) over everything: (paths of S^T, E, R), not normalised."""
     sensor = sensors()
-    table = np.zeros((3,) * turns + (DRAWS, len(FACTORS)))
-    shown = sensor.value_per_draw[:, :, CONTROLS[:turns]].swapaxes(1, 2)  # (E, T, S, G)
-    density = norm.logpdf(observations()[:turns, None], shown, sensor.standard_deviation)
+    table = np.zeros((3,) * steps + (DRAWS, len(FACTORS)))
+    shown = sensor.value_per_draw[:, :, CONTROLS[:steps]].swapaxes(1, 2)  # (E, T, S, G)
+    density = norm.logpdf(observations()[:steps, None], shown, sensor.standard_deviation)
     for draw, (place, factor) in product(range(DRAWS), enumerate(FACTORS)):
         *_, (_, joint) = trajectories(model(factor), CONTROLS, np.nansum(density[draw], axis=-1))
         table[..., draw, place] = joint * sensor.draw_weight[draw] / len(FACTORS)
@@ -129,7 +129,7 @@ def test_the_interval_of_a_parameter_does_not_depend_on_where_its_draws_lie():
 
 
 def test_a_belief_that_underflows_comes_back():
-    """The hypothesis that is right from the second turn on had a weight below the doubles."""
+    """The hypothesis that is right from the second step on had a weight below the doubles."""
     value = np.array([0.0, 60.0])[:, None, None, None].repeat(2, axis=2)  # (E, 1, U, 1)
     learner = LearningFilter(model(levels=1), GaussianSensorModel(value, 1.0), NOTHING, ("e", [0, 60]))
     estimates = estimates_of(learner, np.array([[0.0], [60.0], [60.0]]), [0, 0, 0])
@@ -153,19 +153,19 @@ def moments(values: Float, weight: Float) -> tuple[Float, Float]:
 def test_filtered_and_smoothed_are_sums_over_all_trajectories(other):
     """States, draws and transition factors; what is expected to be seen, also of another belief."""
     learner, seen, rewards = learner_of_all(), observations(), RewardModel(sensors(), *SETTINGS)
-    expectation, turns = LearntExpectation(learner, rewards, POLICY), estimates_of(learner, seen, CONTROLS)
-    carried = [turn.carried for turn in turns]
-    now, later = np.array([turn.filtered for turn in turns]), learner.smoothed(carried)
+    expectation, steps = LearntExpectation(learner, rewards, POLICY), estimates_of(learner, seen, CONTROLS)
+    carried = [step.carried for step in steps]
+    now, later = np.array([step.filtered for step in steps]), learner.smoothed(carried)
     value, whole, evidence = sensors().value_per_draw, enumerated(STEPS), 0.0
-    for t, turn in enumerate(turns):
+    for t, step in enumerate(steps):
         until = enumerated(t + 1)
-        evidence += turn.log_evidence
+        evidence += step.log_evidence
         assert evidence == pytest.approx(np.log(until.sum()), abs=1e-12)
         joint = until.reshape(-1, 3, DRAWS, len(FACTORS)).sum(axis=0) / until.sum()
         np.testing.assert_allclose(now[t], joint.sum(axis=(1, 2)), rtol=1e-11)
-        belief = np.exp(turn.carried.arrays["log_belief"]).reshape(len(FACTORS), DRAWS, 3)
+        belief = np.exp(step.carried.arrays["log_belief"]).reshape(len(FACTORS), DRAWS, 3)
         np.testing.assert_allclose(belief, joint.transpose(2, 1, 0), rtol=1e-11)
-        factor = turn.learnt["transition_factor"]
+        factor = step.learnt["transition_factor"]
         assert factor.mean == pytest.approx(joint.sum(axis=(0, 1)) @ FACTORS, rel=1e-9)
         others = tuple(axis for axis in range(STEPS + 2) if axis != t)
         np.testing.assert_allclose(later[t], whole.sum(axis=others) / whole.sum(), rtol=1e-10)
@@ -194,9 +194,9 @@ def test_filtered_and_smoothed_are_sums_over_all_trajectories(other):
 
 
 def test_predicted_follows_the_scenario_through_the_policy():
-    *_, turn = estimates_of(learner_of_all(), observations(), CONTROLS)
+    *_, step = estimates_of(learner_of_all(), observations(), CONTROLS)
     expectation = LearntExpectation(learner_of_all(), RewardModel(sensors(), *SETTINGS), POLICY)
-    found = expectation.predicted([turn.carried], [turn.filtered], [POLICY], 2)
+    found = expectation.predicted([step.carried], [step.filtered], [POLICY], 2)
     table = enumerated(STEPS).sum(axis=(0, 1, 2, 5))  # (S, E)
     table = table / table.sum()
     matrix, value = model().transition.matrix, sensors().value_per_draw
@@ -222,7 +222,7 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     seen = 1.5 + 0.93 * shown + np.array([0.1, -0.7, 0.4, 0.2, -0.1, np.nan, 0.9])
     there = ~np.isnan(seen)
     estimates = estimates_of(learner, seen[:, None], controls)
-    carried, learnt = [turn.carried for turn in estimates], estimates[-1].learnt
+    carried, learnt = [step.carried for step in estimates], estimates[-1].learnt
     # Bayesian linear regression of (o - h) / sigma on (offset, gain) in their prior deviations.
     design = np.stack([np.full(6, 2.0), 0.1 * shown[there]], axis=1) / 0.5
     left = (seen - shown)[there] / 0.5
@@ -241,7 +241,7 @@ def test_gain_offset_and_noise_are_those_of_the_regression():
     row = design[-1]
     rewards = RewardModel(sensor, 9.0, (0.0, 0.0), 0.8)
     expectation = LearntExpectation(learner, rewards, np.array([[1.0, 0.0]]))
-    found = expectation.filtered(carried, [turn.filtered for turn in estimates], seen[:, None])
+    found = expectation.filtered(carried, [step.filtered for step in estimates], seen[:, None])
     spread = 0.5 * np.sqrt(scale2 * row @ covariance @ row)
     assert found.mean[-1, 0] == pytest.approx(shown[-1] + 0.5 * row @ mean)
     assert found.standard_deviation[-1, 0] == pytest.approx(spread)

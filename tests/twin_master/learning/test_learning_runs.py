@@ -27,9 +27,9 @@ from twin_master.viewer.flight import Flight
 from uav_twin import fly, load_scenario, open_run, prepare_twin, report_figures
 
 MOMENTS = ("mean", "standard_deviation", "lower", "upper")
-TURNS = 9
+STEPS = 9
 SHORT = (
-    ("steps = 50", f"steps = {TURNS}"),
+    ("steps = 50", f"steps = {STEPS}"),
     ("draws = 60", "draws = 8"),
     ("count = 24\n", "count = 24\nbetween_levels = false\n"),
 )
@@ -56,9 +56,9 @@ def learnt(folder: Path) -> xr.Dataset:
     return open_run(folder)["learnt"].to_dataset()
 
 
-def test_the_store_holds_what_the_twin_said_in_every_turn(folder, learnt):
+def test_the_store_holds_what_the_twin_said_in_every_step(folder, learnt):
     lines = [line["learnt"] for line in journal(folder)]
-    assert len(lines) == TURNS
+    assert len(lines) == STEPS
     assert len(lines[0]) == 1 + 1 + 24 + 24 + 23  # parameter, transitions, noise, gain, offset
     for name in lines[0]:
         base, _, sensor = name.rstrip("]").partition("[")
@@ -147,16 +147,16 @@ def test_the_view_shows_what_was_learnt(folder):
     flight, run = Flight(folder), open_run(folder)
     filtered = run["filtered"].to_dataset()
     flight.update()
-    shown = flight.believed(flight.seen(0, TURNS)).expected
+    shown = flight.believed(flight.seen(0, STEPS)).expected
     noise = filtered["noise_standard_deviation"].values
     wide = np.hypot(noise, filtered["quantity_standard_deviation"].values)
     np.testing.assert_allclose(np.hypot(shown.standard_deviation, shown.noise), wide, rtol=0.1)
     np.testing.assert_allclose(shown.reward_mean, filtered["reward_mean"].values, atol=0.03)
-    ahead = flight.predicted(flight.seen(TURNS - 1, TURNS)[0]).expected.mean
+    ahead = flight.predicted(flight.seen(STEPS - 1, STEPS)[0]).expected.mean
     assert np.abs((ahead - run["predicted"]["quantity_mean"].values[-1]) / noise[-1]).max() < 0.06
 
     def off() -> float:
-        error = flight.believed(flight.seen(0, TURNS)).expected.mean - filtered["quantity_mean"].values
+        error = flight.believed(flight.seen(0, STEPS)).expected.mean - filtered["quantity_mean"].values
         return float(np.abs(error / noise).max())
 
     residual = (run["observed"]["strain"].values - filtered["quantity_mean"].values) / noise
@@ -166,7 +166,7 @@ def test_the_view_shows_what_was_learnt(folder):
     assert learnt < 0.06 < 0.3 < off()  # as calibrated
 
 
-def test_a_watch_keeps_the_last_turns_of_what_it_learnt(scenario, folder, learnt):
+def test_a_watch_keeps_the_last_steps_of_what_it_learnt(scenario, folder, learnt):
     out = folder.parent / "watch"
     said("watch", scenario, "--observations", folder, "--out", out, "--no-report", "--last", 4)
     watched = open_run(out)["learnt"].to_dataset()
@@ -203,7 +203,7 @@ def test_offsets_of_sensors_of_several_units_have_their_own(tmp_path):
     assert [learnt[f"gauge_offset[{number}]"]["unit"] for number in range(1, 5)] == units
 
 
-def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
+def test_notices_are_on_in_every_file_that_does_not_step_them_off(tmp_path):
     assert dict(Noticing()) == vars(Noticing())
     for name in scenario_files():
         loaded = load_scenario(name)
@@ -222,7 +222,7 @@ def test_notices_are_on_in_every_file_that_does_not_turn_them_off(tmp_path):
     many = [(levels, f"{[*range(90)]}\nprior = {[1] + [0] * 89}")] * 2
     for changes, remark in (
         ([of_its_own], "each sensor has a parameter of"),
-        (many, "they take 11,664,000 numbers a turn, more than 1,000,000"),
+        (many, "they take 11,664,000 numbers a step, more than 1,000,000"),
     ):
         text = text_of("level_turns", *changes)
         loaded = load_scenario(written(tmp_path, text))
@@ -238,25 +238,25 @@ def test_what_was_noticed_is_the_same_on_console_in_journal_store_summary_and_re
     faults = ("# What the figures", Inputs(__file__).text("faults.toml") + "# What the figures")
     spoilt, noticed = written(tmp_path, TEXT, *SHORT, faults), tmp_path / "run"
     console = said("run", spoilt, "--out", noticed, "--no-report")
-    assert _shown(123_456, "") == "123456"  # a turn has all of its digits
-    alarm = next(line for line in console.splitlines() if line.startswith("Turn ") and "gauge 5" in line)
+    assert _shown(123_456, "") == "123456"  # a step has all of its digits
+    alarm = next(line for line in console.splitlines() if line.startswith("Step ") and "gauge 5" in line)
     assert "gauge 5 shows too much, or the asset near it" in alarm
-    assert ", since about turn 2 (" in alarm
-    search = f"; to find the cause: uav-twin discrepancy run --from-run {noticed} --from-turn 2"
+    assert ", since about step 2 (" in alarm
+    search = f"; to find the cause: uav-twin discrepancy run --from-run {noticed} --from-step 2"
     assert alarm.endswith(f"alarm from 100){search}")
-    assert "Turn 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in console
+    assert "Step 3: gauge 12 shows 1e+14 microstrain, and no state can show less than" in console
 
     notices = json.loads((noticed / "summary.json").read_text())["notices"]
     assert {n["kind"] for n in notices} == {"gauge_left_out", "alarm", "hypothesis"}
     assert {(n["kind"], *n["sensors"]) for n in notices} >= {("gauge_left_out", 12), ("alarm", 5)}
     lines = journal(noticed)
-    assert [{"turn": line["turn"]} | n for line in lines for n in line.get("notices", ())] == notices
+    assert [{"step": line["step"]} | n for line in lines for n in line.get("notices", ())] == notices
     kept = open_run(noticed)["notice"].to_dataset()
     for name, values in kept.data_vars.items():
         assert [line["suspicion"][name] for line in lines] == values.values.tolist()
     np.testing.assert_array_equal(kept["left_out"].sel(sensor=12), [0, 0, 0, 1, 1, 1, 1, 1, 1])
     figures = figures_of(noticed)
-    assert figures["alarm_step"] == next(n["turn"] for n in notices if n["kind"] == "alarm")
+    assert figures["alarm_step"] == next(n["step"] for n in notices if n["kind"] == "alarm")
     assert figures["gauge_off"] == kept["gauge_off"].values[-1]
     decided = [line["suspicion"]["decided_by"] for line in lines]
     assert figures["decided_by"] == decided[-1]

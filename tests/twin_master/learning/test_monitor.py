@@ -16,12 +16,12 @@ from twin_master.errors import ImpossibleObservation, InvalidModelError, Invalid
 from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.rivals import Shares
-from twin_master.mission.journal import line_of, turn_record
+from twin_master.mission.journal import line_of, step_record
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.turns import Reading, Turn
+from twin_master.mission.steps import MissionStep, Reading
 from twin_master.network.estimator import Words
 from twin_master.network.graphical_model import worsening_table
-from twin_master.network.twin import TwinTurn
+from twin_master.network.twin import TwinStep
 from twin_master.scenario.tables import Learning, Noticing
 from uav_twin import ExactFilter, GaussianSensorModel, GraphicalModel, Twin, WatchfulEstimator, prepare_twin
 
@@ -43,13 +43,13 @@ def watchful(gauges: int = 3, given: Noticing = SETTINGS) -> WatchfulEstimator:
     return WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, given)
 
 
-def drawn(random: np.random.Generator, turns: int, gauges: int = 3) -> Float:
+def drawn(random: np.random.Generator, steps: int, gauges: int = 3) -> Float:
     """Return observations of the model itself, with noise scales drawn from their prior."""
     model, sensors = small(gauges)
     half = 0.5 * SETTINGS.noise_degrees
     scale = np.sqrt(half / random.gamma(half, size=gauges))
     draw, state, rows = random.integers(2), 0, []
-    for _ in range(turns):
+    for _ in range(steps):
         rows.append(sensors.value_per_draw[draw, state, 0] + scale * random.normal(size=gauges))
         state = random.choice(3, p=model.transition.matrix[0, state])
     return np.array(rows)
@@ -62,7 +62,7 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     seen[6:, 1] *= 1.4
     words = Words(names=("root", "spar", "tip"), command="")  # of an asset where none looks for causes
     watched = estimates_of(WatchfulEstimator(inner, sensors, DRAWS, words=words), seen)
-    for turn, (plain, found) in enumerate(zip(estimates_of(inner, seen), watched, strict=True)):
+    for step, (plain, found) in enumerate(zip(estimates_of(inner, seen), watched, strict=True)):
         # The filter goes on as if it were alone, and the evidence is the model's.
         np.testing.assert_array_equal(*(one.carried.arrays["log_filtered"] for one in (found, plain)))
         assert found.log_evidence == plain.log_evidence
@@ -72,7 +72,7 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
         mixed = sum((one.probability * one.belief for one in found.hypotheses if one.belief is not None),
                     np.zeros(3))  # fmt: skip
         np.testing.assert_allclose(mixed / mixed.sum(), found.filtered, atol=2.0 * told + 1e-6)
-        if turn < 6:
+        if step < 6:
             np.testing.assert_allclose(found.filtered, plain.filtered, atol=0.03)
     assert probability["gauge 2 (spar) off"] > 0.9
     assert found.suspicion.gauge_off > 0.9
@@ -80,7 +80,7 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     assert (alarm.sensors, abs(alarm.since - 6) <= 1) == ((2,), True)
     assert (
         ": gauge 2 (spar) shows too much, or the asset near it is not as the model says, as where it has "
-        f"softened, since about turn {alarm.since}"
+        f"softened, since about step {alarm.since}"
     ) in alarm.sentence
     assert alarm.sentence.endswith("alarm from 100)")
     assert np.abs(found.filtered - plain.filtered).max() > 0.1
@@ -94,7 +94,7 @@ def test_the_belief_is_that_of_all_hypotheses_that_believe_in_a_state():
     # A model that takes the place of another begins without suspicion.
     taught = GaussianSensorModel(sensors.value_per_draw * [[[[1.0, 1.4, 1.0]]]], 1.0)
     other = WatchfulEstimator(ExactFilter(model, taught), taught, DRAWS)
-    after = other.turn(carried[-1], seen[-1], 0, 12)
+    after = other.step(carried[-1], seen[-1], 0, 12)
     assert max(after.suspicion.none_of_these, after.suspicion.gauge_off) < 0.05
     assert not after.notices
 
@@ -156,26 +156,26 @@ def test_a_fault_that_showed_under_a_control_is_mended_by_that_control():
     assert shares.none_of_these < 0.01
 
 
-def test_evidence_is_the_sum_over_states_draws_gains_and_first_turns(monkeypatch):
+def test_evidence_is_the_sum_over_states_draws_gains_and_first_steps(monkeypatch):
     """Where the noise is known and gains are not learnt, against the sum over every course of events."""
     monkeypatch.setattr("twin_master.learning.monitor._REACH", (0.0,) * 4)
-    turns, seen = 4, drawn(np.random.default_rng(8), 4)
-    seen[2, 1] = seen[1] = np.nan  # a gauge, and a whole turn
-    known = Noticing(noise_degrees=1e9, onset_turns=3.0)
+    steps, seen = 4, drawn(np.random.default_rng(8), 4)
+    seen[2, 1] = seen[1] = np.nan  # a gauge, and a whole step
+    known = Noticing(noise_degrees=1e9, onset_steps=3.0)
     found = estimates_of(watchful(given=known), seen)[-1].suspicion
     model, sensors = small()
-    to_begin = 0.5 / (1.0 + np.arange(turns) / 3.0)
-    first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of these turns, and of none of them
+    to_begin = 0.5 / (1.0 + np.arange(steps) / 3.0)
+    first = np.concatenate([[0.5], -np.diff(to_begin), [to_begin[-1]]])  # of these steps, and of none of them
 
     def evidence(gauge: int, gain: float, begin: int) -> float:
-        shown = sensors.value_per_draw[:, :, 0].repeat(turns, axis=1).reshape(2, 3, turns, 3)
+        shown = sensors.value_per_draw[:, :, 0].repeat(steps, axis=1).reshape(2, 3, steps, 3)
         shown[:, :, begin:, gauge] *= 1.0 + gain
         density = np.nansum(norm.logpdf(seen, shown), axis=-1).swapaxes(1, 2)  # (E, T, S)
-        paths = ([*trajectories(model, [0] * turns, row)][-1][1] for row in density)
+        paths = ([*trajectories(model, [0] * steps, row)][-1][1] for row in density)
         return 0.5 * float(sum(joint.sum() for joint in paths))
 
     for gauge in range(3):
-        each = [np.mean([evidence(gauge, gain, begin) for gain in GAINS]) for begin in range(turns + 1)]
+        each = [np.mean([evidence(gauge, gain, begin) for gain in GAINS]) for begin in range(steps + 1)]
         expected = np.log(first @ each / evidence(gauge, 0.0, 0))
         assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-5)
 
@@ -202,11 +202,11 @@ def test_the_first_evidence_is_a_ratio_of_two_sums():
         assert found.log_evidence_gauge[gauge] == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("turns", [1, 7])
-def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_model(turns):
+@pytest.mark.parametrize("steps", [1, 7])
+def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_model(steps):
     """What Ville's inequality needs, by quadrature over the next observation, after any past."""
     estimator = watchful(1)
-    seen = drawn(np.random.default_rng(turns), turns, 1)
+    seen = drawn(np.random.default_rng(steps), steps, 1)
     seen[-1] += 4.0  # a past that looks like a fault
     today = estimates_of(estimator, seen)[-1]
     model, sensors = small(1)
@@ -219,7 +219,7 @@ def test_the_mean_of_tomorrows_e_values_is_todays_under_the_predictions_of_the_m
     grid = np.linspace(-40.0, 60.0, 801)
     density = np.einsum("es,esn->n", belief, student.pdf(grid, degrees, value[..., None], scale))
     wide = WatchfulEstimator(ExactFilter(model, sensors), sensors, DRAWS, Noticing(absurd_deviations=1e3))
-    tomorrow = [wide.turn(today.carried, np.array([x]), 0, turns).suspicion for x in grid]
+    tomorrow = [wide.step(today.carried, np.array([x]), 0, steps).suspicion for x in grid]
     for name in ("log_evidence_none", "log_evidence_any_gauge"):
         values = np.exp([getattr(suspicion, name) for suspicion in tomorrow])
         mean = np.trapezoid(density * values, grid)
@@ -247,15 +247,15 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, la
         for number, row in enumerate([ordinary[0], *rows, *ordinary[1:]]):
             before = twin.save_state()
             try:
-                turn = twin.revise(0, row) if number and number == late else twin.turn(row)
+                step = twin.revise(0, row) if number and number == late else twin.step(row)
             except (ImpossibleObservation, InvalidObservationError):
                 assert twin.save_state() == before
-                turn = twin.turn(np.full(2, np.nan))
-            assert turn.filtered.sum() == pytest.approx(1.0)
-            if turn.suspicion is not None:
-                assert 0.0 <= turn.suspicion.none_of_these + turn.suspicion.gauge_off <= 1.0 + 1e-12
-            record = Turn(Reading(np.full(2, np.nan)), turn)
-            line_of(turn_record(record))  # which holds no NaN and no infinity
+                step = twin.step(np.full(2, np.nan))
+            assert step.filtered.sum() == pytest.approx(1.0)
+            if step.suspicion is not None:
+                assert 0.0 <= step.suspicion.none_of_these + step.suspicion.gauge_off <= 1.0 + 1e-12
+            record = MissionStep(Reading(np.full(2, np.nan)), step)
+            line_of(step_record(record))  # which holds no NaN and no infinity
 
 
 def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():
@@ -268,16 +268,16 @@ def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():
     late, absurd = seen[5].copy(), seen.copy()
     late[1], seen[5] = 1e9, np.nan
     absurd[1:4, 2], seen[1:4, 2], absurd[5] = [1e9, np.nan, 1e16], np.nan, np.nan
-    for turn, row in enumerate(absurd):
-        found, expected = twin.turn(row, 0), without.turn(seen[turn], 0)
-        told += [(turn, notice.kind, notice.sensors) for notice in found.notices]
-        assert bool(found.suspicion.left_out[2]) == (1 <= turn < 4)
+    for step, row in enumerate(absurd):
+        found, expected = twin.step(row, 0), without.step(seen[step], 0)
+        told += [(step, notice.kind, notice.sensors) for notice in found.notices]
+        assert bool(found.suspicion.left_out[2]) == (1 <= step < 4)
         np.testing.assert_allclose(found.filtered, expected.filtered, rtol=1e-9)
     assert told == [(1, "gauge_left_out", (3,)), (4, "gauge_back", (3,))]
     revised = twin.revise(5, late)
-    assert revised.turn == 9
+    assert revised.step == 9
     assert [(n.kind, n.sensors) for n in revised.notices] == [("gauge_left_out", (2,)), ("gauge_back", (2,))]
-    assert "Turn 5: gauge 2 shows 1e+09" in revised.notices[0].sentence
+    assert "Step 5: gauge 2 shows 1e+09" in revised.notices[0].sentence
 
 
 def test_too_many_states_are_refused_in_a_sentence(monkeypatch):
@@ -317,16 +317,16 @@ def test_belief_and_decision_follow_what_holds_now(between):
     known, random = replace(wing, scenario=scenario), np.random.default_rng(4)
     states, gauges = known.model.states.coordinates, np.arange(24)
     twins = {True: known.twin(lag=1), False: wing.twin(lag=1)}
-    course: dict[bool, list[TwinTurn]] = {True: [], False: []}
+    course: dict[bool, list[TwinStep]] = {True: [], False: []}
     truth = np.repeat([0.0, 0.2, 0.4, 0.6], [10, 10, 10, 60])
-    for turn, z1 in enumerate(truth):
+    for step, z1 in enumerate(truth):
         state = np.flatnonzero(np.isclose(states[:, 0], z1) & (states[:, 1] == 0.0))[0]
-        wrong = (gauges == 16) & (12 <= turn < 46) | (gauges % 2 == 0) & (60 <= turn < 80)
+        wrong = (gauges == 16) & (12 <= step < 46) | (gauges % 2 == 0) & (60 <= step < 80)
         noise = 150e-6 * random.normal(size=24)
         for watched, twin in twins.items():
-            control = course[watched][-1].next_control if turn else 1
+            control = course[watched][-1].next_control if step else 1
             row = known.sensor_model.mean[state, control] * np.where(wrong, 0.67, 1.0) + noise
-            course[watched].append(twin.turn(row, control))
+            course[watched].append(twin.step(row, control))
     first = states[:, 0]
     mean = {watched: np.array([found.filtered @ first for found in course[watched]]) for watched in course}
     assert np.abs(mean[True] - truth)[np.r_[14:20, 25:30, 35:90]].max() < 0.12
@@ -367,15 +367,15 @@ def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_na
     assert named.scenario.control_names[named.safest] == "3g"
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
-    turns = [twin.turn(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]
-    alarm = next(notice for turn in turns for notice in turn.notices if notice.kind == "alarm")
+    steps = [twin.step(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]
+    alarm = next(notice for step in steps for notice in step.notices if notice.kind == "alarm")
     assert ", from the start " in alarm.sentence
     assert alarm.sentence.endswith(
         "alarm from 100); to find the cause: uav-twin discrepancy run --from-run DIR"
     )
-    turn = turns[-1]
-    assert turn.suspicion.none_of_these > 0.5
-    np.testing.assert_allclose(turn.decision_probability, [1.0])  # the policy decides where nothing is safest
+    step = steps[-1]
+    assert step.suspicion.none_of_these > 0.5
+    np.testing.assert_allclose(step.decision_probability, [1.0])  # the policy decides where nothing is safest
 
 
 @pytest.fixture(scope="module")
@@ -385,14 +385,14 @@ def level_turns() -> Knowledge:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_control_does_not_chatter_where_a_fault_shows_in_sharp_turns_alone(level_turns, seed):
+def test_control_does_not_chatter_where_a_fault_shows_in_sharp_steps_alone(level_turns, seed):
     """Half of the gauges show a third too little at 3g, and what they should at 2g; nothing is damaged."""
     twin, random, control, controls = level_turns.twin(lag=1), np.random.default_rng(seed), 1, []
     wrong = random.permutation(24) < 12
     for _ in range(50):
         gain = np.where(wrong, 0.67, 1.0) if control == 1 else 1.0
         row = level_turns.sensor_model.mean[0, control] * gain + 150e-6 * random.normal(size=24)
-        found = twin.turn(row, control)
+        found = twin.step(row, control)
         controls.append(control)
         control = found.next_control
     assert np.count_nonzero(np.diff(controls)) <= 3

@@ -37,7 +37,7 @@ from twin_master.mission import loop
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, line_of
 from twin_master.mission.loop import fly, kept_in, taken_up
 from twin_master.mission.preparation import Knowledge
-from twin_master.mission.turns import History, Plant, SensorStatus, Truth, Turn
+from twin_master.mission.steps import History, MissionStep, Plant, SensorStatus, Truth
 from twin_master.network.twin import build_graphical_model
 from twin_master.scenario.reading import load_scenario
 from twin_master.scenario.schema import Scenario
@@ -68,18 +68,18 @@ def part(known: Known, folder: Path, config_hash: str = "abc", kind: type[Plant]
 
 
 @pytest.mark.parametrize("name", ["level_turns", "growing_damage", "failing_gauges", "level_turns_learning"])
-def test_resuming_after_any_turn_is_bit_identical(name, library_file, tmp_path):
+def test_resuming_after_any_step_is_bit_identical(name, library_file, tmp_path):
     known = of_library(name, library_file)
     whole = part(known, tmp_path)
     assert len(journal(tmp_path)) == 50
     content = (tmp_path / JOURNAL_NAME).read_bytes()
-    for turns in (17, 50):
-        kept = content.splitlines(keepends=True)[: turns + 1]
+    for steps in (17, 50):
+        kept = content.splitlines(keepends=True)[: steps + 1]
         (tmp_path / JOURNAL_NAME).write_bytes(b"".join(kept))
         rest = part(known, tmp_path)
-        assert rest.resumed_at == turns
+        assert rest.resumed_at == steps
         assert (tmp_path / JOURNAL_NAME).read_bytes() == content
-        assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= turns))
+        assert np.all((rest.seconds > 0.0).any(axis=1) == (np.arange(50) >= steps))
         assert rest.notices == whole.notices
         for array in ARRAYS:
             np.testing.assert_array_equal(getattr(rest, array), getattr(whole, array))
@@ -103,7 +103,7 @@ def test_a_mission_without_numba_is_the_same(library_file, tmp_path):
         xr.testing.assert_allclose(found[group].to_dataset(), expected[group].to_dataset(), rtol=1e-9)
 
 
-def test_timing_of_a_turn(paper):
+def test_timing_of_a_step(paper):
     """Control u_t is in force while d_t, the gain of step t included, is observed; noise alone is added."""
     knowledge, source = paper
     asked: list[tuple[float, float, float]] = []
@@ -127,7 +127,7 @@ def test_timing_of_a_turn(paper):
 
 
 def test_an_asset_that_returns_nan_or_the_wrong_number_stops_the_mission(paper):
-    inner, kept = paper[1].open(), list[Turn]()
+    inner, kept = paper[1].open(), list[MissionStep]()
 
     def broken(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
         values = inner.step(control, health).values
@@ -189,19 +189,19 @@ class Heavy(Plant):
         return np.random.default_rng(self.step).bytes(100)
 
     def restore(self, flown: History, asset_state: bytes) -> None:
-        self.step, self._state = len(flown.turns), flown.state[-1]
+        self.step, self._state = len(flown.steps), flown.state[-1]
         assert asset_state == self.save_state()
 
 
 @pytest.fixture(scope="module", params=[4])
 def known(request: pytest.FixtureRequest, library_file: Path) -> Known:
-    """Of a mission of four turns, or of another number."""
+    """Of a mission of four steps, or of another number."""
     mission = load_scenario("level_turns").scenario.mission.model_copy(update={"steps": request.param})
     return of_library("level_turns", library_file, mission=mission)
 
 
 def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one_refused(known, tmp_path):
-    """Also one that decided otherwise in any turn."""
+    """Also one that decided otherwise in any step."""
     part(known, tmp_path)
     path = tmp_path / JOURNAL_NAME
     whole = path.read_bytes()
@@ -229,15 +229,15 @@ def test_a_journal_that_was_cut_off_is_gone_on_with_and_a_changed_or_foreign_one
         with pytest.raises(NotResumableError, match=rf"line {line} of .*changed or is damaged.*--replace"):
             part(known, tmp_path)
     path.write_bytes(whole)
-    for turn, record in enumerate(journal(tmp_path)):
+    for step, record in enumerate(journal(tmp_path)):
         other = line_of(record | {"next_control": 1 - record["next_control"]})
-        path.write_bytes(b"".join([*lines[: turn + 1], other, *lines[turn + 2 :]]))
-        with pytest.raises(NotResumableError, match=f"decided otherwise after turn {turn} .*--replace"):
+        path.write_bytes(b"".join([*lines[: step + 1], other, *lines[step + 2 :]]))
+        with pytest.raises(NotResumableError, match=f"decided otherwise after step {step} .*--replace"):
             part(known, tmp_path)
 
 
 @pytest.mark.parametrize("known", [12], indirect=True)
-def test_large_states_are_kept_less_often_and_their_turns_flown_again(known, tmp_path, monkeypatch):
+def test_large_states_are_kept_less_often_and_their_steps_flown_again(known, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "STATE_ALLOWANCE", 5000)
     monkeypatch.setattr(loop, "STATE_SHARE", 50)
     part(known, tmp_path, kind=Heavy)
@@ -289,7 +289,7 @@ def test_an_fmu_that_ends_its_simulation_ends_the_mission_with_what_was_flown(
     flag.touch()
     part = new_run(loaded, tmp_path / "part")
     (said,) = part.notices
-    assert said.startswith("The asset ended the mission after 20 of 30 turns: ")
+    assert said.startswith("The asset ended the mission after 20 of 30 steps: ")
     assert "The FMU asked to end the simulation in the step from t = 20 s" in said
     with xr.open_datatree(whole.folder / "run.nc") as long, xr.open_datatree(part.folder / "run.nc") as short:
         for name in ("observed/y", "truth/y", "truth/state", "truth/sensor_status", "filtered/belief"):
@@ -351,7 +351,7 @@ def test_our_policy_flies_the_mission_of_the_loop(environment):
         twin, (observation, info) = knowledge.twin(), environment.reset(seed=seed)
         observed, controls, rewards, truncated = [info["observed"]], [info["control"]], [], False
         while not truncated:
-            action = twin.turn(info["observed"], info["control"]).next_control
+            action = twin.step(info["observed"], info["control"]).next_control
             observation, reward, terminated, truncated, info = environment.step(action)
             assert not terminated
             np.testing.assert_array_equal(observation, np.nan_to_num(info["observed"]))

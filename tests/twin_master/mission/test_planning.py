@@ -77,7 +77,7 @@ def asset_of(known: Knowledge) -> Any:
     return ReducedModelSource(known.scenario, reduced_model()).open()
 
 
-def test_an_action_is_a_control_with_a_price_and_a_repair_follows_the_growth_of_its_turn():
+def test_an_action_is_a_control_with_a_price_and_a_repair_follows_the_growth_of_its_step():
     written = scenario()
     assert written.control_names == ("2g", "3g", "inspect", "repair_1", "repair_2")
     assert written.control[INSPECT].values == {"load_factor": 2.0}
@@ -90,7 +90,7 @@ def test_an_action_is_a_control_with_a_price_and_a_repair_follows_the_growth_of_
     assert not row[1:].any()
 
 
-def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_turn():
+def test_a_reading_is_weighed_beside_the_gauges_and_only_in_its_step():
     known = knowledge()
     row = np.full(26, np.nan)
     row[24] = 0.37
@@ -113,7 +113,7 @@ def test_what_learns_or_gives_notice_takes_a_reading_as_the_exact_filter_does(ga
         others.append(WatchfulEstimator(exact, sensors, known.draws.values, wary))
     rng, states = np.random.default_rng(1), np.array([0, 1, 6, 7, 12, 13])
     controls = [1, INSPECT, 0, INSPECT, INSPECT, 1]
-    rows = [sensors.sampled(states[[turn]], control, rng)[0] for turn, control in enumerate(controls)]
+    rows = [sensors.sampled(states[[step]], control, rng)[0] for step, control in enumerate(controls)]
     seen = np.where(gauges | (np.arange(26) >= 24), rows, np.nan)
     expected = estimates_of(exact, seen, controls)
     for estimator in others:
@@ -223,7 +223,7 @@ def test_the_command_plans_draws_and_says_what_inspections_gauges_and_simpler_ru
     assert policy.stat().st_size > 1000
     assert picture.read_bytes().startswith(b"<?xml")
     rules = json.loads(said("plan", path, "--json"))["rules"]
-    assert rules["QMDP"][0] < rules["inspection every 5 turns"][0] < rules["planned on the belief"][0]
+    assert rules["QMDP"][0] < rules["inspection every 5 steps"][0] < rules["planned on the belief"][0]
     worth = json.loads(said("design", path, "--sensors", 1, "--among", "17,24", "--worth", "--json"))["worth"]
     assert worth["all beyond chosen"][0] == pytest.approx(worth["all"][0] - worth["chosen"][0])
     assert worth["all beyond chosen"][1] < 0.2 * worth["all"][1]  # mission by mission
@@ -247,9 +247,9 @@ def test_inspections_of_a_fleet_go_where_they_are_worth_most():
     assert np.array_equal(np.delete(few, wanting), np.delete(chosen, wanting))
 
 
-def test_a_budget_of_inspections_is_kept_in_every_turn():
+def test_a_budget_of_inspections_is_kept_in_every_step():
     known, (_, plan) = knowledge(*FOUR_STATES), planned()
-    settings = known.scenario.planner.model_copy(update={"inspections_a_turn": 3})
+    settings = known.scenario.planner.model_copy(update={"inspections_per_step": 3})
     written = known.scenario.model_copy(update={"planner": settings})
     flown = side_by_side(following(known, plan.policy, written), 40)
     inspections = (flown.control_index == INSPECT).sum(axis=0)
@@ -258,11 +258,11 @@ def test_a_budget_of_inspections_is_kept_in_every_turn():
 
 def test_a_fleet_shares_its_inspections_in_one_shard(tmp_path):
     text = 'format = 1\nfleet = { name = "inspected", shard = 20 }\n[[group]]\nname = "all"\n'
-    text += 'scenario = "inspected_wing"\ncount = 30\ninspections_a_turn = 2\n'
+    text += 'scenario = "inspected_wing"\ncount = 30\ninspections_per_step = 2\n'
     with pytest.raises(FleetError, match="`shard` be 30 or more"):
         load_fleet(written(tmp_path, text))
     fleet = load_fleet(written(tmp_path, text, ("shard = 20", "shard = 30")))
-    assert fleet.groups[0].scenarios[0].planner.inspections_a_turn == 2
+    assert fleet.groups[0].scenarios[0].planner.inspections_per_step == 2
 
 
 def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
@@ -274,18 +274,18 @@ def test_a_watch_proposes_inspections_and_takes_their_readings(tmp_path):
     names = known.scenario.control_names
 
     def messages() -> Iterator[dict[str, Any]]:
-        for turn, flight in enumerate(flown.turns[:15]):
+        for step, flight in enumerate(flown.steps[:15]):
             row = flight.reading.observed
             read = dict(zip(("inspect_z1_percent", "inspect_z2_percent"), 100.0 * row[24:], strict=True))
             read = {name: value for name, value in read.items() if np.isfinite(value)}
-            control = names[flown.control_index[turn]]
-            yield {"turn": turn, "control": control, "strain": row[:24].tolist()} | read
+            control = names[flown.control_index[step]]
+            yield {"step": step, "control": control, "strain": row[:24].tolist()} | read
 
     told: list[Mapping[str, Any]] = []
     uav_twin.watch(path, messages(), tmp_path / "watch", decide=told.append, report=False)
-    for turn, decision in enumerate(told):
-        assert decision["next_control"] == names[flown.control_index[turn + 1]]
-        mean = known.model.states.mean(flown.filtered[turn])
+    for step, decision in enumerate(told):
+        assert decision["next_control"] == names[flown.control_index[step + 1]]
+        mean = known.model.states.mean(flown.filtered[step])
         assert decision["health"]["z2"]["mean"] == pytest.approx(mean[1], abs=1e-5)
     inspected = flown.control_index.tolist().index(INSPECT)
     spread = [decision["health"]["z2"]["standard_deviation"] for decision in told]
@@ -301,7 +301,7 @@ def gauged() -> Knowledge:
 
 
 def test_the_information_of_sensors_is_that_of_an_integral_also_where_something_moves_them_together():
-    """Two sensors that turn one reading, and another of no meaning, by 30 degrees tell what the one does."""
+    """Two sensors that step one reading, and another of no meaning, by 30 degrees tell what the one does."""
     means, moved = np.array([0.0, 1.0, 3.0]), np.array([0.3, 1.0, 0.6])
     spread, state = np.sqrt(1.0 + moved**2), np.arange(60_000) % 3
     shown = means[state] + spread[state] * norm.ppf((np.arange(60_000) // 3 + 0.5) / 20_000)

@@ -179,7 +179,7 @@ def test_filter_smoother_and_evidence_equal_enumeration(seed):
 @pytest.mark.parametrize("product", [False, True])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_smoothing_and_prediction_equal_variable_elimination(seed, product):
-    """The control of each turn to come is a node that is marginalised."""
+    """The control of each step to come is a node that is marginalised."""
     rng = np.random.default_rng(seed)
     model = random_model(rng, (2, 3), product=product)
     control = rng.integers(0, 2, 6)

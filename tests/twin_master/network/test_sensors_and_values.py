@@ -68,9 +68,9 @@ def test_likelihood_is_the_integral_and_eq_32_its_approximation(seed, spread, re
         np.testing.assert_allclose(likelihood, wanted, rtol=1e-12, atol=rounding)
         assert np.all(np.isneginf(model.log_likelihood(np.full(SENSORS, 1e200), control)))  # no overflow
         # Nor does it depend on what the model was asked before.
-        turns = [(np.nan * observation, 0), (-observation, 1), (observation, control)]
-        rows = model.log_likelihood_sequence(*zip(*turns, strict=True))
-        np.testing.assert_array_equal(rows, [model.log_likelihood(*turn) for turn in turns])
+        steps = [(np.nan * observation, 0), (-observation, 1), (observation, control)]
+        rows = model.log_likelihood_sequence(*zip(*steps, strict=True))
+        np.testing.assert_array_equal(rows, [model.log_likelihood(*step) for step in steps])
     joint = rng.dirichlet(np.ones(STATES * CONTROLS), 3).reshape(3, STATES, CONTROLS)
     noise = np.sqrt(np.einsum("bsu,sug->bg", joint, total**2))
     np.testing.assert_allclose(model.noise(joint), noise, rtol=1e-13)
@@ -373,7 +373,7 @@ def test_the_value_is_what_was_published_and_what_an_independent_solver_finds(pr
 @pytest.mark.parametrize("moves_first", [False, True])
 @pytest.mark.parametrize("seed", range(6))
 def test_the_value_is_that_on_a_fine_grid_of_beliefs(seed, moves_first):
-    """Also under a control that is given for the first turn."""
+    """Also under a control that is given for the first step."""
     problem = drawn(seed, 2, moves_first)
     grid = np.linspace(0.0, 1.0, 2001)
     beliefs = np.column_stack((1.0 - grid, grid))
@@ -424,11 +424,11 @@ def test_a_control_is_left_as_often_as_all_courses_of_observations_say(monkeypat
     vectors = 0.3 * rng.normal(size=(3, 4)) + np.array([[0.15], [0.0], [0.0]])
     policy = BeliefPolicy(vectors, np.array([1, 0, 2]))
 
-    def leaves(belief: np.ndarray, turns: int) -> float:
+    def leaves(belief: np.ndarray, steps: int) -> float:
         if policy.decide(belief) != 1:
             return 1.0
-        after = problem.following(belief, 1) if turns > 1 else np.zeros((0, 4))
-        return float(sum(row.sum() * leaves(row / row.sum(), turns - 1) for row in after))
+        after = problem.following(belief, 1) if steps > 1 else np.zeros((0, 4))
+        return float(sum(row.sum() * leaves(row / row.sum(), steps - 1) for row in after))
 
     beliefs = rng.dirichlet(np.ones(4), 5)
     exact = [leaves(belief, 4) for belief in beliefs]

@@ -1,4 +1,4 @@
-"""The twin: the model that a scenario describes, and what it concludes from turn to turn."""
+"""The twin: the model that a scenario describes, and what it concludes from step to step."""
 
 import pickle
 from dataclasses import replace
@@ -15,7 +15,7 @@ from twin_master.errors import ImpossibleObservation, InvalidModelError
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.estimator import Learnt
 from twin_master.network.inference import smooth
-from twin_master.network.twin import TwinTurn, build_graphical_model
+from twin_master.network.twin import TwinStep, build_graphical_model
 from twin_master.scenario.reading import parse_scenario
 from uav_twin import Carried, Estimate, ExactFilter, Twin, filter_sequence
 
@@ -38,102 +38,102 @@ def test_the_transitions_of_a_scenario():
     assert matrix[0, at((0.8, 0.0)), at((0.0, 0.2))] == pytest.approx(0.125)
 
 
-def decided(knowledge: Knowledge, rule: str, turns: int) -> TwinTurn:
-    """Return the last of some turns that follow the dynamics alone at 3g, decided by a rule."""
+def decided(knowledge: Knowledge, rule: str, steps: int) -> TwinStep:
+    """Return the last of some steps that follow the dynamics alone at 3g, decided by a rule."""
     planner = knowledge.scenario.planner.model_copy(update={"decide_on": rule})
     scenario = knowledge.scenario.model_copy(update={"planner": planner})
     twin = replace(knowledge, scenario=scenario).twin()
     blind = np.full(knowledge.sensor_model.sensor_count, np.nan)
-    return [twin.turn(blind, 1) for _ in range(turns)][-1]
+    return [twin.step(blind, 1) for _ in range(steps)][-1]
 
 
-def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_turn(knowledge):
+def test_the_two_rules_of_decision_differ_where_the_belief_tips_within_one_step(knowledge):
     """The policy is 2g from z1 = 60 %, three levels up; nothing is seen, so z1 is binomial with p = 0.1.
 
     After 26 transitions p(z1 >= 60 %) = 0.489, after 27 it is 0.515.
     """
     np.testing.assert_array_equal(knowledge.plan.control_index.reshape(5, 5)[:, 0], [1, 1, 1, 0, 0])
-    for rule, turns in product(("filtered", "predicted"), (26, 27, 28)):
-        turn, moves = decided(knowledge, rule, turns), turns - (rule == "filtered")
+    for rule, steps in product(("filtered", "predicted"), (26, 27, 28)):
+        step, moves = decided(knowledge, rule, steps), steps - (rule == "filtered")
         gentle = binom.sf(2, moves, 0.1)
-        np.testing.assert_allclose(turn.decision_probability, [gentle, 1.0 - gentle], atol=1e-12)
-        assert turn.next_control == int(moves <= 26), (turns, rule)
+        np.testing.assert_allclose(step.decision_probability, [gentle, 1.0 - gentle], atol=1e-12)
+        assert step.next_control == int(moves <= 26), (steps, rule)
         # What is predicted does not depend on the rule.
-        ahead = turn.prediction.control_probability[0, 0]
-        assert ahead == pytest.approx(binom.sf(2, turns, 0.1), abs=1e-12)
+        ahead = step.prediction.control_probability[0, 0]
+        assert ahead == pytest.approx(binom.sf(2, steps, 0.1), abs=1e-12)
 
 
 def test_an_impossible_observation_names_twin_step_and_sensors(knowledge):
     twin = knowledge.twin()
     good = knowledge.sensor_model.mean[0, 1].copy()
-    twin.turn(good, 1)
+    twin.step(good, 1)
     bad = good.copy()
     bad[4] += 1e200
     with pytest.raises(
         ImpossibleObservation, match=r"'paper_level_turns', step 1: .* sensor 5: \+8e\+203 sd"
     ) as caught:
-        twin.turn(bad, 1)
+        twin.step(bad, 1)
     error = pickle.loads(pickle.dumps(caught.value))  # as a worker of a fleet hands it on
     assert (str(error), error.twin, error.step) == (str(caught.value), "paper_level_turns", 1)
     assert next(iter(error.worst_residuals)) == "sensor 5"
-    assert twin.turns == 1
-    twin.turn(good, 1)
+    assert twin.steps == 1
+    twin.step(good, 1)
     assert twin.smoothed().shape == (2, 25)
 
 
 @pytest.fixture
 def seen(knowledge: Knowledge) -> np.ndarray:
-    """Forty turns (40, 24) of a wing that is getting worse, as 3g shows it."""
+    """Forty steps (40, 24) of a wing that is getting worse, as 3g shows it."""
     noise = np.random.default_rng(1).standard_normal((40, 24))
     return knowledge.sensor_model.mean[np.arange(40) // 9 * 6, 1] + 150e-6 * noise
 
 
-def told(turn: TwinTurn) -> tuple[object, ...]:
-    """Return what two turns that are the same to the last bit have in common."""
-    arrays = turn.filtered.tobytes(), turn.decision_probability.tobytes()
-    return turn.turn, turn.next_control, turn.log_evidence, *arrays
+def told(step: TwinStep) -> tuple[object, ...]:
+    """Return what two steps that are the same to the last bit have in common."""
+    arrays = step.filtered.tobytes(), step.decision_probability.tobytes()
+    return step.step, step.next_control, step.log_evidence, *arrays
 
 
-def test_a_twin_has_no_last_turn_and_smooths_over_its_lag(knowledge, seen):
-    """Turn by turn it concludes what filter and smoother find in the whole sequence.
+def test_a_twin_has_no_last_step_and_smooths_over_its_lag(knowledge, seen):
+    """Step by step it concludes what filter and smoother find in the whole sequence.
 
     The smoother of a lag is that of the whole history: it needs no likelihood from before.
     """
     model, controls = knowledge.model, np.arange(40) % 3 % 2
     seen[17] = np.nan
-    bounded, whole, turns = knowledge.twin(lag=5), knowledge.twin(), []
+    bounded, whole, steps = knowledge.twin(lag=5), knowledge.twin(), []
     for count, (row, control) in enumerate(zip(seen, controls.tolist(), strict=True), start=1):
-        turns.append(whole.turn(row, control))
-        assert told(bounded.turn(row, model.controls[control])) == told(turns[-1])
+        steps.append(whole.step(row, control))
+        assert told(bounded.step(row, model.controls[control])) == told(steps[-1])
         first = max(0, count - 6)
         assert bounded.first_kept == first
         np.testing.assert_array_equal(bounded.smoothed(), whole.smoothed()[first:])
     found = filter_sequence(model, controls, knowledge.sensor_model.log_likelihood_sequence(seen, controls))
-    np.testing.assert_allclose([turn.filtered for turn in turns], found.filtered, atol=1e-14)
-    np.testing.assert_allclose([turn.log_evidence for turn in turns], found.log_evidence, atol=1e-12)
+    np.testing.assert_allclose([step.filtered for step in steps], found.filtered, atol=1e-14)
+    np.testing.assert_allclose([step.log_evidence for step in steps], found.log_evidence, atol=1e-12)
     np.testing.assert_allclose(whole.smoothed(), smooth(model, controls, found.log_filtered), atol=1e-14)
-    assert knowledge.twin(lag=0).turn(seen[0]).control_index == 1  # the first control of the scenario
+    assert knowledge.twin(lag=0).step(seen[0]).control_index == 1  # the first control of the scenario
 
 
 def test_a_twin_is_kept_and_goes_on_to_the_last_bit(knowledge, seen):
-    """Of turns from before its lag nothing can be revised; what is refused or damaged leaves it as it was."""
+    """Of steps from before its lag nothing can be revised; what is refused or damaged leaves it as it was."""
     twin, other = knowledge.twin(lag=4), knowledge.twin(lag=4)
     for row in seen[:10]:
-        twin.turn(row)
+        twin.step(row)
     state = twin.save_state()
-    for turn in (4, 10, -1):
-        with pytest.raises(IndexError, match=rf"turn {turn} .*from 5 on.*seen 10"):
-            twin.revise(turn, seen[0])
+    for step in (4, 10, -1):
+        with pytest.raises(IndexError, match=rf"step {step} .*from 5 on.*seen 10"):
+            twin.revise(step, seen[0])
     with pytest.raises(ImpossibleObservation):
         twin.revise(7, np.full(24, 1e300))
     assert twin.save_state() == state
     other.restore_state(state)
     assert other.proposed_control == twin.proposed_control
     for row in seen[10:]:
-        last = told(twin.turn(row))
-        assert last == told(other.turn(row))
+        last = told(twin.step(row))
+        assert last == told(other.step(row))
     assert other.save_state() == twin.save_state()
-    # The first turn that is kept may be revised; what it has shown already changes nothing.
+    # The first step that is kept may be revised; what it has shown already changes nothing.
     assert told(twin.revise(twin.first_kept, seen[twin.first_kept])) == last
     for damaged in (b"", state[:-7], arrays_to_bytes({"a": np.zeros(2)})):
         with pytest.raises(InvalidModelError):
@@ -148,12 +148,12 @@ def test_own_policy_planner_sensor_model_and_estimator(knowledge, seen):
             return knowledge.sensor_model.log_likelihood(observation, control_index)  # type: ignore[arg-type]
 
     class Counting(ExactFilter):
-        """An estimator that learns: it carries a figure from turn to turn beside the belief."""
+        """An estimator that learns: it carries a figure from step to step beside the belief."""
 
-        def turn(
-            self, before: Carried | None, observation: np.ndarray, control_index: int, turn: int
+        def step(
+            self, before: Carried | None, observation: np.ndarray, control_index: int, step: int
         ) -> Estimate:
-            estimate = super().turn(before, observation, control_index, turn)
+            estimate = super().step(before, observation, control_index, step)
             count = 1.0 if before is None else float(before.arrays["count"]) + 1.0
             carried = Carried(control_index, {**estimate.carried.arrays, "count": np.array(count)})
             return replace(estimate, carried=carried, learnt={"count": Learnt(count, 0.0, count, count)})
@@ -163,14 +163,14 @@ def test_own_policy_planner_sensor_model_and_estimator(knowledge, seen):
     own = Twin("own", model, Tenfold(), lambda _: gentle, estimator=Counting(model, Tenfold()), lag=3)
     plain = knowledge.twin()
     for number, row in enumerate(seen[:8], start=1):
-        mine, theirs = own.turn(row, 1), plain.turn(row, 1)
+        mine, theirs = own.step(row, 1), plain.step(row, 1)
         np.testing.assert_array_equal(mine.filtered, theirs.filtered)
         assert mine.next_control == 0
         assert mine.learnt["count"].mean == number
     assert own.revise(6, seen[6]).learnt["count"].mean == 8
     assert np.isfinite(own.predict(mine.filtered, "2g", 4).predicted).all()
     with pytest.raises(ImpossibleObservation):
-        own.turn(np.full(24, 1e300))
+        own.step(np.full(24, 1e300))
     for wrong, match in (("4g", "no control is named '4g'"), (2, "between 0 and 1")):
         with pytest.raises(InvalidModelError, match=match):
-            own.turn(seen[0], wrong)  # type: ignore[arg-type]
+            own.step(seen[0], wrong)  # type: ignore[arg-type]

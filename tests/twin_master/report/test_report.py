@@ -38,10 +38,10 @@ DRAWING = b'<svg viewBox="0 0 1 1"></svg>'
 
 def test_the_page_begins_with_what_was_decided_believed_and_explained(run):
     decided, believed, explained = opening_sentences(run)
-    assert decided.startswith("The twin fell back from 3g to 2g at turn 31, one turn after")
+    assert decided.startswith("The twin fell back from 3g to 2g at step 31, one step after")
     both = np.where(run.model.states.coordinates.sum(axis=1) > 0.59, 0, 1)
     left = opening_sentences(altered(run, policy__control_index=both))[0]
-    assert left == "The twin left 3g for 2g at turn 31."  # by a policy of both states
+    assert left == "The twin left 3g for 2g at step 31."  # by a policy of both states
     mean, deviation = (100 * run[f"filtered/{name}"][-1, 0] for name in ("mean", "standard_deviation"))
     low, high = max(mean - 2 * deviation, 0.0), min(mean + 2 * deviation, 80.0)
     interval = f"{mean:.1f} % ({low:.1f} to {high:.1f}, truth 60)"
@@ -53,7 +53,7 @@ def test_the_page_begins_with_what_was_decided_believed_and_explained(run):
 
 
 def first_sentence(run: Run, *gentle: int, level: float = 0.6, **changes: np.ndarray | None) -> str:
-    """The first sentence of a run that flew 2g at these turns, by a policy that leaves 3g from a level on."""
+    """The first sentence of a run that flew 2g at these steps, by a policy that leaves 3g from a level on."""
     control = np.ones(50, dtype=np.int64)
     control[list(gentle)] = 0
     policy = np.where(run.model.states.coordinates[:, 0] > level - 0.01, 0, 1)
@@ -71,8 +71,8 @@ OTHERWISE: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize(("gentle", "otherwise", "said"), INPUTS.table("first_sentences.toml")["rows"])
 def test_the_first_sentence_follows_the_record(run, gentle, otherwise, said):
-    turns = (turn for begin, end in gentle for turn in range(begin, end))
-    assert first_sentence(run, *turns, **OTHERWISE[otherwise]) == said
+    steps = (step for begin, end in gentle for step in range(begin, end))
+    assert first_sentence(run, *steps, **OTHERWISE[otherwise]) == said
 
 
 def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run):
@@ -80,11 +80,11 @@ def test_of_a_real_asset_nothing_is_said_but_what_was_recorded(run):
     observed = watched.tree["observed"].to_dataset()
     watched.tree["observed"] = observed.assign_coords(step=observed["step"] + 1000)
     obeyed = np.tile([0.1, 0.9], (50, 1))
-    obeyed[30:] = [0.8, 0.2]  # asked for 2g from turn 31 on
+    obeyed[30:] = [0.8, 0.2]  # asked for 2g from step 31 on
     left = first_sentence(watched, *range(31, 50), filtered__decision_probability=obeyed)
-    assert left == "The asset left 3g for 2g at turn 1031."
+    assert left == "The asset left 3g for 2g at step 1031."
     kept = first_sentence(watched, filtered__decision_probability=obeyed)
-    assert kept == "The asset kept 3g at every turn; at 19 turns the twin had asked for another control."
+    assert kept == "The asset kept 3g at every step; at 19 steps the twin had asked for another control."
     assert "truth" not in " ".join(opening_sentences(watched))
 
 
@@ -116,7 +116,7 @@ def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run):
 
 
 @pytest.mark.parametrize("now", [0, 18])
-def test_smoothing_up_to_a_turn_equals_a_mission_that_ended_there(run, library_file, tmp_path, now):
+def test_smoothing_up_to_a_step_equals_a_mission_that_ended_there(run, library_file, tmp_path, now):
     shorter = flown(library_file, tmp_path / "run", steps=now + 1)
     assert_array_equal(shorter["filtered/probability"], run["filtered/probability"][: now + 1])
     assert_allclose(run.smoothed_until(now), shorter["smoothed/probability"], atol=1e-12)
@@ -170,7 +170,7 @@ def test_short_missions(run, hold, tmp_path, steps, horizon):
     part = {"step": slice(steps), "horizon": slice(horizon), "sensor": slice(5)}
     tree = run.tree.isel(part, missing_dims="ignore")
     hold(rescripted(replace(run, tree=tree), observation={"count": 5}))
-    assert f"{steps} turns" in report.write_report(tmp_path).read_text(encoding="utf-8")
+    assert f"{steps} steps" in report.write_report(tmp_path).read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("no_drawing")
@@ -179,7 +179,7 @@ def test_lost_gauges_are_told_and_marked(run, hold, tmp_path):
     observed = run.observed.copy()
     observed[12:19, 16:20] = observed[3:5] = np.nan
     lost = altered(run, observed__strain=observed)
-    assert lost_ranges(lost) == "gauges 17, 18, 19, 20 at turns 12–18; all gauges at turns 3–4"
+    assert lost_ranges(lost) == "gauges 17, 18, 19, 20 at steps 12–18; all gauges at steps 3–4"
     assert "the belief followed the dynamics alone" in report.render_page(lost, {}, {})
     axes = panel(mission_figure(lost, 49, [16]), "Gauge 17")
     assert_array_equal(line(axes, "lost")[:, 0], [3, 4, *range(12, 19)])
@@ -241,7 +241,7 @@ def test_another_layout_gives_one_sentence(folder, tmp_path, missing):
 
 
 @pytest.mark.usefixtures("no_drawing")
-def test_the_last_turns_of_a_watch_have_their_numbers_and_what_nobody_knows_is_left_out(run, hold, tmp_path):
+def test_the_last_steps_of_a_watch_have_their_numbers_and_what_nobody_knows_is_left_out(run, hold, tmp_path):
     observed = run.observed.copy()
     observed[7], observed[[8, 9], 2] = np.nan, np.nan
     shifted = altered(run, observed__strain=observed, truth=None).tree.map_over_datasets(
@@ -250,7 +250,7 @@ def test_the_last_turns_of_a_watch_have_their_numbers_and_what_nobody_knows_is_l
     watched = replace(run, tree=shifted, summary={})
     hold(watched)
     figures = {drawn.name: drawn for drawn in report.report_figures(tmp_path, 1020)}
-    assert "at turn 1020" in figures["mission_now"].title
+    assert "at step 1020" in figures["mission_now"].title
     drawn = figures["mission_now"].figure
     assert "now: 1020" in {text.get_text() for axes in drawn.axes for text in axes.texts}
     for title, name, first in (
@@ -261,8 +261,8 @@ def test_the_last_turns_of_a_watch_have_their_numbers_and_what_nobody_knows_is_l
         assert line(panel(drawn, title), name)[0, 0] == first
     assert panel(drawn, "Control: flown").patches[-1].get_center()[0] == 1030
     assert panel(figures["check"].figure, "Standardised").get_xlim() == (999.5, 1049.5)
-    assert "turn 1049" in [axes.get_title("left") for axes in figures["belief"].figure.axes]
-    assert lost_ranges(watched) == "gauge 3 at turns 1008–1009; all gauges at turn 1007"
+    assert "step 1049" in [axes.get_title("left") for axes in figures["belief"].figure.axes]
+    assert lost_ranges(watched) == "gauge 3 at steps 1008–1009; all gauges at step 1007"
     for now in (49, 999, 1050):
         with pytest.raises(RunFolderError, match=rf"must lie in 1000\.\.1049, and {now} came"):
             report.write_report(tmp_path, now=now)

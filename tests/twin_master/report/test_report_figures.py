@@ -15,7 +15,7 @@ from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
 from twin_master.report.mission import (
     belief_figure,
-    belief_turns,
+    belief_steps,
     choose_sensors,
     mission_figure,
     policy_figure,
@@ -97,7 +97,7 @@ def test_states_and_sensors_have_units_and_names_of_their_own(run, hold, tmp_pat
     assert "in m2.K/W, percent; the past" in figures["mission_now"].caption
     assert "0.0002 bar (pressure), 0.0002 L/min (flow 2)" in figures["check"].caption
     words = " ".join(figure.caption + figure.title for figure in figures.values())
-    for word in ("turn", "gauge", "microstrain", "µε", "strain"):
+    for word in ("step", "gauge", "microstrain", "µε", "strain"):
         assert word not in words.lower(), word
 
 
@@ -107,12 +107,12 @@ def test_numbers_beside_an_axis_are_short():
 
 
 def test_maps_show_the_joint_belief_the_policy_and_its_margin(run):
-    figure, turns = belief_figure(run), belief_turns(run)
-    assert (turns[0], turns[-1], len(turns)) == (0, 49, 8)
-    for axes, turn in zip(figure.axes[:8], turns, strict=True):
+    figure, steps = belief_figure(run), belief_steps(run)
+    assert (steps[0], steps[-1], len(steps)) == (0, 49, 8)
+    for axes, step in zip(figure.axes[:8], steps, strict=True):
         mesh = axes.collections[0].get_array().reshape(5, 5)
-        assert_array_equal(mesh, run["filtered/probability"][turn].reshape(5, 5).T)
-        assert f"turn {turn}" in axes.get_title(loc="left")
+        assert_array_equal(mesh, run["filtered/probability"][step].reshape(5, 5).T)
+        assert f"step {step}" in axes.get_title(loc="left")
     named = [(bool(axes.get_xlabel()), bool(axes.get_ylabel())) for axes in figure.axes[:8]]
     assert named == [(lowest, first) for lowest in (False, True) for first in (True, *(False,) * 3)]
     figure = policy_figure(run)

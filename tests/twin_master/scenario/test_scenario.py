@@ -18,6 +18,7 @@ from calibration.result.record import Calibration as Calibrated
 from calibration.result.record import ParameterPrior
 from fe.runtime.patch import LocalStiffnessLoss
 from fe.wing.design import SHIPPED_DESIGN
+from reporting.former_names import FormerNameWarning
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import merged, patch_record, table_of, text_of, written
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset
@@ -98,6 +99,34 @@ def test_no_table_whatsoever_raises_anything_but_a_sentence(table):
         except TwinMasterError as error:
             sentence = str(error)
         assert sentence.startswith("x.toml")
+
+
+# ---------------------------- keys that had other names
+
+FORMER_KEYS = """
+[notice]
+memory_turns = 30.0
+onset_turns = 40.0
+
+[watch]
+seconds_per_turn = 2.0
+"""
+
+
+def test_a_scenario_of_an_earlier_version_is_read_with_one_sentence(tmp_path):
+    former, present = tmp_path / "former.toml", tmp_path / "present.toml"
+    text = text_of("level_turns")
+    former.write_text(text + FORMER_KEYS)
+    present.write_text(text + FORMER_KEYS.replace("turn", "step"))
+    with pytest.warns(FormerNameWarning, match=r"former\.toml: `memory_turns` is now called `memory_steps`"):
+        scenario = load_scenario(former).scenario
+    # A second warning about the same file were an error.
+    assert load_scenario(former).scenario == scenario == load_scenario(present).scenario
+    assert scenario.watch.seconds_per_step == 2.0
+    table = scenario.to_dict()
+    table["planner"]["inspections_a_turn"] = table["planner"]["inspections_per_step"] = 3
+    with pytest.raises(ScenarioError, match=r"`inspections_a_turn` is now called .*, and both are given"):
+        parse_scenario(table, "x.toml")
 
 
 # ---------------------------- the kinds, a kind of one's own, and files of format 1

@@ -141,16 +141,16 @@ def test_figures_of_a_mission_do_not_depend_on_the_unit_of_the_state(unit):
 @pytest.mark.parametrize("name", ["level_turns", "failing_gauges", "growing_damage"])
 def test_every_figure_is_one_that_a_reference_can_name_and_stands_beside_it(name, library_file):
     each = flown(name, library_file)
-    turns = []
-    for turn in each.flight.turns:
-        happened = turn.reading.happened._replace(monitors={"strain_error_bound": 2e-6})
-        turns.append(replace(turn, reading=replace(turn.reading, happened=happened)))
+    steps = []
+    for step in each.flight.steps:
+        happened = step.reading.happened._replace(monitors={"strain_error_bound": 2e-6})
+        steps.append(replace(step, reading=replace(step.reading, happened=happened)))
     references = (
         Reference(figure="fallback_delay", value="1 or 2", source="somewhere"),
         Reference(figure="mean_reward_error", value=-0.4, source="elsewhere"),
     )
     scenario = each.scenario.model_copy(update={"reference": references})
-    complete = replace(each, scenario=scenario, flight=replace(each.flight, turns=turns))
+    complete = replace(each, scenario=scenario, flight=replace(each.flight, steps=steps))
     figures = [*summarise(complete, np.zeros((50, 3)))]
     assert tuple(figure.key for figure in figures) == each.scenario.figure_names
     value, flight = {figure.key: figure.value for figure in figures}, each.flight

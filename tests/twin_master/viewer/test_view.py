@@ -30,7 +30,7 @@ from twin_master.mission.preparation import KNOWLEDGE_NAME
 from twin_master.viewer.flight import LATEST, Belief, Flight, Request, Teller
 from uav_twin import fly, load_scenario, open_run
 
-TURNS = 50
+STEPS = 50
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def lines(run: Path) -> list[bytes]:
 
 @pytest.fixture
 def begun(run: Path, tmp_path: Path) -> Path:
-    """The run before its first turn."""
+    """The run before its first step."""
     folder = Path(shutil.copytree(run, tmp_path / "begun"))
     (folder / JOURNAL_NAME).unlink()
     (folder / "run.nc").unlink()
@@ -61,20 +61,20 @@ def add(folder: Path, *content: bytes) -> None:
         file.writelines(content)
 
 
-def of_turns(flight: Flight, first: int, end: int) -> Belief:
-    """Return what the twin believed of turns when they were flown."""
+def of_steps(flight: Flight, first: int, end: int) -> Belief:
+    """Return what the twin believed of steps when they were flown."""
     return flight.believed(flight.seen(first, end))
 
 
-def asked(first: int = 0, end: int = 0, turn: int = LATEST, **changed: int) -> Request:
+def asked(first: int = 0, end: int = 0, step: int = LATEST, **changed: int) -> Request:
     given = {"number": 1, "flight": -1, "shown": -1, "count": -1} | changed
-    return Request(first=first, end=end, turn=turn, **given)
+    return Request(first=first, end=end, step=step, **given)
 
 
 def test_every_number_is_that_of_the_run(run):
     flight, stored = viewed(run), open_run(run)
-    assert flight.turns == TURNS
-    believed, expected = of_turns(flight, 0, TURNS), flight.predicted(flight.seen(28, 29)[0])
+    assert flight.steps == STEPS
+    believed, expected = of_steps(flight, 0, STEPS), flight.predicted(flight.seen(28, 29)[0])
     for belief, group, part, control in (
         (believed, "filtered", slice(None), "decision_probability"),
         (expected, "predicted", 28, "control_probability"),
@@ -89,56 +89,56 @@ def test_every_number_is_that_of_the_run(run):
     np.testing.assert_allclose(believed.expected.standard_deviation, deviation, rtol=1e-9)
     noise = stored["filtered"]["noise_standard_deviation"].values
     np.testing.assert_allclose(believed.expected.noise, noise, rtol=1e-9)
-    np.testing.assert_array_equal(flight.truth(flight.seen(0, TURNS)), stored["truth"]["state"].values)
+    np.testing.assert_array_equal(flight.truth(flight.seen(0, STEPS)), stored["truth"]["state"].values)
 
 
-def test_turns_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_they_are_taken_back(
+def test_steps_are_seen_as_soon_as_their_lines_are_whole_and_forgotten_where_they_are_taken_back(
     begun, lines
 ):
     """A line that was changed ends the view with its number."""
     flight = Flight(begun)
     assert not flight.update()
-    for content, turns in (([*lines[:20], lines[20][:40]], 19), ([lines[20][40:]], 20)):
+    for content, steps in (([*lines[:20], lines[20][:40]], 19), ([lines[20][40:]], 20)):
         add(begun, *content)
-        assert [flight.update(), flight.turns, flight.update()] == [True, turns, False]
+        assert [flight.update(), flight.steps, flight.update()] == [True, steps, False]
     number = flight.number
     (begun / JOURNAL_NAME).write_bytes(b"".join(lines[:11]))  # as a resumed run does
     flight.update()
-    assert (flight.turns, flight.number) == (10, number + 1)
-    # A viewer that holds the twenty turns is told all ten again.
+    assert (flight.steps, flight.number) == (10, number + 1)
+    # A viewer that holds the twenty steps is told all ten again.
     answer = told(Teller(flight), 0, 20, flight=number, shown=19, count=20)
     assert (answer["first"], answer["count"], len(answer["past"]["control"])) == (0, 10, 10)
-    add(begun, lines[11].replace(b'"turn": 10', b'"turn": 11'), *lines[12:])
+    add(begun, lines[11].replace(b'"step": 10', b'"step": 11'), *lines[12:])
     with pytest.raises(RunFolderError, match=r"line 12 of the journal .* was changed or is damaged"):
         flight.update()
 
 
-def test_an_observation_that_came_late_stands_in_its_turn(begun, lines):
-    turns = [json.loads(line[65:]) for line in lines[1:]]
-    missed = turns[6] | {"observed": [None] * 24}
-    late = turns[9] | {"observation_turn": 6, "observed": turns[6]["observed"]}
-    add(begun, lines[0], *map(line_of, [*turns[:6], missed, *turns[7:10]]))
+def test_an_observation_that_came_late_stands_in_its_step(begun, lines):
+    steps = [json.loads(line[65:]) for line in lines[1:]]
+    missed = steps[6] | {"observed": [None] * 24}
+    late = steps[9] | {"observation_step": 6, "observed": steps[6]["observed"]}
+    add(begun, lines[0], *map(line_of, [*steps[:6], missed, *steps[7:10]]))
     flight = viewed(begun)
     number = flight.number
-    add(begun, line_of(late | {"filtered": turns[20]["filtered"]}))
+    add(begun, line_of(late | {"filtered": steps[20]["filtered"]}))
     assert flight.update()
-    assert (flight.turns, flight.number) == (10, number + 1)
-    expected = [turn["observed"] for turn in turns[:10]]
+    assert (flight.steps, flight.number) == (10, number + 1)
+    expected = [step["observed"] for step in steps[:10]]
     np.testing.assert_array_equal(flight.observed(flight.seen(0, 10)), np.array(expected, dtype=float))
-    last = [turn["filtered"] for turn in flight.seen(8, 10)]
-    assert last == [turns[8]["filtered"], turns[20]["filtered"]]
-    add(begun, *map(line_of, [{"model": {}}, *turns[10:20]]))
-    assert viewed(begun).turns == 20
+    last = [step["filtered"] for step in flight.seen(8, 10)]
+    assert last == [steps[8]["filtered"], steps[20]["filtered"]]
+    add(begun, *map(line_of, [{"model": {}}, *steps[10:20]]))
+    assert viewed(begun).steps == 20
     flight.update()
-    add(begun, line_of(turns[30]))
-    with pytest.raises(RunFolderError, match="tells turn 30 where 20 was expected"):
+    add(begun, line_of(steps[30]))
+    with pytest.raises(RunFolderError, match="tells step 30 where 20 was expected"):
         flight.update()
     journal = begun / JOURNAL_NAME
     journal.rename(begun / "before")
     journal.write_bytes(b"".join(lines[:4]))  # another flight
     assert Teller(flight).answer(asked()) is None  # until it is seen
     assert flight.update()
-    assert flight.turns == 3
+    assert flight.steps == 3
 
 
 @pytest.mark.parametrize("content", [None, b"", b"PK\x05\x06" + bytes(18), b"no archive"])
@@ -159,18 +159,18 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     flight = viewed(run)
     teller = Teller(flight)
     everything = told(teller)
-    assert (everything["turn"], everything["first"], everything["count"]) == (TURNS - 1, 0, TURNS)
+    assert (everything["step"], everything["first"], everything["count"]) == (STEPS - 1, 0, STEPS)
     number = everything["flight"]
     missed = told(teller, 0, 30, flight=number, shown=29, count=30)
     assert missed["first"] == 30
     np.testing.assert_allclose(missed["past"]["state"], everything["past"]["state"][30:], rtol=1e-12)
-    assert teller.answer(asked(0, TURNS, flight=number, shown=TURNS - 1, count=TURNS)) is None
-    back = told(teller, 0, TURNS, 7, flight=number, shown=8, count=TURNS)
-    assert (back["turn"], back["past"]) == (7, None)
+    assert teller.answer(asked(0, STEPS, flight=number, shown=STEPS - 1, count=STEPS)) is None
+    back = told(teller, 0, STEPS, 7, flight=number, shown=8, count=STEPS)
+    assert (back["step"], back["past"]) == (7, None)
     assert len(back["ahead"]["state"]) == 10
     # In printed units, with their bands.
-    answer = told(teller, turn=28)
-    past, believed = answer["past"], of_turns(flight, 0, 29)
+    answer = told(teller, step=28)
+    past, believed = answer["past"], of_steps(flight, 0, 29)
     mean = flight.knowledge.model.states.mean(believed.probability)
     wide = np.hypot(believed.expected.standard_deviation, believed.expected.noise)
     np.testing.assert_allclose(past["state"], 100.0 * mean)
@@ -179,9 +179,9 @@ def test_a_viewer_is_told_what_it_misses_and_nothing_else(run):
     np.testing.assert_allclose(width, 2 * 1.959963984540054e6 * wide)
     assert np.min(past["state_lower"]) >= 0.0
     assert np.max(past["state_upper"]) <= 80.0
-    assert answer["ahead"]["reward"][0][2] is None  # no error reward of a turn to come
+    assert answer["ahead"]["reward"][0][2] is None  # no error reward of a step to come
     with pytest.raises(ValueError, match=r"for Request"):
-        Request.model_validate_json(json.dumps(asked().__dict__ | {"turn": 1.5}))
+        Request.model_validate_json(json.dumps(asked().__dict__ | {"step": 1.5}))
 
 
 @contextmanager
@@ -223,22 +223,22 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         first = tabs[0]
         said = first.value("element('said').textContent")
         assert re.fullmatch(
-            r"turn 29: z₁ \d+ ± \d+ %, z₂ \d+ ± \d+ %\. Flown 3g; next [23]g with probability [01]\.\d{3}\.",
+            r"step 29: z₁ \d+ ± \d+ %, z₂ \d+ ± \d+ %\. Flown 3g; next [23]g with probability [01]\.\d{3}\.",
             said,
         )
         # Keyboard: back by one and by ten, to the start; the others stay where they are.
-        for key, turn in (("ArrowLeft", 28), ("PageUp", 18), ("Home", 0), ("ArrowLeft", 0), ("PageDown", 10)):
+        for key, step in (("ArrowLeft", 28), ("PageUp", 18), ("Home", 0), ("ArrowLeft", 0), ("PageDown", 10)):
             first.press(key)
             first.wait(
-                f"state.shown === {turn} && state.wanted === {turn} && window.painted.at(-1)[0] === {turn}"
+                f"state.shown === {step} && state.wanted === {step} && window.painted.at(-1)[0] === {step}"
             )
         assert first.value("drawn.past.length") == 11
         assert first.value("drawn.ahead") == list(range(11, 21))
         assert first.value("document.querySelectorAll('#wing circle').length") == 24
         assert first.value("document.querySelectorAll('#wing .lost').length") == 0
         assert tabs[1].value("state.shown") == 29
-        before = first.picture(tmp_path / "turn_10.png")
-        # A verdict on motion came behind turn 29.
+        before = first.picture(tmp_path / "step_10.png")
+        # A verdict on motion came behind step 29.
         (begun / "teaching" / "figures").mkdir(parents=True)
         drawing = to_svg(new_figure(2.0))
         (begun / "teaching" / "figures" / "missing_force.svg").write_bytes(drawing)
@@ -248,7 +248,7 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         tabs[1].wait("!element('force').hidden && element('picture').naturalWidth > 0")
         assert tabs[1].value("element('verdict').textContent") == "A spring is <missing>."
         assert tabs[1].value("document.documentElement.scrollWidth <= innerWidth")
-        assert first.value("element('force').hidden")  # nothing was known at turn 10
+        assert first.value("element('force').hidden")  # nothing was known at step 10
         # A viewer that was away gets what it missed; one that looks back stays there, and knows of the rest.
         tabs[2].value("socket.onclose = null; socket.close()")
         add(begun, *lines[31:-1], line_of(json.loads(lines[-1][65:]) | Inputs(__file__).table("told.toml")))
@@ -258,16 +258,16 @@ def test_the_page_in_a_browser(begun, lines, tmp_path):
         tabs[2].value("connect()")
         tabs[2].wait("window.painted.at(-1)[0] === 49 && held.rows.length === 50")
         flown = viewed(begun)
-        expected = 100.0 * flown.knowledge.model.states.mean(of_turns(flown, 0, TURNS).probability)
+        expected = 100.0 * flown.knowledge.model.states.mean(of_steps(flown, 0, STEPS).probability)
         for tab in tabs[1:]:
             np.testing.assert_allclose(tab.value("held.rows.map((row) => row.state)"), expected)
         assert first.value("element('told').hidden && element('learning').hidden")
         first.press("End")
         first.wait("window.painted.at(-1)[0] === 49")
         assert first.value("element('latest').getAttribute('aria-pressed')") == "true"
-        assert first.picture(tmp_path / "turn_49.png") != before
+        assert first.picture(tmp_path / "step_49.png") != before
         said = first.value("[...element('notices').children].map((item) => item.textContent)")
-        assert said == ["Turn 49: gauge 4 is off.", "turn 49: Look at <b>gauge 3</b>."]
+        assert said == ["Step 49: gauge 4 is off.", "step 49: Look at <b>gauge 3</b>."]
         learnt = "".join(f"{name}0.9512 (0.9400 to 0.9600)" for name in ("e", "a[9]", "a[10]"))
         assert first.value("element('learnt').textContent") == learnt
         # Everything came from this server, and nothing went wrong.

@@ -24,7 +24,7 @@ from reporting.progress import SilentProgress
 from tests.twin_master.runs import flight_of, text_of
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.loop import BelievedModel
-from twin_master.mission.turns import History
+from twin_master.mission.steps import History
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.tables import Noticing
 from twin_master.viewer.flight import Flight
@@ -35,12 +35,12 @@ from twin_master.watch.opening import begun_watch
 
 
 def write_csv(path: Path, observed: np.ndarray, controls: np.ndarray, garbage: bool = False) -> Path:
-    lines = ["turn,control," + ",".join(f"strain_{number}" for number in range(1, 25))]
-    for turn, row in enumerate(observed):
+    lines = ["step,control," + ",".join(f"strain_{number}" for number in range(1, 25))]
+    for step, row in enumerate(observed):
         cells = ",".join("" if np.isnan(value) else repr(value) for value in row.tolist())
-        lines.append(f"{turn},{('2g', '3g')[controls[turn]]},{cells}")
-        if garbage and turn % 7 == 3:
-            lines.append(f"{turn},4g,what")
+        lines.append(f"{step},{('2g', '3g')[controls[step]]},{cells}")
+        if garbage and step % 7 == 3:
+            lines.append(f"{step},4g,what")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
@@ -62,9 +62,9 @@ def watchful(base: Watch, folder: Path) -> Watch:
 
 
 def ran(watch: Watch, feed: Feed, *stops: int | None, pause: float = 0.0) -> Counts:
-    """Run a watch up to each number of turns (None: to the end); return the last counts."""
-    for turns in stops or (None,):
-        counts = watch.run(feed, lambda _decision: time.sleep(pause), turns=turns)
+    """Run a watch up to each number of steps (None: to the end); return the last counts."""
+    for steps in stops or (None,):
+        counts = watch.run(feed, lambda _decision: time.sleep(pause), steps=steps)
     return counts
 
 
@@ -204,7 +204,7 @@ def mission(base: Watch) -> History:
 
 @pytest.fixture(scope="session")
 def recorded(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mission as a CSV file with some garbage between its turns."""
+    """The mission as a CSV file with some garbage between its steps."""
     path = tmp_path_factory.mktemp("recorded") / "mission.csv"
     return write_csv(path, mission.observed, mission.control_index, garbage=True)
 
@@ -247,7 +247,7 @@ def whole(base: Watch, recorded: Path, tmp_path_factory: pytest.TempPathFactory)
 
 @pytest.fixture(scope="session")
 def loose(mission: History, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The mission with a gauge that shows 30 % too little from turn 15 on."""
+    """The mission with a gauge that shows 30 % too little from step 15 on."""
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
     return write_csv(tmp_path_factory.mktemp("loose") / "m.csv", observed, mission.control_index)

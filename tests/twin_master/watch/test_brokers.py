@@ -41,21 +41,21 @@ def where_of(broker: Mosquitto) -> Broker:
     return broker_of(address(broker))
 
 
-def message(turn: int, **others: object) -> str:
-    return json.dumps({"turn": turn, "control": "2g", "strain_1": 1e-3, **others})
+def message(step: int, **others: object) -> str:
+    return json.dumps({"step": step, "control": "2g", "strain_1": 1e-3, **others})
 
 
-def publish(client: Any, *turns: int) -> None:
-    for turn in turns:
-        client.publish(TOPIC, message(turn), qos=1).wait_for_publish(60)
+def publish(client: Any, *steps: int) -> None:
+    for step in steps:
+        client.publish(TOPIC, message(step), qos=1).wait_for_publish(60)
 
 
 @contextmanager
-def watching(where: Broker, watch: Watch, turns: int) -> Iterator[list[str]]:
-    """Watch so many turns in a thread, from when the twin is connected on; yields what it notes."""
+def watching(where: Broker, watch: Watch, steps: int) -> Iterator[list[str]]:
+    """Watch so many steps in a thread, from when the twin is connected on; yields what it notes."""
     notes = list[str]()
     feed = MqttFeed(where, watch, notes.append)
-    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"turns": turns})
+    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"steps": steps})
     thread.start()
     wait_until(lambda: notes)
     yield notes
@@ -76,34 +76,34 @@ def heard_at(broker: Mosquitto, name: str, topic: str = DECISION) -> tuple[Any, 
 
 @pytest.mark.parametrize("broker", [False, True], ids=["plain", "tls"], indirect=True)
 def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole, broker, monkeypatch):
-    secure, turns = f"mqtts://wing@localhost:{broker.port}/{TOPIC}", len(mission.observed)
+    secure, steps = f"mqtts://wing@localhost:{broker.port}/{TOPIC}", len(mission.observed)
     where = broker_of(secure, broker.authority) if broker.tls else where_of(broker)
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")
     with pytest.raises(MissionInputError, match=r"refuses the twin.*[Nn]ot authorized"):
         watch.run(MqttFeed(where, watch, str), str)
     assert not [*watch.folder.glob("*.mqtt")]  # a client that never was in is no client that was forgotten
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
-    with watching(where, watch, turns):
+    with watching(where, watch, steps):
         listener, heard = heard_at(broker, "listener")
         publisher = broker.client("publisher")
 
         def send(first: int, last: int) -> None:
-            for turn in range(first, last):
-                control = ("2g", "3g")[mission.control_index[turn]]
-                record = {"turn": turn, "control": control, "strain": mission.observed[turn].tolist()}
+            for step in range(first, last):
+                control = ("2g", "3g")[mission.control_index[step]]
+                record = {"step": step, "control": control, "strain": mission.observed[step].tolist()}
                 publisher.publish(TOPIC, json.dumps(record), qos=1).wait_for_publish(20)
 
         send(0, 20)
         for number in range(1000):
             publisher.publish(TOPIC, b"garbage %d" % number, qos=0)
         publisher.publish(TOPIC, b"x" * 3_000_000, qos=0)
-        publisher.publish(TOPIC, json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which turn?
+        publisher.publish(TOPIC, json.dumps({"strain": [1e-4] * 24}), qos=1)  # of which step?
         send(15, 19)
         if not broker.tls:
             broker.again()
             wait_until(publisher.is_connected)
-        send(20, turns)
-    wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
+        send(20, steps)
+    wait_until(lambda: heard and heard[-1]["step"] == steps - 1)
     publisher.disconnect()
     listener.disconnect()
     last, expected = (journal(folder)[-1] for folder in (watch.folder, whole))
@@ -112,31 +112,31 @@ def test_over_a_broker_that_stops_and_a_hostile_publisher(watch, mission, whole,
     assert counts["late"] == 0
     assert counts["duplicates"] >= 4
     assert 1 <= counts["rejected"] < 1010  # a broker may lose or repeat some
-    assert {decision["turn"] for decision in heard} == set(range(turns))
+    assert {decision["step"] for decision in heard} == set(range(steps))
     assert all(decision["probability"] >= 0.5 for decision in heard)
 
 
 @pytest.mark.parametrize("kills", [4, pytest.param(100, marks=pytest.mark.long)])
 def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_killed(watch, broker, kills):
     """Of each kill the broker tells that the watch was lost."""
-    turns, chance, where = 60 * kills, random.Random(kills), where_of(broker)
+    steps, chance, where = 60 * kills, random.Random(kills), where_of(broker)
     listener, heard = heard_at(broker, "listener")
 
-    def run(turns: int, note: Any = str) -> None:
+    def run(steps: int, note: Any = str) -> None:
         feed = MqttFeed(where, watch, note)
-        watch.run(feed, str, turns=turns)
+        watch.run(feed, str, steps=steps)
         feed.close()
 
-    run(1, lambda _note: publish(listener, *range(turns)))  # all but the first wait at the broker
+    run(1, lambda _note: publish(listener, *range(steps)))  # all but the first wait at the broker
     listener.disconnect()
     listener.loop_stop()  # no thread while processes are forked; the broker keeps what it is to hear
     met = 0
 
     def next_end() -> int:
-        lines = chance.randrange(40) if met < kills else 2 * turns
+        lines = chance.randrange(40) if met < kills else 2 * steps
         return (watch.folder / JOURNAL_NAME).stat().st_size + 2000 * lines
 
-    while killed_at(watch, next_end(), lambda: run(turns)):
+    while killed_at(watch, next_end(), lambda: run(steps)):
         met += 1
         asker, states = heard_at(broker, "asker", f"{TOPIC}/heartbeat")
         wait_until(lambda states=states: states and states[-1]["state"] == "lost")
@@ -144,12 +144,12 @@ def test_every_decision_of_a_backlog_is_published_however_often_the_watch_is_kil
         asker.loop_stop()
     assert met == kills
     listener = broker.client("listener", heard)
-    wait_until(lambda: heard and heard[-1]["turn"] == turns - 1)
+    wait_until(lambda: heard and heard[-1]["step"] == steps - 1)
     listener.disconnect()
-    assert [line["turn"] for line in journal(watch.folder)] == list(range(turns))
-    assert {decision["turn"] for decision in heard} == set(range(turns))
+    assert [line["step"] for line in journal(watch.folder)] == list(range(steps))
+    assert {decision["step"] for decision in heard} == set(range(steps))
     assert len([decision for decision in heard if decision.get("told_again")]) >= kills
-    assert len(heard) < turns + 100 * kills
+    assert len(heard) < steps + 100 * kills
 
 
 def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watch, plain):
@@ -169,7 +169,7 @@ def test_decisions_that_the_broker_has_not_acknowledged_are_published_again(watc
     assert int(published.read_text()) == first[2]
     topic.go_back()  # as where the broker is lost
     topic.publish()
-    assert [decision["turn"] for decision in sent] == [0, 1, 2, 1, 2]
+    assert [decision["step"] for decision in sent] == [0, 1, 2, 1, 2]
 
 
 def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
@@ -177,13 +177,13 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
 ):
     publisher, notes = broker.client("publisher"), list[str]()
 
-    def watched(watch: Watch, turns: int, *sent: int) -> Counts:
+    def watched(watch: Watch, steps: int, *sent: int) -> Counts:
         def note(text: str) -> None:
             notes.append(text)
             publish(publisher, *sent)
 
         feed = MqttFeed(where_of(broker), watch, note)
-        counts = watch.run(feed, str, turns=turns)
+        counts = watch.run(feed, str, steps=steps)
         feed.close()
         return counts
 
@@ -197,12 +197,12 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     (watch.folder / "published").write_text("0" * 20)
     watched(watch, 7)  # nothing more is wanted, and what was not published is
     wait_until(lambda: len([one for one in heard if "control" in one]) >= 7)
-    assert {one["turn"] for one in heard if one.get("told_again")} == {*range(7)}
+    assert {one["step"] for one in heard if one.get("told_again")} == {*range(7)}
     wait_until(lambda: heard[-1].get("state") == "ended")
-    assert [heard[-1][key] for key in ("turn", "lag", "received", "refused")] == [6, 0, 6, 0]
+    assert [heard[-1][key] for key in ("step", "lag", "received", "refused")] == [6, 0, 6, 0]
     feed = MqttFeed(where_of(broker), watch, lambda _note: publish(publisher, 7))
     with pytest.raises(ZeroDivisionError), closing(feed):
-        watch.run(feed, lambda decision: decision["turn"] // 0)
+        watch.run(feed, lambda decision: decision["step"] // 0)
     wait_until(lambda: heard[-1].get("state") == "lost")
     other = begun(base, tmp_path / "other")
     watched(other, 1, 0)
@@ -220,7 +220,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
 
     beginning = threading.Thread(target=begin)
     beginning.start()
-    words = ("watch", scenario.path, "--observations", address(broker), "--out", watch.folder, "--turns", 1)
+    words = ("watch", scenario.path, "--observations", address(broker), "--out", watch.folder, "--steps", 1)
     monkeypatch.setenv(PASSWORD_VARIABLE, "another")  # the first attempt fails, and the wish is kept
     failed = command(*words, "--no-report", "--replace").stderr
     assert "refuses the twin" in failed
@@ -228,7 +228,7 @@ def test_an_orderly_end_and_a_watch_that_takes_the_place_of_another(
     monkeypatch.setenv(PASSWORD_VARIABLE, PASSWORD)
     done = command(*words, "--no-report", "--resume")
     beginning.join()
-    assert [json.loads(line)["turn"] for line in done.stdout.splitlines()] == [0]
+    assert [json.loads(line)["step"] for line in done.stdout.splitlines()] == [0]
     assert "1 message." in done.stderr
     assert [path.read_text() for path in watch.folder.glob("*.mqtt")] == names[:1]
     assert all(note.startswith("Connected") for note in notes)
@@ -249,7 +249,7 @@ def test_a_broker_that_refuses_what_it_allowed_before(watch, broker, tmp_path):
         broker.again()
         wait_until(lambda: notes[-1].startswith("Connected") and publisher.is_connected())
         publish(publisher, 1)
-        wait_until(lambda: heard[-1]["turn"] == 1)
+        wait_until(lambda: heard[-1]["step"] == 1)
         (tmp_path / "rights").write_text(f"user wing\ntopic readwrite {TOPIC}\n")
         broker.further.append(f"acl_file {tmp_path / 'rights'}")
         broker.again()
@@ -258,11 +258,11 @@ def test_a_broker_that_refuses_what_it_allowed_before(watch, broker, tmp_path):
         broker.further.pop()
         broker.again()
         publisher.publish(TOPIC, message(3), qos=1)
-    wait_until(lambda: heard[-1]["turn"] == 3)
+    wait_until(lambda: heard[-1]["step"] == 3)
     publisher.disconnect()
     assert any(note.startswith("Waiting: the broker at 127.0.0.1") and "authorized" in note for note in notes)
     assert f"The broker does not take {DECISION}: Not authorized." in notes
-    assert [decision["turn"] for decision in heard] == [0, 1, 2, 3]
+    assert [decision["step"] for decision in heard] == [0, 1, 2, 3]
 
 
 RIGHTS_PLUGIN = Path("/usr/lib/x86_64-linux-gnu/mosquitto_dynamic_security.so")

@@ -23,13 +23,13 @@ from twin_master.watch.message import Message, Refused
 
 pytestmark = pytest.mark.xdist_group("watches")
 
-HEADER = "turn,strain_1,strain_2\n"
+HEADER = "step,strain_1,strain_2\n"
 LOGROTATE = shutil.which("logrotate")
 Rotation = Callable[[Path], None]
 
 
-def row(turn: int) -> str:
-    return f"{turn},{turn + 1}e-5,1e-4\n"
+def row(step: int) -> str:
+    return f"{step},{step + 1}e-5,1e-4\n"
 
 
 def append(path: Path, text: str) -> None:
@@ -103,20 +103,20 @@ Begun = Callable[..., tuple[Path, Feeding]]
 
 
 def new(messages: Feeding) -> list[int | str]:
-    """Return the turns that have come, and in the place of what was refused its text."""
+    """Return the steps that have come, and in the place of what was refused its text."""
     came = takewhile(lambda fed: fed[0] is not None, messages)
-    return [fed.turn if isinstance(fed, Message) and fed.turn is not None else text for fed, text in came]
+    return [fed.step if isinstance(fed, Message) and fed.step is not None else text for fed, text in came]
 
 
 @pytest.fixture
 def begun_log(base: Watch, tmp_path: Path) -> Begun:
-    """What begins a log with some turns, and reads them."""
+    """What begins a log with some steps, and reads them."""
 
-    def begin(*turns: int) -> tuple[Path, Feeding]:
+    def begin(*steps: int) -> tuple[Path, Feeding]:
         path = tmp_path / "log.csv"
-        path.write_text(HEADER + "".join(map(row, turns)))
+        path.write_text(HEADER + "".join(map(row, steps)))
         messages = CsvFeed(path, base.scenario, follow=True).messages(None)
-        assert new(messages) == [*turns]
+        assert new(messages) == [*steps]
         return path, messages
 
     return begin
@@ -138,23 +138,23 @@ def test_no_row_is_lost_in_a_rotation(begun_log, rotation, header):
             writer.write(row(3)[4:])  # until its writer opens the new one
         append(path, header + row(4))
     assert new(messages) == ([2, 3, 4] if cut else [3, 4])
-    for turn in (5, 7):
-        append(path, row(turn))
+    for step in (5, 7):
+        append(path, row(step))
         rotate(path)
-        append(path, header + row(turn + 1))
-        assert new(messages) == [turn, turn + 1]
+        append(path, header + row(step + 1))
+        assert new(messages) == [step, step + 1]
 
 
 @pytest.mark.parametrize("way", ["logging", *rotations("copytruncate")])
 def test_a_writer_that_does_not_wait_for_its_reader(begun_log, way):
-    (path, messages), turns = begun_log(), 4000
+    (path, messages), steps = begun_log(), 4000
     handler = RotatingFileHandler(path, maxBytes=2000 if way == "logging" else 0, backupCount=1000)
 
     def write() -> None:
-        for turn in range(turns):
-            if way == "copytruncate" and turn % 500 == 250:  # between copy and cut nobody may write
+        for step in range(steps):
+            if way == "copytruncate" and step % 500 == 250:  # between copy and cut nobody may write
                 ROTATIONS[way](path)
-            handler.emit(logging.makeLogRecord({"msg": row(turn).strip()}))
+            handler.emit(logging.makeLogRecord({"msg": row(step).strip()}))
         handler.close()
 
     writer = Thread(target=write)
@@ -163,7 +163,7 @@ def test_a_writer_that_does_not_wait_for_its_reader(begun_log, way):
     while writer.is_alive():
         found += new(messages)
     writer.join()
-    assert found + new(messages) == list(range(turns))
+    assert found + new(messages) == list(range(steps))
     assert len(list(path.parent.glob("log.csv.*"))) >= (30 if way == "logging" else 8)
 
 
@@ -179,14 +179,14 @@ def test_half_rows_are_waited_for_a_copy_is_read_on_and_columns_of_a_new_file_ar
     fresh.write_text(path.read_text() + row(1))
     fresh.rename(path)
     assert new(messages) == [1]
-    for turn in (2, 3):
-        append(path, row(turn))
+    for step in (2, 3):
+        append(path, row(step))
         renamed(path)
     append(path, "strain_2,step\n1e-4,4\n")
-    *turns, message = (next(messages)[0] for _ in range(3))
+    *steps, message = (next(messages)[0] for _ in range(3))
     assert isinstance(message, Message)
-    assert (message.turn, message.observed[1], np.isnan(message.observed[0])) == (4, 1e-4, True)
-    assert [told.turn for told in turns if isinstance(told, Message)] == [2, 3]
+    assert (message.step, message.observed[1], np.isnan(message.observed[0])) == (4, 1e-4, True)
+    assert [told.step for told in steps if isinstance(told, Message)] == [2, 3]
     append(path, "1e-4,5e")  # half a row of a dead writer ends with its file
     assert new(messages) == []
     renamed(path)
@@ -195,14 +195,14 @@ def test_half_rows_are_waited_for_a_copy_is_read_on_and_columns_of_a_new_file_ar
 
 
 @pytest.mark.parametrize(
-    ("turns", "left"),
+    ("steps", "left"),
     [
         ([0, 1], [*range(2, 9)]),  # longer than before: it is known by its rows
         ([*range(6000)], [*range(5000)]),  # it begins as before: known by its size
     ],
 )
-def test_a_cut_without_a_copy_is_told(begun_log, turns, left):
-    path, messages = begun_log(*turns)
+def test_a_cut_without_a_copy_is_told(begun_log, steps, left):
+    path, messages = begun_log(*steps)
     size = path.stat().st_size
     path.write_text(HEADER + "".join(map(row, left)))
     assert str(next(messages)[0]) == (
@@ -219,13 +219,13 @@ def test_a_watch_that_was_down_takes_up_a_rotated_log(watch, mission, plain, tmp
     header, *rows = plain.read_text().splitlines(keepends=True)
     path = tmp_path / "log.csv"
     path.write_text(header)
-    for turn, text in enumerate(rows):
-        if turn in (15, 30, 33):
+    for step, text in enumerate(rows):
+        if step in (15, 30, 33):
             ROTATIONS[rotation](path)
             append(path, header if has_header else "")
         append(path, text)
-        if turn in (13, 17, 20, 29, 49):  # else it is down
-            counts = ran(watch, CsvFeed(path, watch.scenario, follow=True), turn + 1 - turn % 4)
+        if step in (13, 17, 20, 29, 49):  # else it is down
+            counts = ran(watch, CsvFeed(path, watch.scenario, follow=True), step + 1 - step % 4)
     assert (counts.received, counts.missing, counts.duplicates, counts.rejected) == (49, 0, 0, 0)
     assert [line["filtered"] for line in journal(watch.folder)] == mission.filtered[:49].tolist()
 

@@ -31,21 +31,21 @@ def with_section(watch: Watch, **keys: Any) -> Watch:
 
 
 def line(mission: Any, row: int, **others: Any) -> dict[str, Any]:
-    """Return the message of a row of a mission, without saying which turn it is."""
+    """Return the message of a row of a mission, without saying which step it is."""
     control = ("2g", "3g")[mission.control_index[row]]
     return {"control": control, "strain": mission.observed[row].tolist(), **others}
 
 
-def decisions_of(watch: Watch, messages: list[Mapping[str, Any]], turns: int | None = None) -> list[Any]:
+def decisions_of(watch: Watch, messages: list[Mapping[str, Any]], steps: int | None = None) -> list[Any]:
     """Return what the operator is told of messages."""
     stream = io.BytesIO("".join(json.dumps(message) + "\n" for message in messages).encode())
     decisions = list[Any]()
-    watch.run(json_lines(watch.scenario, stream), decisions.append, turns=turns)
+    watch.run(json_lines(watch.scenario, stream), decisions.append, steps=steps)
     return decisions
 
 
 def kinds(decisions: list[Any]) -> list[tuple[int, str]]:
-    return [(decision["turn"], notice["kind"]) for decision in decisions for notice in decision["notices"]]
+    return [(decision["step"], notice["kind"]) for decision in decisions for notice in decision["notices"]]
 
 
 def sentence(decisions: list[Any], kind: str) -> str:
@@ -58,14 +58,14 @@ def sentence(decisions: list[Any], kind: str) -> str:
     ("factor", "unit"), [(1e3, "milliseconds"), (1e6, "microseconds"), (1e9, "nanoseconds")]
 )
 @pytest.mark.parametrize("begin", [0.0, EPOCH])
-def test_times_of_another_unit_are_turns_in_their_order_and_the_unit_is_named(
+def test_times_of_another_unit_are_steps_in_their_order_and_the_unit_is_named(
     watch, mission, factor, unit, begin
 ):
-    with_section(watch, seconds_per_turn=1.0)
+    with_section(watch, seconds_per_step=1.0)
     jitter = [0.0, 0.08, -0.07]
-    messages = [line(mission, turn, time=factor * (begin + turn + jitter[turn])) for turn in range(3)]
+    messages = [line(mission, step, time=factor * (begin + step + jitter[step])) for step in range(3)]
     decisions = decisions_of(watch, messages)
-    assert [decision["turn"] for decision in decisions] == [0, 1, 2]
+    assert [decision["step"] for decision in decisions] == [0, 1, 2]
     assert kinds(decisions) == [(1, "clock")]
     assert unit in sentence(decisions, "clock")
     np.testing.assert_array_equal(watch.filtered, mission.filtered[2])
@@ -73,81 +73,81 @@ def test_times_of_another_unit_are_turns_in_their_order_and_the_unit_is_named(
 
 @pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_times_in_a_stated_unit_show_gaps(watch, mission, unit, factor):
-    with_section(watch, seconds_per_turn=1.0, time_unit=unit)
-    messages = [line(mission, turn, time=factor * (EPOCH + turn)) for turn in (0, 1, 4)]
+    with_section(watch, seconds_per_step=1.0, time_unit=unit)
+    messages = [line(mission, step, time=factor * (EPOCH + step)) for step in (0, 1, 4)]
     decisions = decisions_of(watch, messages)
-    assert [decision["turn"] for decision in decisions] == [0, 1, 2, 3, 4]
+    assert [decision["step"] for decision in decisions] == [0, 1, 2, 3, 4]
     assert kinds(decisions) == [(2, "gap")]
 
 
 def test_a_clock_that_changes_its_unit_is_refused_and_the_unit_is_named(watch, mission):
-    with_section(watch, seconds_per_turn=1.0)
-    messages = [line(mission, turn, time=100.0 + turn) for turn in range(3)]
-    messages += [line(mission, turn, time=1000.0 * (100.0 + turn)) for turn in range(3, 7)]
+    with_section(watch, seconds_per_step=1.0)
+    messages = [line(mission, step, time=100.0 + step) for step in range(3)]
+    messages += [line(mission, step, time=1000.0 * (100.0 + step)) for step in range(3, 7)]
     decisions = decisions_of(watch, messages)
     assert kinds(decisions) == [(2, "refused")]
     assert 'its times look like milliseconds: give `watch.time_unit = "ms"`' in sentence(decisions, "refused")
 
 
 def test_a_gap_of_a_clock_that_is_known_is_a_gap_however_long(watch, mission):
-    with_section(watch, seconds_per_turn=1.0)
+    with_section(watch, seconds_per_step=1.0)
     messages = [line(mission, number, time=time) for number, time in enumerate([0.0, 1.0, 1001.0])]
     decisions = decisions_of(watch, messages)
-    assert decisions[-1]["turn"] == 1001
+    assert decisions[-1]["step"] == 1001
     told = sentence(decisions, "gap")
-    assert told.startswith("Turns 2 to 1000: no message came, and the belief is predicted through 999 turns")
+    assert told.startswith("Steps 2 to 1000: no message came, and the belief is predicted through 999 steps")
     assert "milliseconds" not in told
 
 
 def test_a_gap_is_told_once_by_a_watch_that_ends_within(watch, mission, tmp_path):
-    messages = [line(mission, turn, turn=turn) for turn in (0, 1, 9)]
-    decisions = decisions_of(watch, messages, turns=4) + decisions_of(watch, messages[2:])
+    messages = [line(mission, step, step=step) for step in (0, 1, 9)]
+    decisions = decisions_of(watch, messages, steps=4) + decisions_of(watch, messages[2:])
     assert kinds(decisions) == [(2, "gap")]
-    assert sentence(decisions, "gap").startswith("Turns 2 to 8: no message came")
-    assert decisions[-1]["turn"] == 9
+    assert sentence(decisions, "gap").startswith("Steps 2 to 8: no message came")
+    assert decisions[-1]["step"] == 9
 
 
 def test_refusals_in_a_row_are_told_once_and_that_messages_are_taken_again(watch, mission):
-    good = [line(mission, turn, turn=turn) for turn in range(3)]
-    bad = {"turn": "one"}
+    good = [line(mission, step, step=step) for step in range(3)]
+    bad = {"step": "one"}
     decisions = decisions_of(watch, [good[0], bad, bad, good[1], *[bad] * 5, good[2]])
     assert kinds(decisions) == [(1, "refused"), (2, "taken")]
-    assert "Since turn 1, 3 messages came, and all were refused" in sentence(decisions, "refused")
+    assert "Since step 1, 3 messages came, and all were refused" in sentence(decisions, "refused")
     assert "after 5 were refused" in sentence(decisions, "taken")
     assert decisions[2]["told_again"]  # the last decision, with the notice
     assert watch.intake.complaint() == ""
 
 
 def test_a_counter_that_begins_again_is_told_as_that(watch, mission):
-    messages = [line(mission, turn, turn=turn) for turn in range(8)]
-    again = [line(mission, turn + 8, turn=turn) for turn in range(4)]
+    messages = [line(mission, step, step=step) for step in range(8)]
+    again = [line(mission, step + 8, step=step) for step in range(4)]
     decisions = decisions_of(watch, messages + again)
     assert kinds(decisions) == [(7, "refused")]
-    assert "the turns 0, 1 and 2, which were watched before" in sentence(decisions, "refused")
+    assert "the steps 0, 1 and 2, which were watched before" in sentence(decisions, "refused")
     assert watch.intake.complaint().startswith(
         "The watch ended while messages were refused: the last 4 of 12"
     )
 
 
 def test_observations_that_no_state_shows_are_refusals(base, mission):
-    """They are refused once their turn is assimilated, so that turns go on."""
-    text = "".join(json.dumps(line(mission, turn, turn=turn)) + "\n" for turn in range(3))
+    """They are refused once their step is assimilated, so that steps go on."""
+    text = "".join(json.dumps(line(mission, step, step=step)) + "\n" for step in range(3))
     intake = Intake(base.scenario, json_lines(base.scenario, io.BytesIO(text.encode())))
     twin = base.models[0].knowledge.twin(lag=12)
-    for turn in range(3):
+    for step in range(3):
         reading = intake.read(twin)
         assert reading is not None
-        predicted = intake.impossible(reading, ImpossibleObservation("wing", turn))
-        twin.turn(predicted.observed, predicted.control)
-    assert "probability zero" in intake.stream.refusals(twin.turns).sentence
+        predicted = intake.impossible(reading, ImpossibleObservation("wing", step))
+        twin.step(predicted.observed, predicted.control)
+    assert "probability zero" in intake.stream.refusals(twin.steps).sentence
     assert intake.complaint().startswith("The watch ended while messages were refused: the last 3 of 3")
 
 
 @pytest.mark.parametrize("name", ["fields", "strian"])
 def test_a_message_without_a_known_sensor_is_told_until_one_comes(watch, mission, name):
     with_section(watch, allow_unknown=True)
-    good = [line(mission, turn, turn=turn) for turn in range(4)]
-    blind = [{"turn": turn, name: [1e-3] * 24} for turn in range(4)]
+    good = [line(mission, step, step=step) for step in range(4)]
+    blind = [{"step": step, name: [1e-3] * 24} for step in range(4)]
     decisions = decisions_of(watch, [good[0], blind[1], blind[2], good[3]])
     assert [kind for kind in kinds(decisions) if kind[1] == "blind"] == [(1, "blind")]
     assert f"no reading of any gauge; passed over: `{name}`" in sentence(decisions, "blind")
@@ -156,7 +156,7 @@ def test_a_message_without_a_known_sensor_is_told_until_one_comes(watch, mission
 def test_nested_messages_are_refused_and_nothing_is_advised_that_passes_over_all(watch):
     with_section(watch, allow_unknown=True)
     nested = {"fields": {"strain_1_microstrain": 2520.8}, "tags": {"host": "pi"}}
-    decisions = decisions_of(watch, [{"turn": turn, **nested} for turn in range(4)])
+    decisions = decisions_of(watch, [{"step": step, **nested} for step in range(4)])
     assert kinds(decisions) == [(-1, "refused")]
     told = sentence(decisions, "refused")
     assert "`fields` holds an object" in told
@@ -179,17 +179,17 @@ def test_to_pass_over_names_is_advised_only_where_it_helps(watch, message, is_ad
 
 def test_a_name_that_is_passed_over_and_looks_like_a_slip_is_told_once(watch, mission):
     with_section(watch, allow_unknown=True)
-    messages = [{"turn": turn, "strain_1": 1e-3, "strian_2": 1e-3, "battery": 3.3} for turn in range(3)]
+    messages = [{"step": step, "strain_1": 1e-3, "strian_2": 1e-3, "battery": 3.3} for step in range(3)]
     decisions = decisions_of(watch, messages[:2]) + decisions_of(watch, messages[2:])
     assert kinds(decisions) == [(0, "passed_over")]
     assert sentence(decisions, "passed_over") == (
-        "Turn 0: passed over as no gauge: `strian_2` (probably `strain_2`)."
+        "Step 0: passed over as no gauge: `strian_2` (probably `strain_2`)."
     )
 
 
 def test_a_watch_that_was_stopped_anywhere_tells_the_same(base, mission, tmp_path):
-    header = "turn,control," + ",".join(f"strain_{number}" for number in range(1, 25))
-    rows = [f"{turn},3g," + ",".join(map(repr, row)) for turn, row in enumerate(mission.observed.tolist())]
+    header = "step,control," + ",".join(f"strain_{number}" for number in range(1, 25))
+    rows = [f"{step},3g," + ",".join(map(repr, row)) for step, row in enumerate(mission.observed.tolist())]
     bad = ["no,3g" + ",1e-3" * 24]
     path = tmp_path / "m.csv"
     parts = [header, *rows[:3], *bad * 4, *rows[3:5], *rows[9:11], *bad * 2, "11,3g" + "," * 24, *rows[12:14]]
@@ -197,12 +197,12 @@ def test_a_watch_that_was_stopped_anywhere_tells_the_same(base, mission, tmp_pat
     told = []
     for name, stops in (("whole", (None,)), ("stopped", (1, 3, 4, 6, 8, 10, 12, None))):
         watch = begun(base, tmp_path / name)
-        for turns in stops:
-            watch.run(CsvFeed(path, watch.scenario), str, turns=turns)
+        for steps in stops:
+            watch.run(CsvFeed(path, watch.scenario), str, steps=steps)
         lines = journal(watch.folder)
-        told.append([(one["turn"], notice) for one in lines for notice in one.get("notices", ())])
+        told.append([(one["step"], notice) for one in lines for notice in one.get("notices", ())])
     assert told[0] == told[1]
-    assert [(turn, notice["kind"]) for turn, notice in told[0]] == [
+    assert [(step, notice["kind"]) for step, notice in told[0]] == [
         (2, "refused"), (3, "taken"), (5, "gap"), (11, "blind"),
     ]  # fmt: skip
 
@@ -215,13 +215,13 @@ def watched(scenario: LoadedScenario, folder: Path, messages: list[Mapping[str, 
 
 
 def test_a_watch_of_messages_that_were_of_no_use_fails(scenario, mission, tmp_path):
-    bad = [{"turn": turn, "fields": {}} for turn in range(2)]
+    bad = [{"step": step, "fields": {}} for step in range(2)]
     done = watched(scenario, tmp_path / "bad", bad)
     assert done.returncode == 1
     assert "The watch ended while messages were refused: the last 2 of 2 messages" in done.stderr
-    blind = [{"turn": turn, "control": "3g"} for turn in range(2)]
+    blind = [{"step": step, "control": "3g"} for step in range(2)]
     done = watched(scenario, tmp_path / "blind", blind)
     assert done.returncode == 1
     assert "None of 2 messages has a reading of any gauge" in done.stderr
-    good = [line(mission, turn, turn=turn) for turn in range(2)]
+    good = [line(mission, step, step=step) for step in range(2)]
     assert watched(scenario, tmp_path / "good", [bad[0], *good, bad[1]]).returncode == 0

@@ -73,41 +73,41 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]
     alarm = next(d for d in decisions for n in d["notices"] if n["kind"] == "alarm")
-    assert verdict["to_turn"] == alarm["turn"] + 10
-    assert 12 <= verdict["from_turn"] <= 18
-    assert model["from_turn"] == verdict["from_turn"]
-    (adopted,) = [record["turn"] for record in records if "model" in record]
-    turns = {record["turn"]: record["log_evidence"] for record in records if "filtered" in record}
-    evidence = [turns[turn] for turn in range(model["from_turn"], adopted + 1)]
+    assert verdict["to_step"] == alarm["step"] + 10
+    assert 12 <= verdict["from_step"] <= 18
+    assert model["from_step"] == verdict["from_step"]
+    (adopted,) = [record["step"] for record in records if "model" in record]
+    steps = {record["step"]: record["log_evidence"] for record in records if "filtered" in record}
+    evidence = [steps[step] for step in range(model["from_step"], adopted + 1)]
     assert model["before"]["log_evidence"] == pytest.approx(sum(evidence))
     assert model["before"]["rms_residual"] > 1.4 > 1.3 > model["after"]["rms_residual"]
     said = [notice["sentence"] for d in decisions for notice in d["notices"]]
     searched = [sentence for sentence in said if "belief and decision follow" not in sentence]
     assert "named. It is so. The patch is tried" in searched[1]
-    assert "is believed from turn" in searched[2]
+    assert "is believed from step" in searched[2]
     assert len(searched) == 3
-    asked = decisions[verdict["to_turn"]]  # before anything is taught the gauge is known to be off
+    asked = decisions[verdict["to_step"]]  # before anything is taught the gauge is known to be off
     assert asked["decided_by"] == "gauge 5 off"
     assert asked["hypotheses"]["gauge 5 off"] > 0.9
     assert [notice.sentence for _, notice in watch.told(0)] == said  # in the report too, though filtered anew
-    assert watch.told(asked["turn"])[0] == watch.told(0)[0]  # the first alarm also in that of the last turns
+    assert watch.told(asked["step"])[0] == watch.told(0)[0]  # the first alarm also in that of the last steps
     # Once it is taught, the twin knows the wing as one that had seen no loose gauge.
     last = records[-1]["filtered"]
     assert np.abs(np.array(last) - mission.filtered[-1]).max() < 0.2
-    assert viewed(watch.folder).pictures == []  # turns show no motion, and no force in it
+    assert viewed(watch.folder).pictures == []  # steps show no motion, and no force in it
     # Stopped within the trial, and after the adoption: the same journal.
     stopped = watchful(base, tmp_path / "stopped")
-    asked = verdict["to_turn"]
+    asked = verdict["to_step"]
     for end in (asked + 5, asked + 15, None):
         teach = tutor(stopped, tmp_path, "named", -0.3).act
-        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, turns=end)
+        stopped.run(CsvFeed(loose, stopped.scenario), str, teach, steps=end)
         again = watchful(stopped, tmp_path / f"{end}")
         check_same(again.folder, stopped.folder, JOURNAL_NAME)
         stopped = again
     check_same(stopped.folder, watch.folder, JOURNAL_NAME)
 
 
-def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(noticing, recorded, tmp_path):
+def test_a_patch_is_believed_from_a_stated_step_on_and_its_missing_force_shown(noticing, recorded, tmp_path):
     folder = tmp_path / "verdict"  # as `discrepancy run` leaves one
     (folder / "figures").mkdir(parents=True)
     (folder / "figures" / "missing_force.svg").write_bytes(to_svg(new_figure(2.0)))
@@ -116,11 +116,11 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     ran(noticing, CsvFeed(recorded, noticing.scenario), 20)
     flight = viewed(noticing.folder)
     before, number = flight.believed(flight.seen(0, 5)).expected.mean, flight.number
-    assert flight.pictures == []  # turns are no motion
-    with pytest.raises(MissionInputError, match="--from-turn names one of the 20 turns"):
+    assert flight.pictures == []  # steps are no motion
+    with pytest.raises(MissionInputError, match="--from-step names one of the 20 steps"):
         noticing.run(CsvFeed(recorded, noticing.scenario), str, patched=(folder / "patch.json", 21))
     given = (folder / "patch.json", 15)
-    counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, turns=25, patched=given)
+    counts = noticing.run(CsvFeed(recorded, noticing.scenario), str, steps=25, patched=given)
     noticing.store(counts, report=False)
     run = open_run(noticing.folder)
     assert (run.attrs["model_patch"], run.attrs["model_patch_from_step"]) == ("asset/model_patch_1.json", 15)
@@ -140,7 +140,7 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     seen = flight.seen(0, 25)
     shown = flight.believed(seen)
     np.testing.assert_array_equal(shown.expected.mean[:5], before)  # as it was told
-    controls = [turn["control_index"] for turn in seen]
+    controls = [step["control_index"] for step in seen]
     for part, model in zip((slice(20), slice(20, None)), noticing.models, strict=True):
         joint = known_control(shown.probability[part], controls[part], 2)
         expected, _ = model.knowledge.sensor_model.moments(joint)
@@ -149,9 +149,9 @@ def test_a_patch_is_believed_from_a_stated_turn_on_and_its_missing_force_shown(n
     (picture,) = flight.pictures
     teller = Teller(flight)
     assert b"<svg" in picture.drawing.read_bytes()
-    asked = Request(number=1, flight=-1, first=0, end=0, turn=18, shown=-1, count=-1)
+    asked = Request(number=1, flight=-1, first=0, end=0, step=18, shown=-1, count=-1)
     assert json.loads(str(teller.answer(asked)))["picture"] is None  # as was known at the time
-    shown = json.loads(str(teller.answer(asked.model_copy(update={"turn": 19}))))["picture"]
+    shown = json.loads(str(teller.answer(asked.model_copy(update={"step": 19}))))["picture"]
     assert shown["said"] == "It is so."
     (picture.drawing.parent.parent / "verdict.json").write_text("{}")
     assert viewed(noticing.folder).pictures == []
@@ -161,11 +161,11 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
     for kind, gain, sentence in (
         ("named", 0.3, "and is not adopted."),
         ("named", -0.002, "nats of evidence, 3 are needed, and is not adopted."),
-        ("family", -0.3, "--model-patch DIR/teaching/turns_"),
+        ("family", -0.3, "--model-patch DIR/teaching/steps_"),
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
-        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, turns=40)
+        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, steps=40)
         records = journal(watch.folder)
         assert not any("model" in record for record in records)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
@@ -193,7 +193,7 @@ def verdict_folder(folder: Path, gates: list[dict[str, Any]]) -> Path:
 )
 def test_a_name_without_an_absolute_fit_is_not_tried_and_the_notice_says_why(tmp_path, name, passed, caveat):
     gates = [{"name": name, "passed": passed, "reason": "It leaves three noises."}]
-    verdict = verdict_of(verdict_folder(tmp_path / "verdict", gates), tmp_path / "log", 3, 13, "turn")
+    verdict = verdict_of(verdict_folder(tmp_path / "verdict", gates), tmp_path / "log", 3, 13, "step")
     assert not verdict["tried"]
     sentence = verdict["notice"]["sentence"]
     assert f"named. A mass is missing. {caveat}" in sentence
@@ -215,14 +215,14 @@ def test_a_group_that_differs_at_other_loads_is_not_tried(tmp_path, members, tri
     effects = [{"patch": ModelPatch((member,)).to_list()} for member in members]
     verdict = {"kind": "group", "sentence": "Either is missing.", "gates": gates, "effects": effects}
     (folder / "verdict.json").write_text(json.dumps({"verdict": verdict}))
-    found = verdict_of(folder, tmp_path / "log", 3, 13, "turn")
+    found = verdict_of(folder, tmp_path / "log", 3, 13, "step")
     assert found["tried"] is tried
-    assert ("more turns at more than one load may" in found["notice"]["sentence"]) is not tried
+    assert ("more steps at more than one load may" in found["notice"]["sentence"]) is not tried
 
 
 @pytest.fixture(scope="module")
 def saturated(mission, tmp_path_factory) -> Path:
-    """The mission as gauges recorded it that all saturate softly, from the first turn on."""
+    """The mission as gauges recorded it that all saturate softly, from the first step on."""
     observed = 4e-3 * np.tanh(mission.observed / 4e-3)
     return write_csv(tmp_path_factory.mktemp("saturated") / "saturated.csv", observed, mission.control_index)
 
@@ -234,12 +234,12 @@ def test_after_an_alarm_of_many_gauges_nothing_is_adopted_from_its_name_alone(ba
     answer.write_text(json.dumps(["named", patch_record(SensorGain("*", -0.1, "strain"))]))
     watch = watchful(base, tmp_path / "watch")
     teach = Tutor(watch, wait=True, command=(sys.executable, str(script), str(answer), "-"))
-    watch.run(CsvFeed(saturated, watch.scenario), str, teach.act, turns=30)
+    watch.run(CsvFeed(saturated, watch.scenario), str, teach.act, steps=30)
     records = journal(watch.folder)
     trial = next(n["sentence"] for r in records for n in r.get("notices", []) if n["kind"] == "trial")
     assert not any("model" in record for record in records)
     assert "and is not adopted from its name alone, because many gauges raised the alarm" in trial
-    assert "uav-twin watch --resume --out DIR --model-patch DIR/teaching/turns_0_to_" in trial
+    assert "uav-twin watch --resume --out DIR --model-patch DIR/teaching/steps_0_to_" in trial
     assert " gained -" not in trial
 
 
@@ -247,7 +247,7 @@ def test_after_an_alarm_of_many_gauges_nothing_is_adopted_from_its_name_alone(ba
 def unbelieved(base, saturated, tmp_path_factory) -> tuple[Watch, list[dict[str, Any]]]:
     """A watch that ends while no state explains the gauges, with its decisions."""
     watch, decisions = watchful(base, tmp_path_factory.mktemp("unbelieved") / "watch"), []
-    counts = watch.run(CsvFeed(saturated, watch.scenario), decisions.append, turns=12)
+    counts = watch.run(CsvFeed(saturated, watch.scenario), decisions.append, steps=12)
     watch.store(counts)
     assert decisions[-1]["none_of_these"] > 0.5 > decisions[0]["none_of_these"]
     return watch, decisions
@@ -273,53 +273,53 @@ def test_report_and_summary_tell_no_state_that_is_not_believed(unbelieved):
 
 def test_the_page_that_follows_a_flight_shows_no_state_that_is_not_believed(unbelieved):
     watch, _ = unbelieved
-    asked = Request(number=1, flight=-1, first=0, end=0, turn=-1, shown=-1, count=-1)
+    asked = Request(number=1, flight=-1, first=0, end=0, step=-1, shown=-1, count=-1)
     answer = json.loads(str(Teller(viewed(watch.folder)).answer(asked)))
     assert answer["past"]["state"][-1] == answer["ahead"]["state"][0] == [None, None]
     assert None not in answer["past"]["state"][0]
 
 
-def test_a_verdict_is_told_also_with_the_turn_that_ends_a_silence_and_is_no_decision(noticing, recorded):
+def test_a_verdict_is_told_also_with_the_step_that_ends_a_silence_and_is_no_decision(noticing, recorded):
     notice = {"kind": "verdict", "sentence": "It is so.", "sensors": []}
     with noticing.begun(CsvFeed(recorded, noticing.scenario)):
-        noticing.write(verdict={"tried": False, "to_turn": 0, "notice": notice})
+        noticing.write(verdict={"tried": False, "to_step": 0, "notice": notice})
         noticing.is_quiet = True
         kinds = [[told["kind"] for told in next(noticing.decisions())["notices"]] for _ in range(2)]
-        noticing.write(verdict={"tried": False, "to_turn": 1, "notice": notice})
-        assert noticing.last_decision()["turn"] == 1
+        noticing.write(verdict={"tried": False, "to_step": 1, "notice": notice})
+        assert noticing.last_decision()["step"] == 1
     assert kinds == [["verdict", "heard"], []]
 
 
-def test_live_turns_wait_neither_for_the_search_nor_for_the_patched_model(
+def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
     noticing, mission, loose, tmp_path, monkeypatch
 ):
-    """It is built beside them, and believed behind the turn that the journal says, to the bit."""
+    """It is built beside them, and believed behind the step that the journal says, to the bit."""
     monkeypatch.setattr("twin_master.watch.tutor.COURTESY", 0)
     gate = tmp_path / "gate"
     live = tutor(noticing, tmp_path, "group", -0.3, str(gate), wait=False)
 
     def decide(decision: Any) -> None:
-        if decision["turn"] == 32:  # the turns before were decided while the search went on
+        if decision["step"] == 32:  # the steps before were decided while the search went on
             gate.touch()
-            wait_until(lambda: [*(noticing.folder / "teaching").glob("turns*/verdict.json")])
-        if decision["turn"] == 45:  # and those behind the trial while the model was built
+            wait_until(lambda: [*(noticing.folder / "teaching").glob("steps*/verdict.json")])
+        if decision["step"] == 45:  # and those behind the trial while the model was built
             wait_until(lambda: live.outcome is not None and live.outcome.done())
 
     noticing.run(CsvFeed(loose, noticing.scenario), decide, live.act)
     model = next(record for record in journal(noticing.folder) if "model" in record)
     verdict = next(record["verdict"] for record in journal(noticing.folder) if "verdict" in record)
-    assert (verdict["turn"], model["turn"]) == (32, 45)
-    assert verdict["to_turn"] < 32
-    assert model["model"]["from_turn"] < 20
+    assert (verdict["step"], model["step"]) == (32, 45)
+    assert verdict["to_step"] < 32
+    assert model["model"]["from_step"] < 20
     assert model["model"]["notice"]["sentence"].endswith("which of them is true these data cannot tell.")
     observed = mission.observed.copy()
     observed[15:, 4] *= 0.7
     twin, patched = (one.knowledge.twin() for one in noticing.models)
-    for turn, (row, control) in enumerate(zip(observed, mission.control_index.tolist(), strict=True)):
-        if turn == model["model"]["from_turn"]:
+    for step, (row, control) in enumerate(zip(observed, mission.control_index.tolist(), strict=True)):
+        if step == model["model"]["from_step"]:
             patched.restore_state(twin.save_state())
             twin = patched
-        believed = twin.turn(row, control).filtered.tolist()
+        believed = twin.step(row, control).filtered.tolist()
     assert journal(noticing.folder)[-1]["filtered"] == believed
     again = watchful(noticing, tmp_path / "again")
     twins = [replay(one._path, one.models, one.scenario.watch.lag)[0].twin for one in (again, noticing)]
@@ -338,7 +338,7 @@ def test_a_policy_that_changes_is_told(base):
     )
     outcome = Outcome(b"", None, 3.5, {"policy_change": sentence})  # type: ignore[arg-type]
     for kind in TRIED:
-        assert trial_sentence({"kind": kind, "from_turn": 3}, outcome, "turn").endswith(f". {sentence}")
+        assert trial_sentence({"kind": kind, "from_step": 3}, outcome, "step").endswith(f". {sentence}")
 
 
 def test_a_gauge_taught_to_show_too_little_makes_no_wing_healthier(base, tmp_path):
@@ -367,34 +367,34 @@ def test_gauges_taught_to_saturate_make_no_wing_healthier(base, tmp_path):
     np.testing.assert_array_equal(taught.plan.policy, known.plan.policy)
 
 
-def turn(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
+def step(number: int, evidence: float = 0.0, *alarms: dict[str, Any]) -> dict[str, Any]:
     told = {"suspicion": {"log_evidence_none": evidence}, "filtered": [1.0]}
-    return {"turn": number, "notices": list(alarms), **told}
+    return {"step": number, "notices": list(alarms), **told}
 
 
-def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_turns():
+def test_an_alarm_must_hold_and_is_asked_again_with_twice_the_steps():
     teaching = Teaching(100.0)
     alarm = {"kind": "alarm", "sentence": "a", "since": 3}
     for number in range(12):
-        teaching.take(turn(number, 10.0, *([alarm] if number == 5 else [])))
+        teaching.take(step(number, 10.0, *([alarm] if number == 5 else [])))
     for number in (12, 13, 14, 15):
-        teaching.take(turn(number, math.log(100.0) - 0.1))
-    assert teaching.question is None  # it did not hold ten turns after the alarm
-    teaching.take(turn(16, math.log(100.0)))
+        teaching.take(step(number, math.log(100.0) - 0.1))
+    assert teaching.question is None  # it did not hold ten steps after the alarm
+    teaching.take(step(16, math.log(100.0)))
     assert teaching.question == (3, 16)
     told = {"kind": "verdict", "sentence": "v"}
-    teaching.take({"turn": 16, "verdict": {"to_turn": 16, "turn": 16, "tried": False, "notice": told}})
+    teaching.take({"step": 16, "verdict": {"to_step": 16, "step": 16, "tried": False, "notice": told}})
     assert teaching.question is None
     assert teaching.untold == [told]
     for number in range(17, 40):
-        teaching.take(turn(number, 10.0))
+        teaching.take(step(number, 10.0))
         assert (teaching.question is not None) == (number >= 27)
     assert teaching.question == (3, 27)
     assert teaching.untold == []
-    teaching.take({"turn": 40, "model": {"from_turn": 8, "notice": told, "alarms": [alarm]}})
+    teaching.take({"step": 40, "model": {"from_step": 8, "notice": told, "alarms": [alarm]}})
     assert (teaching.question, teaching.untold) == (None, [told, alarm])
     for number in range(41, 60):
-        teaching.take(turn(number, 10.0))
+        teaching.take(step(number, 10.0))
     assert teaching.question == (8, 49)  # the alarm of the new model, and not before it was believed
 
 

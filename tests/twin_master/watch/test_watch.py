@@ -60,11 +60,11 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tmp
         np.testing.assert_array_equal(run["filtered"][name].values, getattr(mission, name))
     assert "truth" not in run.children
     told = journalled(base, whole)
-    assert [decision["turn"] for decision in told] == list(range(50))
+    assert [decision["step"] for decision in told] == list(range(50))
     assert all(0.5 <= decision["probability"] <= 1.0 for decision in told)
     assert [d["next_control"] for d in told[:-1]] == [d["control"] for d in told[1:]]
     figures = figures_of(whole)
-    assert (figures["turns"], figures["rejected"], figures["missing"]) == (50, 7, 0)
+    assert (figures["steps"], figures["rejected"], figures["missing"]) == (50, 7, 0)
     assert len((whole / "rejected.jsonl").read_text().splitlines()) == 7
     assert "messages refused" in (whole / "report.html").read_text()
     for number, source in enumerate((whole / "run.nc", whole)):
@@ -74,17 +74,17 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tmp
     with pytest.raises(MissionInputError, match="holds no journal"):
         file_feed(tmp_path, base.scenario)
     before = (whole / JOURNAL_NAME).read_bytes()
-    with flown(whole, 3, 20, SilentProgress()) as copy:  # up to a turn
+    with flown(whole, 3, 20, SilentProgress()) as copy:  # up to a step
         assert (copy / "run.nc").is_file()
-        assert [record["turn"] for record in journal(copy)] == list(range(21))
+        assert [record["step"] for record in journal(copy)] == list(range(21))
     assert not copy.exists()
     assert (whole / JOURNAL_NAME).read_bytes() == before
-    nowhere = r"has the turns 0 to 20 up to turn 20, and none from 21 on"
+    nowhere = r"has the steps 0 to 20 up to step 20, and none from 21 on"
     with pytest.raises(MissionInputError, match=nowhere), flown(whole, 21, 20, SilentProgress()):
         raise AssertionError
 
 
-def test_a_kill_at_any_moment_loses_no_turn(watch, recorded, whole, monkeypatch):
+def test_a_kill_at_any_moment_loses_no_step(watch, recorded, whole, monkeypatch):
     monkeypatch.setattr("twin_master.watch.folder.FLUSH_SECONDS", 0.0)  # so that each line may be the last
     feed = CsvFeed(recorded, watch.scenario)
     chance, kills, file = random.Random(3), 0, watch.folder / JOURNAL_NAME
@@ -112,14 +112,14 @@ def test_a_kill_at_any_moment_loses_no_turn(watch, recorded, whole, monkeypatch)
 def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
     base, mission, plain, tmp_path, monkeypatch, case, stops, counted
 ):
-    """Also one that learns and gives notice, and is told from turn 10 on of controls that were not flown."""
+    """Also one that learns and gives notice, and is told from step 10 on of controls that were not flown."""
     given, path, tables = load_scenario("level_turns_learning").scenario, tmp_path / "m.csv", {}
     controls = np.where(np.arange(50) < 10, mission.control_index, 1 - mission.control_index)
     if case == "gap":
         rows = plain.read_text().splitlines()
         path.write_text("\n".join([*rows[:11], "what", *rows[21:], ""]))
     else:
-        monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 8)
+        monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_STEPS", 8)
         write_csv(path, mission.observed, controls)
         tables = {"learning": given.learning, "notice": given.notice}
     knowledge = replace(base.models[0].knowledge, scenario=base.scenario.model_copy(update=tables))
@@ -136,23 +136,23 @@ def test_a_watch_that_was_stopped_goes_on_as_if_it_had_never_ended(
         watch.store(counts, last=35, report=False)
         assert figures_of(watch.folder)["blind_steps"] == "15, 16, 17, 18, 19"
         summary = json.loads((watch.folder / "summary.json").read_text())
-        assert summary["control"] == "left 3g for 2g at turn 31"
+        assert summary["control"] == "left 3g for 2g at step 31"
     if case == "learning":
         last = json.loads(last_line(folders[0]))
         assert "young_modulus_factor" in last["learnt"]
         twin = knowledge.twin()
         for row, control in zip(mission.observed, controls.tolist(), strict=True):
-            found = twin.turn(row, control)
+            found = twin.step(row, control)
         assert last["filtered"] == found.filtered.tolist()
 
 
-def test_what_came_behind_the_last_turn_of_a_live_watch_stays_counted(watch, mission):
-    told = {"turn": 0, "control": watch.scenario.control_names[mission.control_index[0]]}
+def test_what_came_behind_the_last_step_of_a_live_watch_stays_counted(watch, mission):
+    told = {"step": 0, "control": watch.scenario.control_names[mission.control_index[0]]}
     line = json.dumps(told | {"strain": mission.observed[0].tolist()}).encode() + b"\n"
     for lines, received in ((3 * line, 3), (b"", 3), (line, 4)):
         counts = ran(watch, json_lines(watch.scenario, io.BytesIO(lines)))
         assert (counts.received, counts.duplicates) == (received, received - 1)
-    assert [decision["turn"] for decision in journalled(watch) if decision] == [0]
+    assert [decision["step"] for decision in journalled(watch) if decision] == [0]
 
 
 def test_another_file_is_read_from_its_beginning(watch, mission, plain, tmp_path):
@@ -195,25 +195,25 @@ def test_what_came_late_stands_in_the_journal_and_is_fed_from_it(base, mission, 
     watch.run(CsvFeed(tmp_path / "late.csv", watch.scenario), told.append)
     assert journalled(watch) == told
     assert watch.last_decision() == told[-1] | {"told_again": True}
-    assert [decision["revised_by_turn"] for decision in told if "revised_by_turn" in decision] == [20, 25]
+    assert [decision["revised_by_step"] for decision in told if "revised_by_step" in decision] == [20, 25]
 
 
 def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_path, monkeypatch):
     """It costs the same however long it is; what is not read is not missed, and what is read is checked."""
-    monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_TURNS", 8)
+    monkeypatch.setattr("twin_master.watch.intake.SNAPSHOT_STEPS", 8)
     monkeypatch.setattr("twin_master.watch.teaching.CHECKED", 1)
     observed, controls = np.tile(mission.observed, (4, 1)), np.tile(mission.control_index, 4)
     feed = CsvFeed(write_csv(tmp_path / "m.csv", observed, controls), watch.scenario)
     file, counts = watch.folder / JOURNAL_NAME, []
-    for turns in (60, 100, 196):  # as many turns behind the last snapshot
-        ran(watch, feed, turns)
+    for steps in (60, 100, 196):  # as many steps behind the last snapshot
+        ran(watch, feed, steps)
         with patch("twin_master.mission.journal.whole_record", wraps=whole_record) as read:
             watch.last_decision()
-            ran(watch, feed, turns)
+            ran(watch, feed, steps)
         counts.append(read.call_count)
     assert counts[0] == counts[1] == counts[2] < 60
     lines = file.read_bytes().splitlines(keepends=True)
-    file.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"turn": 2}', b'"turn": 1}'), *lines[4:]]))
+    file.write_bytes(b"".join([*lines[:3], lines[3].replace(b'"step": 2}', b'"step": 1}'), *lines[4:]]))
     ran(watch, feed, 198)
     with pytest.raises(
         NotResumableError, match=r"line 4 .*damaged.*; 3 before it are whole, and 195 behind it"
@@ -223,9 +223,9 @@ def test_a_watch_is_taken_up_from_the_end_of_its_journal(watch, mission, tmp_pat
     fed = [*FolderFeed(watch.folder, watch.scenario).messages(None)]
     assert "line 4 of journal.jsonl was changed or is damaged" in str(fed.pop(2)[0])
     others = np.delete(np.arange(198), 2)
-    np.testing.assert_array_equal([message.turn for message, _ in fed], others)
+    np.testing.assert_array_equal([message.step for message, _ in fed], others)
     np.testing.assert_array_equal([message.observed for message, _ in fed], observed[others])
-    changed = lines[-2].replace(b'"turn": 1', b'"turn": 2')
+    changed = lines[-2].replace(b'"step": 1', b'"step": 2')
     for wrong, sentence in (
         ([*lines[:3], *lines[4:]], r"line 196 .*lines before it are missing"),
         ([*lines[:-2], changed, lines[-1]], "line 196 .*and 1 behind it"),
@@ -249,23 +249,23 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
         read, write = os.pipe()
         stream = os.fdopen(read, "rb")
         feed: Feed = json_lines(watch.scenario, stream)
-        texts = [json.dumps({"turn": turn, "strain_1": 1e-3}) + "\n" for turn in range(3)]
+        texts = [json.dumps({"step": step, "strain_1": 1e-3}) + "\n" for step in range(3)]
     else:
         header, *texts = plain.read_text().splitlines(keepends=True)[:4]
         path = tmp_path / "m.csv"
         path.write_text(header)
         stream, write = path.open("rb"), os.open(path, os.O_WRONLY | os.O_APPEND)
         feed = CsvFeed(path, watch.scenario, follow=True)
-    watching = threading.Thread(target=watch.run, args=(feed, told.append), kwargs={"turns": 3})
+    watching = threading.Thread(target=watch.run, args=(feed, told.append), kwargs={"steps": 3})
     watching.start()
 
     def kinds(count: int) -> list[tuple[int, list[str]]]:
         wait_until(lambda: len(told) >= count)
-        return [(said["turn"], [notice["kind"] for notice in said["notices"]]) for said in told]
+        return [(said["step"], [notice["kind"] for notice in said["notices"]]) for said in told]
 
     def refused_message_is_sent() -> bool:
-        """Send one, which is no turn; return whether the silence was told."""
-        os.write(write, b'{"turn": 0, "no_sensor": 1.0}\n')
+        """Send one, which is no step; return whether the silence was told."""
+        os.write(write, b'{"step": 0, "no_sensor": 1.0}\n')
         return any(notice["kind"] == "quiet" for said in told for notice in said["notices"])
 
     if source == "standard input":
@@ -289,24 +289,24 @@ def test_silence_is_told_and_journalled(watch, plain, tmp_path, source):
     assert journalled(watch)[-len(told) :] == told
     assert ran(watch, CsvFeed(plain, watch.scenario))
     shown = viewed(watch.folder).seen(0, 4)  # as the page shows it
-    seen = [[notice["kind"] for notice in turn.get("notices", ())] for turn in shown]
+    seen = [[notice["kind"] for notice in step.get("notices", ())] for step in shown]
     expected = [["heard", "quiet", "quiet"], ["heard", "quiet"], ["heard"], []]
-    if source == "standard input":  # the recording contradicts the first three turns
+    if source == "standard input":  # the recording contradicts the first three steps
         expected = [["taken", "heard", "refused", "quiet", "quiet"], ["heard", "quiet"]]
         expected += [["heard", "refused"], ["taken"]]
     assert seen == expected
-    assert [turn for turn, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
+    assert [step for step, notice in watch.told(0) if notice.kind == "quiet"] == [0, 0, 1]
 
 
 def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_path, monkeypatch):
     rows = mission.observed[:4].tolist()
-    lines = [json.dumps({"turn": turn, "strain": row}) + "\n" for turn, row in enumerate(rows)]
+    lines = [json.dumps({"step": step, "strain": row}) + "\n" for step, row in enumerate(rows)]
     line = [sys.executable, "-m", "uav_twin", "watch", str(scenario.path), "--no-report"]
     out, pipe = ["--out", str(tmp_path / "watch")], subprocess.PIPE
     with subprocess.Popen([*line, *out], stdin=pipe, stdout=pipe, stderr=pipe, text=True) as process:
         process.stdin.write("".join(lines[:2]))
         process.stdin.flush()
-        assert json.loads(process.stdout.readline())["turn"] == 0
+        assert json.loads(process.stdout.readline())["step"] == 0
         process.stdout.close()  # as head does
         process.stdin.write("".join(lines[2:]))
         process.stdin.flush()
@@ -318,20 +318,20 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_pat
     for again in (0, 1):
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO()))
         told = [json.loads(row) for row in said("watch", "--resume", *out, "--no-report").splitlines()]
-        assert [(decision["told_again"], decision["turn"] > 0) for decision in told] == [(True, True)] * again
+        assert [(decision["told_again"], decision["step"] > 0) for decision in told] == [(True, True)] * again
         (tmp_path / "watch" / "summary.json").unlink()
 
 
 def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
-    """The gauge that comes loose at turn 10, and the skin that softens from turn 25 on."""
+    """The gauge that comes loose at step 10, and the skin that softens from step 25 on."""
     monkeypatch.setattr(Watch, "store", lambda *_arguments, **_options: None)
     folder = tmp_path / "a b"
     done = command("watch", "watched_wing", "--out", folder, "--pace", "0.001")
     assert done.returncode == 0, done.stderr
     decisions = [json.loads(line) for line in done.stdout.splitlines()]
-    assert [decision["turn"] for decision in decisions] == list(range(60))
-    notices = [(d["turn"], notice) for d in decisions for notice in d["notices"]]
-    (first, gauge), (second, none) = ((turn, said) for turn, said in notices if said["kind"] == "alarm")
+    assert [decision["step"] for decision in decisions] == list(range(60))
+    notices = [(d["step"], notice) for d in decisions for notice in d["notices"]]
+    (first, gauge), (second, none) = ((step, said) for step, said in notices if said["kind"] == "alarm")
     assert [said["sensors"] for _, said in notices if said["kind"] == "hypothesis"] == [[4], []]
     assert decisions[24]["decided_by"] == "gauge 4 off"
     assert (decisions[-1]["decided_by"], decisions[-1]["next_control"]) == ("none of these", "2g")
@@ -339,15 +339,15 @@ def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     assert gauge["sensors"] == [4]
     assert abs(gauge["since"] - 10) <= 2
     assert "gauge 4 shows too little, " in gauge["sentence"]
-    assert f"--from-run '{folder}' --from-turn {gauge['since']}\n" in done.stderr
+    assert f"--from-run '{folder}' --from-step {gauge['since']}\n" in done.stderr
     assert "no state of the model explains all gauges" in none["sentence"]
     assert decisions[24]["none_of_these"] < 0.5
     assert decisions[-1]["none_of_these"] > 0.999
     again = command("watch", "--resume", "--out", folder)  # nothing is read
     told = [json.loads(line) for line in again.stdout.splitlines()]
-    assert [(decision["turn"], decision["told_again"]) for decision in told] == [(59, True)]
+    assert [(decision["step"], decision["told_again"]) for decision in told] == [(59, True)]
     assert "60 messages." in again.stderr
-    line = r"turn 59: 3g, no state is believed; next 2g with .*; by none of these \(1\.00\)"
+    line = r"step 59: 3g, no state is believed; next 2g with .*; by none of these \(1\.00\)"
     assert re.search(line, seen("watch", "--resume", "--out", folder))  # as people read it
 
 
@@ -358,7 +358,7 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
 
     def decide(decision: Mapping[str, object]) -> None:
         decisions.append(dict(decision))
-        if decision["turn"] == 7:
+        if decision["step"] == 7:
             before = (folder / JOURNAL_NAME).read_bytes()
             with pytest.raises(RunFolderError, match=r"holds no run\.nc"):
                 stored_run(folder)
@@ -367,7 +367,7 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
 
     with pytest.raises(RunFolderError, match=r"holds no run\.nc"):
         uav_twin.open_run(folder)
-    uav_twin.watch(scenario, recorded, folder, decide=decide, turns=20, report=False)
+    uav_twin.watch(scenario, recorded, folder, decide=decide, steps=20, report=False)
     np.testing.assert_array_equal(opened[0], mission.filtered[:8])
     with pytest.raises(Exception, match=r"this scenario has no `\[asset\]`"):
         uav_twin.fly(scenario, tmp_path / "none")
@@ -376,7 +376,7 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     assert not (tmp_path / "none").exists()
     slip, out = tmp_path / "slip.csv", tmp_path / "slip"
     slip.write_text(edited(recorded.read_text(), ("strain_24", "strian_24")))
-    passed = uav_twin.watch(scenario, slip, out, allow_unknown=True, turns=2, report=False)
+    passed = uav_twin.watch(scenario, slip, out, allow_unknown=True, steps=2, report=False)
     assert [line["lost_sensors"] for line in journalled(base, passed)] == [1, 1]
     with pytest.raises(RunFolderError, match="holds a run already"):
         uav_twin.watch(scenario, recorded, folder)
@@ -386,10 +386,10 @@ def test_a_watch_that_goes_on_is_opened_and_taken_up_from_python(
     assert len(journal(passed)) == 2
     with pytest.raises(MissionInputError, match="give nothing beside --resume"):
         uav_twin.watch(None, recorded, folder, {"seed": 3}, resume=True)
-    uav_twin.watch(None, recorded, folder, decide=decide, resume=True, turns=30, report=False)
+    uav_twin.watch(None, recorded, folder, decide=decide, resume=True, steps=30, report=False)
     (folder / "summary.json").unlink()  # as a kill before the end leaves it
     uav_twin.watch(None, recorded, folder, decide=decide, resume=True, last=10, report=False)
-    assert [decision["turn"] for decision in decisions if decision.get("told_again")] == [29]
+    assert [decision["step"] for decision in decisions if decision.get("told_again")] == [29]
     assert [decision for decision in decisions if not decision.get("told_again")] == journalled(base, whole)
     run = uav_twin.open_run(folder)
     np.testing.assert_array_equal(run["filtered"]["step"].values, np.arange(40, 50))

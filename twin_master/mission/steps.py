@@ -1,4 +1,4 @@
-"""A turn, from its observation to its decision; and what really happens: damage, noise, faults, the asset."""
+"""A step, from its observation to its decision; and what really happens: damage, noise, faults, the asset."""
 
 from collections.abc import Mapping, Sequence
 from copy import copy
@@ -17,13 +17,13 @@ from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.errors import MissionInputError, TwinMasterError, said
 from twin_master.network.estimator import Notice, Suspicion
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.twin import Twin, TwinTurn
+from twin_master.network.twin import Twin, TwinStep
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
 
 class Happened(NamedTuple):
-    """What really happened in a turn, for store and journal; never for the twin.
+    """What really happened in a step, for store and journal; never for the twin.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class Reading:
     control : int or None
         Index of the control in force; None is the one that was proposed.
     revises : int or None
-        The earlier turn that it belongs to; None is the next turn.
+        The earlier step that it belongs to; None is the next step.
     unreadable : dict of int to str
         What came in the place of a reading, by the index of the sensor.
     happened : Happened or None
@@ -66,37 +66,37 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Turn:
-    """A turn.
+class MissionStep:
+    """A step.
 
     Attributes
     ----------
     reading : Reading
         What came.
-    concluded : TwinTurn
+    concluded : TwinStep
         What the twin made of it.
     seconds : tuple of float
         On the clock: of the source, of the twin, and of those that kept it.
     """
 
     reading: Reading
-    concluded: TwinTurn
+    concluded: TwinStep
     seconds: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class _Column:
-    """What the turns say under a name, as an array with a leading axis of the turns."""
+    """What the steps say under a name, as an array with a leading axis of the steps."""
 
     def __init__(self, name: str) -> None:
         self._of = attrgetter(name)
 
     def __get__(self, history: "History", _owner: type) -> NDArray[Any]:
-        return np.array([self._of(turn) for turn in history.turns])
+        return np.array([self._of(step) for step in history.steps])
 
 
 @dataclass
 class History:
-    """The turns of one twin, T of them, in their order.
+    """The steps of one twin, T of them, in their order.
 
     Attributes
     ----------
@@ -104,26 +104,26 @@ class History:
         It has kept all of them where they are to be smoothed.
     sensors : int
         Values of a row that are observed; behind them stand readings of inspections, or a covariance.
-    turns : list of Turn
+    steps : list of MissionStep
     notices : list of (int, Notice)
-        What the operator was told, and in which turn.
+        What the operator was told, and in which step.
     resumed_at : int
-        Turns that an earlier process flew.
+        Steps that an earlier process flew.
     ended : str
-        How the asset ended the mission before its last turn; empty where it did not.
+        How the asset ended the mission before its last step; empty where it did not.
     row : (T, G + I)
         All that came; `observed` and `readings` are its two parts, NaN where nothing was received.
     control_index, log_evidence, filtered, predicted, decision_probability, unexplained : (T, ...)
-        As in `TwinTurn`.
+        As in `TwinStep`.
     state, observation : (T, ...)
         As in `Happened`; of a simulated asset only.
     seconds : (T, 3)
-        As in `Turn`.
+        As in `MissionStep`.
     """
 
     twin: Twin
     sensors: int
-    turns: list[Turn] = field(default_factory=list)
+    steps: list[MissionStep] = field(default_factory=list)
     notices: list[tuple[int, Notice]] = field(default_factory=list)
     resumed_at: int = 0
     ended: str = ""
@@ -139,20 +139,20 @@ class History:
     observation = _Column("reading.happened.observation")
     seconds = _Column("seconds")
 
-    def add(self, turn: Turn) -> None:
-        """Take in a turn, without what follows from the rest of it."""
-        prediction = replace(turn.concluded.prediction, joint=np.empty(0))
-        self.turns.append(replace(turn, concluded=replace(turn.concluded, prediction=prediction)))
-        self.notices += [(turn.concluded.turn, notice) for notice in turn.concluded.notices]
+    def add(self, step: MissionStep) -> None:
+        """Take in a step, without what follows from the rest of it."""
+        prediction = replace(step.concluded.prediction, joint=np.empty(0))
+        self.steps.append(replace(step, concluded=replace(step.concluded, prediction=prediction)))
+        self.notices += [(step.concluded.step, notice) for notice in step.concluded.notices]
 
     def behind(self, skipped: int) -> "History":
-        """Return the turns behind the first `skipped`; the notices stay those of all."""
-        return replace(self, turns=self.turns[skipped:])
+        """Return the steps behind the first `skipped`; the notices stay those of all."""
+        return replace(self, steps=self.steps[skipped:])
 
     @property
-    def first_turn(self) -> int:
-        """Number of the first turn."""
-        return self.turns[0].concluded.turn if self.turns else 0
+    def first_step(self) -> int:
+        """Number of the first step."""
+        return self.steps[0].concluded.step if self.steps else 0
 
     @property
     def observed(self) -> Float:
@@ -167,35 +167,35 @@ class History:
     @property
     def simulated(self) -> bool:
         """Whether it is known what really happened."""
-        return bool(self.turns) and self.turns[0].reading.happened is not None
+        return bool(self.steps) and self.steps[0].reading.happened is not None
 
     @property
     def monitors(self) -> dict[str, Float]:
         """Figures that the asset reported of itself (T,)."""
-        told = [turn.reading.happened.monitors for turn in self.turns if turn.reading.happened is not None]
+        told = [step.reading.happened.monitors for step in self.steps if step.reading.happened is not None]
         return {name: np.array([monitors[name] for monitors in told]) for name in (told[-1] if told else ())}
 
     @cached_property
     def smoothed(self) -> Float:
         """p(D_k | all observations) (T, S)."""
-        return self.twin.smoothed()[-len(self.turns) :]
+        return self.twin.smoothed()[-len(self.steps) :]
 
     @property
     def suspicion(self) -> tuple[Suspicion, ...]:
         """How well the model explained the sensors, where that is watched."""
-        found = (turn.concluded.suspicion for turn in self.turns)
+        found = (step.concluded.suspicion for step in self.steps)
         return tuple(suspicion for suspicion in found if suspicion is not None)
 
     @property
     def learnt_names(self) -> tuple[str, ...]:
         """What is learnt."""
-        return tuple(self.turns[-1].concluded.learnt) if self.turns else ()
+        return tuple(self.steps[-1].concluded.learnt) if self.steps else ()
 
     @property
     def learnt(self) -> Float:
         """The figures of each posterior (T, N, 4)."""
-        figures = [[one.figures for one in turn.concluded.learnt.values()] for turn in self.turns]
-        return np.array(figures).reshape(len(self.turns), len(self.learnt_names), 4)
+        figures = [[one.figures for one in step.concluded.learnt.values()] for step in self.steps]
+        return np.array(figures).reshape(len(self.steps), len(self.learnt_names), 4)
 
 
 class SensorStatus(IntEnum):
@@ -374,9 +374,9 @@ class Plant:
     Attributes
     ----------
     step : int
-        Turns flown.
+        Steps flown.
     ended : str
-        How the asset ended the mission before its last turn; empty where it did not.
+        How the asset ended the mission before its last step; empty where it did not.
     """
 
     def __init__(self, scenario: Scenario, truth: Truth, asset: Asset) -> None:
@@ -385,17 +385,17 @@ class Plant:
         self.step, self.ended = 0, ""
 
     def read(self, twin: Twin) -> Reading | None:
-        """Return what comes of the next turn, see `Source`; None at the end of the mission."""
-        if twin.turns == self._scenario.mission.steps:
+        """Return what comes of the next step, see `Source`; None at the end of the mission."""
+        if twin.steps == self._scenario.mission.steps:
             return None
-        before = twin.control_of(twin.turns - 1) if twin.turns else None
+        before = twin.control_of(twin.steps - 1) if twin.steps else None
         if before is not None and self._scenario.ends(before):
             self.ended = decided_to_end(self._scenario, before)
             return None
         try:
-            return self.turn(twin.proposed_control, before)
+            return self.fly_step(twin.proposed_control, before)
         except FmuEndedError as error:
-            if not twin.turns:
+            if not twin.steps:
                 raise
             self.ended = error.sentence
             return None
@@ -404,15 +404,15 @@ class Plant:
         """Refuse to go on: what is simulated was observed, whatever the twin believes."""
         raise error
 
-    def turn(self, control_index: int, previous_control_index: int | None) -> Reading:
-        """Fly one turn.
+    def fly_step(self, control_index: int, previous_control_index: int | None) -> Reading:
+        """Fly one step.
 
         Parameters
         ----------
         control_index
             Control in force.
         previous_control_index
-            Control of the turn before; None in the first one.
+            Control of the step before; None in the first one.
 
         Raises
         ------
@@ -442,6 +442,6 @@ class Plant:
         return self._asset.save_state()
 
     def restore(self, flown: History, asset_state: bytes) -> None:
-        """Continue behind turns that were flown, and from a saved state of the asset."""
-        self.step, self._state = len(flown.turns), flown.state[-1]
+        """Continue behind steps that were flown, and from a saved state of the asset."""
+        self.step, self._state = len(flown.steps), flown.state[-1]
         self._asset.restore_state(asset_state)

@@ -1,0 +1,197 @@
+"""Derivatives of a trial with respect to its nuisances, and of its prediction to all unknowns."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray, IntArray
+
+from .candidate import (
+    PARAMETER_STEP,
+    SHARED_STEP,
+    Candidate,
+    TrialDerivatives,
+    with_step,
+)
+from .trial_data import GlobalUnknowns, TrialData
+
+
+def nuisance_derivatives(
+    data: TrialData,
+    shared_unknowns: GlobalUnknowns,
+    shared: FloatArray,
+    local: FloatArray,
+    respond: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray | None]],
+) -> tuple[FloatArray, FloatArray]:
+    """Return the derivatives of a trial's response with respect to its nuisances.
+
+    Parameters
+    ----------
+    data : TrialData
+        The trial and its unknowns.
+    shared_unknowns : GlobalUnknowns
+        The layout of the shared unknowns.
+    shared, local : (Q,), (L,) array
+        The scaled shared unknowns, and those of the trial.
+    respond : callable
+        Returns response (N, C) and its time derivative (or None) at shared and local unknowns.
+
+    Returns
+    -------
+    parameters : (P, N, C) array
+        The derivatives with respect to the calibrated parameters.
+    local : (I, N, C) array
+        The derivatives with respect to the unknowns of the trial except its zeros.
+    """
+    unknowns = data.unknowns
+    response, rates = respond(shared, local)
+
+    def slope(
+        shared_values: FloatArray, local_values: FloatArray, step: float = PARAMETER_STEP
+    ) -> FloatArray:
+        stepped, _ = respond(shared_values, local_values)
+        return (stepped - response) / step
+
+    # calibrated parameters: inwards from the upper end of a range
+    _, high = shared_unknowns.ends
+    is_at_end = shared + SHARED_STEP > high
+    steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: shared_unknowns.count]
+    parameters = [
+        slope(with_step(shared, k, step), local, step) for k, step in enumerate(steps.tolist())
+    ]
+    # initial state and constants of inputs
+    zeros_end, _, inputs_end, time_zero_end = unknowns.ends
+    columns = [slope(shared, with_step(local, k)) for k in range(zeros_end, inputs_end)]
+    if unknowns.has_time_zero:
+        if rates is None:
+            columns.append(slope(shared, with_step(local, inputs_end)))
+        else:
+            columns.append(rates * unknowns.scale[inputs_end])
+    # health
+    if len(unknowns.health_rows):
+        columns.extend(
+            _health_derivatives(data, local, time_zero_end, response.shape, partial(slope, shared))
+        )
+    shape = (-1, *response.shape)
+    return np.array(parameters).reshape(shape), np.array(columns).reshape(shape)
+
+
+def _health_derivatives(
+    data: TrialData,
+    local: FloatArray,
+    first: int,
+    shape: tuple[int, ...],
+    slope: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Return the derivatives (H, N, C) of a response with respect to the uncertain health entries.
+
+    The health of a static trial has a row for each reading, and a row changes its own reading only.
+    So all entries of a region are stepped at once, and each takes its own row of the difference.
+
+    Parameters
+    ----------
+    data : TrialData
+        The trial and its unknowns.
+    local : (L,) array
+        The scaled unknowns of the trial.
+    first : int
+        The index of the first health entry among them.
+    shape : tuple of int
+        The shape (N, C) of the response.
+    slope : callable
+        Returns the difference quotient (N, C) to other unknowns of the trial (L,), for a positive
+        step.
+    """
+    unknowns = data.unknowns
+    derivatives = np.zeros((len(unknowns.health_rows), *shape))
+    for region in range(data.trial.health.shape[1]):
+        entries = np.flatnonzero(unknowns.health_columns == region)
+        if not len(entries):
+            continue
+        stepped = local.copy()
+        # away from the limits of the stiffness loss
+        sign = np.where(stepped[first + entries] > 0.0, -1.0, 1.0)
+        stepped[first + entries] += sign * PARAMETER_STEP
+        change = slope(stepped)
+        if data.trial.is_dynamic:
+            derivatives[entries] = sign[:, np.newaxis, np.newaxis] * change
+        else:
+            rows = unknowns.health_rows[entries]
+            derivatives[entries, rows] = sign[:, np.newaxis] * change[rows]
+    return derivatives
+
+
+def prediction_derivatives(
+    data: TrialData,
+    shared_unknowns: GlobalUnknowns,
+    shared: FloatArray,
+    derivatives: TrialDerivatives,
+    candidate: Candidate,
+) -> tuple[FloatArray, IntArray]:
+    """Return the derivatives of a trial's prediction.
+
+    Those of the response, with gains and zeros.
+
+    Parameters
+    ----------
+    data : TrialData
+        The trial and its unknowns.
+    shared_unknowns : GlobalUnknowns
+        The layout of the shared unknowns.
+    shared : (Q,) array
+        The scaled shared unknowns.
+    derivatives : TrialDerivatives
+        The response and its derivatives.
+    candidate : Candidate
+        The effects whose parameters are unknowns.
+
+    Returns
+    -------
+    columns : (L + K, N, C) array
+        The derivatives with respect to the L unknowns of the trial, and to the K shared
+        unknowns and effect parameters that act on it [unit of the channel].
+    index : (K,) array of int
+        The indices of these K, among the Q shared unknowns and the effect parameters after
+        them.
+    """
+    unknowns = data.unknowns
+    channels = data.trial.channels
+    response = derivatives.response
+    gains = 1.0 + shared_unknowns.gains(shared, channels)
+    # zeros of the channels
+    by_zeros = np.zeros((unknowns.zeros, *response.shape))
+    zero_scale = unknowns.scale[: unknowns.zeros, np.newaxis]
+    by_zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = zero_scale
+    # gains of the channels
+    gain_numbers = np.array(
+        [k for k, name in enumerate(shared_unknowns.gain_channels) if name in channels], dtype=int
+    )
+    gain_columns = [channels.index(shared_unknowns.gain_channels[k]) for k in gain_numbers]
+    by_gains = np.zeros((len(gain_numbers), *response.shape))
+    gain_scale = shared_unknowns.scale[shared_unknowns.count + gain_numbers]
+    by_gains[np.arange(len(gain_numbers)), :, gain_columns] = (
+        response[:, gain_columns] * gain_scale
+    ).T
+    # parameters of the effects that act on such trials
+    kind = data.trial.kind
+    effect_numbers = np.array(
+        [k for k in range(candidate.size) if kind in candidate.acts_on_with(k)], dtype=int
+    )
+    columns = np.concatenate(
+        (
+            by_zeros,
+            derivatives.local * gains,
+            derivatives.parameters * gains,
+            by_gains,
+            derivatives.effect[effect_numbers] * gains,
+        )
+    )
+    index = np.concatenate(
+        (
+            np.arange(shared_unknowns.count),
+            shared_unknowns.count + gain_numbers,
+            shared_unknowns.size + effect_numbers,
+        )
+    )
+    return columns, index

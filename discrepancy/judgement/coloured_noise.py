@@ -1,0 +1,103 @@
+"""Verdicts where a fit leaves noise of the colour that its records have, and nothing else."""
+
+from dataclasses import replace
+
+from discrepancy.fits.fitting import CandidateFit
+from discrepancy.fits.gates import check_absolute_fit
+from discrepancy.fits.problem import Problem
+from discrepancy.search_settings import SEARCH
+from discrepancy.verdict import Gate, RemainderEstimate, VerdictKind
+
+from .conclusion import (
+    Conclusion,
+    VerdictOutcome,
+    below_limit_sentence,
+)
+from .consistency_gate import check_consistency
+from .proof import check_held_out
+from .simulation_comparison import SimulationComparison
+
+
+def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOutcome | None:
+    """Return the verdict where a fit leaves noise of the colour of its records, and nothing else.
+
+    None where no hypothesis does.
+    """
+    problem = comparison.problem
+    search = comparison.search
+    best = search.best()
+    no_effect = search.compared_no_effect
+    probabilities = search.set_probabilities()
+    conclusion = Conclusion.from_probabilities(search, best, probabilities)
+    no_effect_gate = check_absolute_fit(problem, no_effect)
+    probability_of_none = probabilities.get((), 0.0)
+    is_possible = probability_of_none > 1.0 - SEARCH.sure
+    if is_possible and no_effect_gate.passed is not False and _leaves_recorded_colour(no_effect):
+        return _nothing_under_coloured_noise(
+            conclusion, no_effect, no_effect_gate, probability_of_none
+        )
+    if not best.candidate.terms or best.candidate.is_family or not _leaves_recorded_colour(best):
+        return None
+    probability = comparison.probability(best)
+    held_out_residuals = comparison.residuals(replace(best, residual_process=None))
+    gates = (
+        check_absolute_fit(problem, best),
+        check_consistency(problem, best),
+        check_held_out(held_out_residuals),
+    )
+    if probability < SEARCH.sure or any(gate.passed is False for gate in gates):
+        return None
+    return conclusion.named(best, probability, gates, remainder_estimates(problem, best))
+
+
+def _nothing_under_coloured_noise(
+    conclusion: Conclusion, no_effect: CandidateFit, gate: Gate, probability_of_none: float
+) -> VerdictOutcome:
+    """Return the verdict that nothing is missing under coloured noise, or too little to tell."""
+    remainders = remainder_estimates(conclusion.search.problem, no_effect)
+    if probability_of_none >= SEARCH.unsure:
+        return conclusion.outcome(
+            VerdictKind.NOTHING_MISSING,
+            "The model explains the data within their noise, which is coloured as its records "
+            "admit.",
+            probability_of_none,
+            no_effect,
+            gates=(gate,),
+            remainders=remainders,
+        )
+    hints = []
+    for name, probability in conclusion.inclusion.items():
+        if probability > 1.0 - SEARCH.sure:
+            hints.append(name)
+    hints.sort()
+    total = min(probability_of_none + sum(conclusion.inclusion[name] for name in hints), 1.0)
+    return conclusion.outcome(
+        VerdictKind.BELOW_LIMIT,
+        below_limit_sentence(hints, " that is coloured"),
+        total,
+        no_effect,
+        group=tuple(hints),
+        gates=(gate,),
+        remainders=remainders,
+    )
+
+
+def _leaves_recorded_colour(fit: CandidateFit) -> bool:
+    """Return whether a fit leaves noise of the colour of its records, and nothing else."""
+    process = fit.residual_process
+    return process is not None and process.is_all_recorded_colour
+
+
+def remainder_estimates(problem: Problem, fit: CandidateFit) -> tuple[RemainderEstimate, ...]:
+    """Return what a fit leaves beside the noise, for each channel with such a residual process."""
+    process = fit.residual_process
+    if process is None:
+        return ()
+    estimates = []
+    for channel, name in enumerate(problem.channel_names):
+        amplitude = float(process.amplitude[channel])
+        if amplitude > 0.0:
+            correlation_time = float(process.correlation_time[channel])
+            frequency = float(process.frequency[channel])
+            estimates.append(RemainderEstimate(name, amplitude, correlation_time, frequency))
+    return tuple(estimates)

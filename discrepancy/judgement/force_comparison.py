@@ -1,0 +1,123 @@
+"""Comparison of hypotheses by how they follow the missing force."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.errors import DiscrepancyError
+from discrepancy.fits.candidate import Candidate, Point
+from discrepancy.fits.fitting import CandidateFit, fit
+from discrepancy.fits.gates import check_absolute_fit
+from discrepancy.missing_force.explained import ForceHypothesis
+from discrepancy.missing_force.gap_share import GapShare
+from discrepancy.missing_force.naming import ForceSearch
+from discrepancy.missing_force.port_force import missing_force
+from discrepancy.missing_force.shares import ForceShares
+from discrepancy.search.strategy import Search
+from discrepancy.search_settings import SEARCH
+from discrepancy.verdict import Gate
+
+from .comparison import Comparison
+
+
+class ForceComparison(Comparison[ForceHypothesis]):
+    """Hypotheses compared by how they follow the missing force.
+
+    Parameters
+    ----------
+    search : Search
+        The search whose hypotheses they are.
+    force_search : ForceSearch
+        The search for the missing force.
+    """
+
+    least_low_end = SEARCH.least_end
+
+    def __init__(self, search: Search, force_search: ForceSearch) -> None:
+        super().__init__(search)
+        self.force_search = force_search
+        self._force_shares = ForceShares(force_search)
+        self.has_held_out = self._force_shares.has_held_out
+
+    @property
+    def no_effect(self) -> ForceHypothesis:
+        """The missing forces alone."""
+        return self.force_search.whole
+
+    @property
+    def ranked(self) -> Sequence[ForceHypothesis]:
+        """All hypotheses, the most probable first."""
+        return self.search.force_hypotheses
+
+    def _gap_share(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
+        """Return the share of the missing force that a hypothesis explains."""
+        return self._force_shares.share_of(hypothesis, held_out=held_out)
+
+    def fit_followed(self, candidate: Candidate, effect: FloatArray) -> ForceHypothesis | None:
+        """Return a further hypothesis, begun at scaled effect parameters (E,).
+
+        None if it cannot be fitted.
+        """
+        return self.force_search.followed(self.force_search.whole, candidate, effect)
+
+    def with_free_shape(self, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
+        """Return a hypothesis of one law with its shape free, if that was compared."""
+        (term,) = hypothesis.candidate.terms
+        key = Candidate((replace(term, free_shape=True),)).key
+        return next((other for other in self.ranked if other.candidate.key == key), None)
+
+    def start_point(self, hypothesis: ForceHypothesis) -> Point:
+        """Return the point of a hypothesis along the missing force."""
+        return self.force_search.whole_point(hypothesis)
+
+    def failed_check(self, hypothesis: ForceHypothesis) -> str:
+        """Return an empty reason: there are no further tests along the missing force."""
+        return ""
+
+    def check_fit(self, hypothesis: ForceHypothesis) -> Gate:
+        """Test whether the best simulation leaves noise alone."""
+        return check_absolute_fit(self.problem, self.search.best())
+
+    def _simulation(self, hypothesis: ForceHypothesis) -> CandidateFit:
+        """Return the simulation of a hypothesis at its values, with their covariance.
+
+        It is the fit without effect if the hypothesis cannot be simulated.
+        """
+        start = self.start_point(hypothesis)
+        try:
+            simulation = fit(self.problem, hypothesis.candidate, start, local_only=True)
+        except (DiscrepancyError, np.linalg.LinAlgError):
+            return self.search.no_effect
+        return replace(simulation, covariance=hypothesis.covariance)
+
+    def remaining_text(self, hypothesis: ForceHypothesis, share: GapShare) -> str:
+        """Return in words how much a hypothesis leaves of the missing force."""
+        unit = self._force_unit(hypothesis)
+        return (
+            f"{share.remaining_rms:.3g} of {share.total_rms:.3g} {unit} (rms) of the missing force"
+        )
+
+    def _force_unit(self, hypothesis: ForceHypothesis) -> str:
+        """Return the unit of the force at a hypothesis's port, or else of the missing force."""
+        ports = self.force_search.ports
+        law_ports = [term.place for term in hypothesis.candidate.terms if term.place in ports]
+        port = law_ports[0] if law_ports else ports[next(iter(hypothesis.processes))]
+        force_unit, *_ = self.problem.model.port_units(port)
+        return force_unit
+
+    def gap_sentence(self) -> str:
+        """Return a sentence on the missing force: size, port, and the variables that order it."""
+        missing = missing_force(self.force_search, self.force_search.best())
+        if missing is None:
+            return ""
+        force = missing.at_port
+        order = "ordered by none of displacement, velocity, amplitude and time"
+        if force.ordered_by:
+            variables = " and ".join(force.ordered_by)
+            percent = 100.0 * max(force.orders.values())
+            order = f"ordered by {variables} ({percent:.0f} % of its variance)"
+        return (
+            f"A force of {force.rms:.3g} {force.unit} (rms) is missing at {force.port!r}, {order}."
+        )

@@ -1,0 +1,203 @@
+"""Comparison of hypotheses by their simulations, under the noise that the best of them leaves."""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from discrepancy.campaign.records import FloatArray
+from discrepancy.fits.candidate import Candidate, CandidateKey, Point
+from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
+from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit
+from discrepancy.location.residuals import FittedTrial
+from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
+from discrepancy.missing_force.shares import SHORTEST, WINDOWS
+from discrepancy.search.starts import are_related
+from discrepancy.search.strategy import Search
+from discrepancy.search.wide_noise import refit_under_wide_noise, unrecorded_noise_levels
+from discrepancy.search_settings import SEARCH
+from discrepancy.verdict import Gate
+
+from .comparison import Comparison
+from .consistency_gate import check_consistency
+from .proof import check_held_out
+
+
+class SimulationComparison(Comparison[CandidateFit]):
+    """Hypotheses compared by simulations, fitted under the noise that the best of them leaves."""
+
+    least_low_end = SEARCH.least_share
+
+    def __init__(self, search: Search) -> None:
+        super().__init__(search)
+        self._free_shape_fits: dict[CandidateKey, CandidateFit] = {}
+
+    @property
+    def no_effect(self) -> CandidateFit:
+        """The model without an effect, under the wider noise."""
+        return self.search.compared_no_effect
+
+    @property
+    def ranked(self) -> Sequence[CandidateFit]:
+        """All hypotheses, the most probable first."""
+        return sorted(self.search.compared_fits().values(), key=lambda fit: -self.search.score(fit))
+
+    def gap_sentence(self) -> str:
+        """Return an empty sentence: simulations do not show what the gap is."""
+        return ""
+
+    @cached_property
+    def _noise_scale(self) -> dict[str, float]:
+        """The noise deviation by channel, relative to that of residual sets.
+
+        Without a noise record that of residual sets is all that the model without effect leaves.
+        """
+        problem = self.problem
+        has_record = problem.freedom > 0.0
+        precisions = problem.precisions(self.search.no_effect.sums)
+        levels = np.where(
+            has_record, 1.0, precisions * unrecorded_noise_levels(problem, self.search.best())
+        )
+        return dict(zip(problem.channel_names, np.sqrt(levels).tolist(), strict=True))
+
+    def _gap_share(self, hypothesis: CandidateFit, *, held_out: bool) -> GapShare:
+        """Return the share of the gap between readings and simulation that is explained."""
+        blocks = []
+        trial_count = 0
+        without_effect = self.residuals(self.search.no_effect).trials
+        with_effect = self.residuals(hypothesis).trials
+        for before, after in zip(
+            _in_role(without_effect, held_out=held_out),
+            _in_role(with_effect, held_out=held_out),
+            strict=True,
+        ):
+            noise = before.noise_deviation * [
+                self._noise_scale[name] for name in before.trial.channels
+            ]
+            squares_before = np.where(before.used, before.residual / noise, 0.0) ** 2
+            squares_after = np.where(after.used, after.residual / noise, 0.0) ** 2
+            sample_count = len(before.used)
+            block_count = 1
+            if before.trial.is_dynamic:
+                block_count = min(WINDOWS, max(1, sample_count // SHORTEST))
+            for block in np.array_split(np.arange(sample_count), block_count):
+                sums = [
+                    float(squares[block].sum())
+                    for squares in (squares_before, squares_after, before.used)
+                ]
+                blocks.append(sums)
+            trial_count += 1
+        sums_before, sums_after, noise_sums = np.array(blocks).T
+        return GapShare(
+            before=sums_before,
+            after=sums_after,
+            noise=noise_sums,
+            held_out=held_out,
+            trial_count=trial_count,
+            remaining_rms=_rms_beyond_noise(sums_after, noise_sums),
+            total_rms=_rms_beyond_noise(sums_before, noise_sums),
+            kind=OF_READINGS,
+            tested=True,
+        )
+
+    def fit_followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
+        """Return a further hypothesis, begun at scaled effect parameters (E,).
+
+        None if it cannot be fitted.
+        """
+        no_effect = self.search.no_effect
+        fitted = self.search.exact_fits.get(candidate.key)
+        if fitted is None:
+            start = Point(no_effect.point.shared, no_effect.point.local, effect)
+            fitted = attempt(self.problem, candidate, start)
+        return None if fitted is None else self._under_wide_noise(fitted)
+
+    def _under_wide_noise(self, fitted: CandidateFit) -> CandidateFit | None:
+        """Return a fit under the wider noise by which hypotheses are compared."""
+        wide_problem = self.search.wide_problem or self.problem
+        return refit_under_wide_noise(self.problem, wide_problem, fitted)
+
+    def add_families(self) -> None:
+        """Compare the best law, and those easily taken for it, with free shapes too.
+
+        A free shape is compared only where the best hypothesis is a single law, and only if its
+        evidence is clearly above that of the law.
+        """
+        best = self.search.best()
+        if len(best.candidate.terms) != 1 or not self.acts_on_structure(best.candidate.terms[0]):
+            return
+        compared = dict(self.search.wide_fits)
+        for single in self._related_single_laws(best):
+            free = fit_free_shape(self.problem, single, 0)
+            wide_free = None if free is None else self._under_wide_noise(free)
+            if wide_free is None:
+                continue
+            self._free_shape_fits[single.candidate.key] = wide_free
+            if wide_free.log_evidence > best.log_evidence + SHAPE_GAIN:
+                compared[wide_free.candidate.key] = wide_free
+        self.search.wide_fits = compared
+
+    def _related_single_laws(self, best: CandidateFit) -> list[CandidateFit]:
+        """Return the best fit of each family of laws that is easily taken for the best law."""
+        (best_term,) = best.candidate.terms
+        singles: dict[tuple[str, str], CandidateFit] = {}
+        fits = (*self.search.rough_fits.values(), *self.search.exact_fits.values())
+        for fitted in fits:
+            if len(fitted.candidate.terms) != 1:
+                continue
+            (term,) = fitted.candidate.terms
+            has_shape_to_free = bool(term.effect.shape) and not term.free_shape
+            if not has_shape_to_free or not self.acts_on_structure(term):
+                continue
+            if term == best_term or are_related(term.effect, best_term.effect):
+                key = (term.effect.family, term.place)
+                singles[key] = max(singles.get(key, fitted), fitted, key=self.search.score)
+        return list(singles.values())
+
+    def with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
+        """Return a hypothesis of one law with its shape free, if that was compared."""
+        if hypothesis.candidate.is_family:
+            return hypothesis
+        return self._free_shape_fits.get(hypothesis.candidate.key)
+
+    def start_point(self, hypothesis: CandidateFit) -> Point:
+        """Return the point of a hypothesis."""
+        return hypothesis.point
+
+    def check_fit(self, hypothesis: CandidateFit) -> Gate:
+        """Test whether the simulation of a hypothesis leaves noise alone."""
+        return check_absolute_fit(self.problem, hypothesis)
+
+    def failed_check(self, hypothesis: CandidateFit) -> str:
+        """Return the reason of a failed test of a hypothesis that leaves noise alone.
+
+        Empty if none.
+        """
+        if hypothesis.residual_process is not None:
+            return ""
+        gates = (
+            check_consistency(self.problem, hypothesis),
+            check_held_out(self.residuals(hypothesis)),
+        )
+        return next((gate.reason for gate in gates if gate.passed is False), "")
+
+    def _simulation(self, hypothesis: CandidateFit) -> CandidateFit:
+        """Return the hypothesis, which is a simulation itself."""
+        return hypothesis
+
+    def remaining_text(self, hypothesis: CandidateFit, share: GapShare) -> str:
+        """Return in words how much of the gap a hypothesis leaves, of how much there is."""
+        return (
+            f"{share.remaining_rms:.3g} of {share.total_rms:.3g} noise deviations "
+            "(rms beyond the noise)"
+        )
+
+
+def _in_role(trials: Iterable[FittedTrial], *, held_out: bool) -> list[FittedTrial]:
+    """Return the trials that were held out, or those that were not."""
+    return [fitted for fitted in trials if fitted.trial.held_out is held_out]
+
+
+def _rms_beyond_noise(sums: FloatArray, noise_sums: FloatArray) -> float:
+    """Return the rms beyond the noise, in noise deviations, given sums of squares by block (B,)."""
+    return float(np.sqrt(max(sums.sum() / noise_sums.sum() - 1.0, 0.0)))

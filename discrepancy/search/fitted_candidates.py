@@ -1,0 +1,124 @@
+"""The candidates that a search has fitted, and what is compared of them."""
+
+from dataclasses import dataclass, field
+from math import exp
+
+from scipy.special import logsumexp
+
+from discrepancy.catalogue.entry import Effect
+from discrepancy.fits.candidate import Candidate, CandidateKey
+from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.gates import check_absolute_fit
+from discrepancy.fits.problem import Problem
+from discrepancy.missing_force.explained import ForceHypothesis
+from discrepancy.missing_force.hypotheses import log_prior
+from discrepancy.search_settings import SEARCH
+
+
+@dataclass
+class FittedCandidates:
+    """The candidates that a search has fitted so far, with their probabilities.
+
+    Attributes
+    ----------
+    problem : Problem
+        The campaign and model.
+    effects : tuple of Effect
+        The effects that can act here.
+    no_effect : CandidateFit
+        The fit of the model without effect.
+    exact_fits : dict of CandidateKey to CandidateFit
+        The candidates that were fitted to convergence.
+    rough_fits : dict of CandidateKey to CandidateFit
+        The candidates that were fitted by few steps only; their evidence is approximate.
+    wide_fits : dict of CandidateKey to CandidateFit
+        The candidates that were fitted under a wider noise; where there are any, they alone are
+        compared.
+    """
+
+    problem: Problem
+    effects: tuple[Effect, ...]
+    no_effect: CandidateFit
+    exact_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
+    rough_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
+    wide_fits: dict[CandidateKey, CandidateFit] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.exact_fits[()] = self.no_effect
+
+    def log_prior(self, candidate: Candidate) -> float:
+        """Return the log prior probability of a candidate at its places."""
+        return log_prior(candidate, len(self.effects), self.problem.setting)
+
+    def score(self, fit: CandidateFit | ForceHypothesis) -> float:
+        """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""
+        return fit.log_evidence + self.log_prior(fit.candidate)
+
+    def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
+        """Return the fit of every candidate that is compared, the exact one where there is one."""
+        return self.wide_fits or {**self.rough_fits, **self.exact_fits}
+
+    def best(self) -> CandidateFit:
+        """Return the most probable candidate."""
+        return max((self.wide_fits or self.exact_fits).values(), key=self.score)
+
+    def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
+        """Return the most probable fit of a set of effects, over their places."""
+        fits = self.compared_fits().values()
+        return max(
+            (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
+        )
+
+    def fitted_effects(self) -> frozenset[str]:
+        """Return the identifiers of all effects that were fitted, alone or with others."""
+        identifiers: set[str] = set()
+        for fits in (self.rough_fits, self.exact_fits, self.wide_fits):
+            for fit in fits.values():
+                identifiers.update(term.effect.identifier for term in fit.candidate.terms)
+        return frozenset(identifiers)
+
+    @property
+    def compared_no_effect(self) -> CandidateFit:
+        """The fit without effect under the noise by which candidates are compared."""
+        return self.wide_fits.get((), self.no_effect)
+
+    def set_probabilities(self) -> dict[tuple[str, ...], float]:
+        """Return the probability of each set of effects at any places, the most probable first."""
+        scores: dict[tuple[str, ...], list[float]] = {}
+        for fit in self.compared_fits().values():
+            scores.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
+        sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
+        total = float(logsumexp(list(sums.values())))
+        ordered = sorted(sums.items(), key=lambda entry: -entry[1])
+        return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
+
+    def record(self, fit: CandidateFit, *, exact: bool) -> None:
+        """Record a fit if its evidence is above that of an earlier fit of the same candidate."""
+        fits = self.exact_fits if exact else self.rough_fits
+        key = fit.candidate.key
+        if key not in fits or fits[key].log_evidence < fit.log_evidence:
+            fits[key] = fit
+
+    def is_unexplained(self) -> bool:
+        """Return whether the best candidate cannot be shown to leave noise alone."""
+        return not check_absolute_fit(self.problem, self.best()).passed
+
+    @property
+    def is_all_in_motion(self) -> bool:
+        """Whether all trials are in motion."""
+        return all(data.trial.is_dynamic for data in self.problem.trials)
+
+    def fit_exactly(self, rough: CandidateFit) -> CandidateFit:
+        """Return a candidate fitted to convergence, from a rough fit, and record it.
+
+        An exact fit that is known already is repeated only if the rough one is clearly better.
+        """
+        key = rough.candidate.key
+        if key in self.wide_fits:
+            return self.wide_fits[key]
+        known = self.exact_fits.get(key)
+        if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
+            exact = attempt(self.problem, rough.candidate, rough.point)
+            # few steps may have led to where the structure cannot follow
+            self.record(rough if exact is None else exact, exact=True)
+        return self.exact_fits[key]
