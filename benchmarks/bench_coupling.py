@@ -9,6 +9,9 @@ import numpy as np
 
 from benchmarks.measurement import Measurement, median_seconds
 from fe.reduction.model_cache import reduced_model
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.companions.build import companion_bytes
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
@@ -20,9 +23,6 @@ from fmu_asset.coupling.structure import (
 )
 from fmu_asset.coupling.system import stepped_components, system_description
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import binding_files

@@ -11,8 +11,8 @@ from fmpy.fmi2 import FMU2Slave
 from benchmarks.measurement import Measurement, median_seconds
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu
 
 BINDING = Path(__file__).parents[1] / "scenarios" / "bindings" / "uav_wing.toml"

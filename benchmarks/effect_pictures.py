@@ -335,6 +335,10 @@ PICTURES: dict[str, Picture] = {
     "high_pass": Picture(
         {"corner_ratio": 0.2}, (ringdown("g0", end=1.5), spectrum("g0", 10.0)), "g0"
     ),
+    "sensor_lag": Picture(
+        {"lag_intervals": 10.0},
+        (ringdown("g0", 0.0, 0.6, "pushed"), ringdown("g0", 2.0, 2.6, "pushed")),
+    ),
     "load_place": Picture(
         {"along_span_ratio": -0.05, "along_chord_ratio": 0.0}, (ratios("up"), load_line("g2"))
     ),

@@ -1,1 +1,1 @@
-"""The FMUs: the slave, its build and check, and the one door to any FMU."""
+"""FMUs: ours are built and checked here, and any FMU is run through one client."""

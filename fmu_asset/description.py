@@ -1,4 +1,4 @@
-"""What an FMU declares, and the texts that are made of it by the templates of this package."""
+"""The declaration of an FMU that we make, and the texts that templates make of it."""
 
 import math
 import re
@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import version
 from itertools import groupby
-from typing import Any
+from typing import NamedTuple
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
@@ -16,6 +16,7 @@ from reporting.toml_file import toml_value
 from reporting.units import BASE_UNITS, meaning_of
 
 _ELEMENT = re.compile(r"(?P<stem>.+)(?:\[(?P<index>[0-9]+)\]|\.(?P<label>[^.]+))")
+"""Name of an element of an array: `strain[1]` or `health.z1`."""
 LOG_CATEGORIES = {
     "logStatusWarning": "Log messages with fmi2Warning status.",
     "logStatusDiscard": "Log messages with fmi2Discard status.",
@@ -28,9 +29,25 @@ PLACEHOLDER = "0_content_0_"
 """Stands for the tag, the first characters of the content hash, until that is known."""
 
 
+class DeclaredUnit(NamedTuple):
+    """A unit in terms of SI.
+
+    Attributes
+    ----------
+    base : dict of str to float
+        Exponents of base units that are not zero, and factor and offset where they are not 1 and 0;
+        empty for a unit that is not understood.
+    displays : dict of str to float
+        Factors of display units.
+    """
+
+    base: dict[str, float]
+    displays: dict[str, float]
+
+
 @dataclass(frozen=True)
 class Declaration:
-    """What an FMU declares, whatever it is made of.
+    """The declaration of an FMU, whatever it is made of.
 
     Attributes
     ----------
@@ -39,9 +56,10 @@ class Declaration:
     description : str
         One sentence for people.
     table : tuple of FmuVariable
-        The variables, in order of their value reference. Local ones are states, and then as many derivatives.
+        The variables, in the order of their value references. Local ones are states, and then as
+        many derivatives.
     dependencies : mapping of str to sequence of str
-        For each output, the inputs that it depends on directly; an output that is missing depends on all.
+        Inputs that each output depends on directly; an output that is missing depends on all.
     """
 
     name: str
@@ -50,27 +68,20 @@ class Declaration:
     dependencies: Mapping[str, Sequence[str]] = field(default_factory=dict)
 
     @property
-    def units(self) -> dict[str, tuple[dict[str, float], dict[str, float]]]:
-        """For each unit of the table exponents, factor and offset to SI, and factors of display units.
-
-        What a text does not say is left out: of a unit that is not understood no more than its name is told.
-        """
-        units: dict[str, tuple[dict[str, float], dict[str, float]]] = {}
+    def units(self) -> dict[str, DeclaredUnit]:
+        """The units of the table by name."""
+        units: dict[str, DeclaredUnit] = {}
         for row in self.table:
-            meaning, shown = meaning_of(row.unit or ""), meaning_of(row.display_unit or "")
-            base, displays = units.setdefault(row.unit, ({}, {})) if row.unit else ({}, {})
-            if meaning is not None:
-                base |= {symbol: n for symbol, n in zip(BASE_UNITS, meaning.exponents, strict=True) if n}
-                if meaning[1:] != (1.0, 0.0):
-                    base |= {"factor": meaning.factor, "offset": meaning.offset}
-                if shown is not None and row.display_unit:
-                    displays[row.display_unit] = meaning.factor / shown.factor
+            if row.unit:
+                unit = units.setdefault(row.unit, DeclaredUnit({}, {}))
+                _declare_unit(unit, row.unit, row.display_unit)
         return units
 
     @property
     def enumerations(self) -> tuple[EnumerationType, ...]:
-        """Enumerations of the table."""
-        return tuple(item for item in ENUMERATIONS if item.name in {row.enumeration for row in self.table})
+        """The enumerations of the table."""
+        names = {row.enumeration for row in self.table}
+        return tuple(entry for entry in ENUMERATIONS if entry.name in names)
 
     @property
     def identifier(self) -> str:
@@ -78,46 +89,104 @@ class Declaration:
         return f"{self.name}_{PLACEHOLDER}"
 
 
+def _declare_unit(unit: DeclaredUnit, name: str, display_unit: str | None) -> None:
+    """Fill the declaration of a unit.
+
+    Parameters
+    ----------
+    unit : DeclaredUnit
+        The declaration; extended in place.
+    name : str
+        Name of the unit.
+    display_unit : str or None
+        A display unit that a variable has.
+    """
+    meaning = meaning_of(name)
+    if meaning is None:
+        return
+    for symbol, exponent in zip(BASE_UNITS, meaning.exponents, strict=True):
+        if exponent:
+            unit.base[symbol] = exponent
+    if meaning.factor != 1.0 or meaning.offset != 0.0:
+        unit.base["factor"] = meaning.factor
+        unit.base["offset"] = meaning.offset
+    if display_unit:
+        display_meaning = meaning_of(display_unit)
+        if display_meaning is not None:
+            unit.displays[display_unit] = meaning.factor / display_meaning.factor
+
+
+# ---------------------------------------------------------------------- templates
+
+
 @cache
 def _templates() -> Environment:
+    """Return the templates of `fmu_asset/templates` with the filters that they use."""
     environment = Environment(
         loader=PackageLoader("fmu_asset"),
-        autoescape=select_autoescape(("xml.jinja", "html.jinja", "ssd.jinja", "ssv.jinja", "ssm.jinja")),
+        autoescape=select_autoescape(
+            ("xml.jinja", "html.jinja", "ssd.jinja", "ssv.jinja", "ssm.jinja")
+        ),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    own = {"c_text": _c_text, "c_number": _c_number, "quoted": toml_value, "written": _written}
-    environment.filters |= own
+    environment.filters |= {
+        "c_text": _c_text,
+        "c_number": _c_number,
+        "quoted": toml_value,
+        "written": _xml_value,
+    }
     return environment
 
 
-def rendered(name: str, /, **values: Any) -> bytes:
-    """Return what a template of `fmu_asset/templates` makes of values, as UTF-8; floats keep their bits."""
-    return _templates().get_template(f"{name}.jinja").render(**values).encode()
+def rendered(template: str, /, **values: object) -> bytes:
+    """Return the text of a template with values filled in, as UTF-8; floats keep their bits.
+
+    Parameters
+    ----------
+    template : str
+        Name of a file in `fmu_asset/templates`, without `.jinja`.
+    **values : object
+        Values that the template uses.
+    """
+    return _templates().get_template(f"{template}.jinja").render(**values).encode()
 
 
 def _c_text(text: str) -> str:
-    """Return a text as a C string; units are anything that a user writes, and messages go through printf."""
-    plain = (
-        chr(byte) if 32 <= byte < 127 and chr(byte) not in '"\\?' else f"\\{byte:03o}"
-        for byte in text.encode()
-    )
-    return f'"{"".join(plain)}"'
+    """Return a text as a C string.
+
+    Units may contain anything that a user writes, and messages go through printf: everything but
+    plain characters is escaped.
+    """
+    characters = []
+    for byte in text.encode():
+        character = chr(byte)
+        is_plain = 32 <= byte < 127 and character not in '"\\?'
+        characters.append(character if is_plain else f"\\{byte:03o}")
+    return f'"{"".join(characters)}"'
 
 
 def _c_number(value: float | None, absent: str) -> str:
-    """Return a float as a C constant that has the same bits."""
-    return absent if value is None or math.isinf(value) else repr(float(value))
+    """Return a float as a C constant with the same bits; `absent` for None and infinity."""
+    if value is None or math.isinf(value):
+        return absent
+    return repr(float(value))
 
 
-def _written(value: float | None, kind: str) -> str | None:
-    """Return a value of a variable as XML has it."""
+def _xml_value(value: float | None, kind: str) -> str | None:
+    """Return a value of a variable of some kind as XML writes it."""
     if value is None:
         return None
-    shown = {"Real": float, "Boolean": bool}.get(kind, int)(value)
-    return repr(shown).lower() if kind == "Boolean" else repr(shown)
+    if kind == "Boolean":
+        return repr(bool(value)).lower()
+    if kind == "Real":
+        return repr(float(value))
+    return repr(int(value))
+
+
+# ---------------------------------------------------------------------- arrays
 
 
 @dataclass(frozen=True)
@@ -127,9 +196,9 @@ class ArrayVariable:
     Attributes
     ----------
     name : str
-        What the names of the rows have in common: `strain` of `strain[1]`, ...; `health` of `health.z1`, ...
+        Stem of the names of the rows: `strain` for `strain[1]`, ...; `health` for `health.z1`, ...
     rows : tuple of FmuVariable
-        The elements in order, alike but for name, description and start value.
+        The elements in order; they differ only in name, description and start value.
     """
 
     name: str
@@ -137,33 +206,50 @@ class ArrayVariable:
 
     @property
     def description(self) -> str:
-        """Return that of the first element with i in the place of its index or name, and all names."""
-        labels = [
-            found["index"] or found["label"]
-            for found in (_ELEMENT.fullmatch(row.name) for row in self.rows)
-            if found
-        ]
-        text = re.sub(rf"\b{re.escape(labels[0])}\b|\b1\b", "i", self.rows[0].description, count=1)
-        return text if labels[0] == "1" else f"{text}; i is one of {', '.join(labels)}"
+        """Description of the first element, with i in the place of its index or label."""
+        labels = []
+        for row in self.rows:
+            match = _ELEMENT.fullmatch(row.name)
+            if match:
+                labels.append(match["index"] or match["label"])
+        first = labels[0]
+        pattern = rf"\b{re.escape(first)}\b|\b1\b"
+        text = re.sub(pattern, "i", self.rows[0].description, count=1)
+        if first == "1":
+            return text
+        return f"{text}; i is one of {', '.join(labels)}"
 
 
 def arrays_of(table: Sequence[FmuVariable]) -> tuple[ArrayVariable, ...]:
     """Return the arrays of a table: numbered variables, and inputs and outputs such as `health.z1`.
 
-    Rows of one stem that differ in unit or range stay scalars.
+    Rows of one stem with different units or ranges stay scalars.
+
+    Parameters
+    ----------
+    table : sequence of FmuVariable
+        The table.
     """
-    found = []
-    for stem, group in groupby(table, _stem):
+    arrays = []
+    for stem, group in groupby(table, _array_stem):
         rows = tuple(group)
-        plain = {replace(row, name="", reference=0, description="", start=None) for row in rows}
-        if stem is not None and len(plain) == 1:
-            found.append(ArrayVariable(stem, rows))
-    return tuple(found)
+        common_fields = set()
+        for row in rows:
+            common_fields.add(replace(row, name="", reference=0, description="", start=None))
+        if stem is not None and len(common_fields) == 1:
+            arrays.append(ArrayVariable(stem, rows))
+    return tuple(arrays)
 
 
-def _stem(row: FmuVariable) -> str | None:
+def _array_stem(row: FmuVariable) -> str | None:
+    """Return the name of the array that a row may belong to."""
     match = _ELEMENT.fullmatch(row.name)
-    return None if match is None or row.causality == "parameter" or row.kind != "Real" else match["stem"]
+    if match is None or row.causality == "parameter" or row.kind != "Real":
+        return None
+    return match["stem"]
+
+
+# ---------------------------------------------------------------------- model description
 
 
 def description_members(
@@ -175,10 +261,10 @@ def description_members(
     fmi: int = 2,
     arrays: Sequence[ArrayVariable] = (),
 ) -> dict[str, bytes]:
-    """Return the files that say what an FMU is, for co-simulation or with states for model exchange.
+    """Return the model description of an FMU, and its documentation page.
 
-    The placeholder stands for what the content hash will give. There is no generation date: equal content
-    gives equal bytes.
+    The FMU is for co-simulation, or, with states, for model exchange. A placeholder stands for what
+    the content hash will give. There is no generation date: equal content gives equal bytes.
 
     Parameters
     ----------
@@ -187,28 +273,33 @@ def description_members(
     generation_tool : str
         Attribute of the root element.
     host : str
-        What the FMU runs in, for its documentation.
+        Sentence on what the FMU runs in, for its documentation.
     source_files : sequence of str
-        C sources in the folder `sources`; an FMU with none needs Python to run.
+        C sources in the folder `sources`; an FMU without any needs Python to run.
     fmi : {2, 3}
         Version of FMI.
     arrays : sequence of ArrayVariable
-        Which variables are elements of arrays, in FMI 3.
+        Variables that are elements of arrays, in FMI 3.
 
     Returns
     -------
     dict of str to bytes
-        By name in the archive: the model description, and a page for people without any request.
+        Content by name in the archive.
     """
-    inner = {row.reference for array in arrays for row in array.rows[1:]}
-    rows = [row for row in declared.table if row.reference not in inner]
+    later_elements = {row.reference for array in arrays for row in array.rows[1:]}
+    rows = [row for row in declared.table if row.reference not in later_elements]
     local = [row for row in rows if row.causality == "local"]
-    states, rates = local[: len(local) // 2], local[len(local) // 2 :]
-    # FMI 2 counts variables from 1, and ours stand at their value references.
-    state_of = {
-        rate.reference: state.reference + (fmi == 2) for state, rate in zip(states, rates, strict=True)
-    }
-    place = {row.name: row.reference + 1 for row in rows}
+    state_count = len(local) // 2
+    states = local[:state_count]
+    rates = local[state_count:]
+    state_of = {}
+    for state, rate in zip(states, rates, strict=True):
+        # FMI 2 counts variables from 1, FMI 3 uses value references; ours differ by one
+        state_of[rate.reference] = state.reference + 1 if fmi == 2 else state.reference
+    index_of = {row.name: row.reference + 1 for row in rows}
+    dependencies = {}
+    for name, sources in declared.dependencies.items():
+        dependencies[name] = sorted(index_of[source] for source in sources)
     xml = rendered(
         "modelDescription.xml",
         declared=declared,
@@ -222,10 +313,7 @@ def description_members(
         rows=rows,
         heads={array.rows[0].reference: array for array in arrays},
         state_of=state_of,
-        dependencies={
-            name: sorted(place[source] for source in sources)
-            for name, sources in declared.dependencies.items()
-        },
+        dependencies=dependencies,
         rates=rates,
     )
     interface = "model-exchange" if local else "co-simulation"

@@ -1,39 +1,49 @@
-"""Errors of the FMUs and of their one door, named by cause, and the sentences that say why."""
+"""Errors of FMUs, named by cause."""
 
 from collections.abc import Sequence
 
 from reporting.errors import StandsForOthersError
-from reporting.sentences import Sentences
 
-said = Sentences(__file__).said
-"""A sentence by "table.name" with its values."""
-
-
-_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(9), *range(11, 32), *range(127, 160))}
+_CONTROL_CODES = (*range(9), *range(11, 32), *range(127, 160))
+"""Codes of control characters, without tabulator and line feed."""
+_ESCAPES = {code: f"\\x{code:02x}" for code in _CONTROL_CODES}
 
 
 def visible(text: str) -> str:
-    r"""Return a text with its control characters, which a terminal would obey, written as `\x1b`."""
-    return text.translate(_CONTROLS)
+    r"""Return a text with control characters, which a terminal would obey, written as `\x1b`."""
+    return text.translate(_ESCAPES)
 
 
 class FmuError(StandsForOthersError):
     """Any error that this package raises on purpose.
 
+    Parameters
+    ----------
+    sentence : str
+        The message.
+    messages : sequence of str
+        Messages that the FMU itself has logged since the last call that succeeded, oldest first.
+    time : float, optional
+        Time at which the FMU ended its simulation [s], if it did.
+
     Attributes
     ----------
+    sentence : str
+        The message, without control characters.
     messages : tuple of str
-        What the FMU itself had logged since the last call that succeeded, oldest first.
+        The messages of the FMU, without control characters.
     time : float or None
-        Where the FMU ended its simulation [s], if it did.
+        As given.
     """
 
-    def __init__(self, sentence: str, messages: Sequence[str] = (), time: float | None = None) -> None:
-        self.time = time
+    def __init__(
+        self, sentence: str, messages: Sequence[str] = (), time: float | None = None
+    ) -> None:
+        self.sentence = visible(sentence)
         self.messages = tuple(visible(message) for message in messages)
-        self.sentence = sentence = visible(sentence)
+        self.time = time
         log = "".join(f"\n  the FMU says: {message}" for message in self.messages)
-        super().__init__(sentence + log)
+        super().__init__(self.sentence + log)
 
 
 class FmuBuildError(FmuError, ValueError):
@@ -49,7 +59,7 @@ class FmuFileError(FmuError, ValueError):
 
 
 class FmuUnsupportedError(FmuError, ValueError):
-    """An FMU is sound but of a kind that cannot be flown: version, interface or platform."""
+    """An FMU is sound but cannot be run, because of its version, interface or platform."""
 
 
 class BindingError(FmuError, ValueError):
@@ -57,7 +67,7 @@ class BindingError(FmuError, ValueError):
 
 
 class CouplingError(FmuError, ValueError):
-    """FMUs cannot be connected as they were told to: an end is unknown, taken twice, or of another type."""
+    """FMUs cannot be connected: an end is unknown, connected twice, or of another type."""
 
 
 class IterationError(FmuError, RuntimeError):

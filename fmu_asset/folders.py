@@ -1,6 +1,6 @@
-"""Folders for extracted FMUs and their workers: where they are made, and how they are removed.
+"""Private folders for extracted FMUs and their workers: how they are made and removed.
 
-None lies in a folder that others can write into: each has a parent of its own, which only its user may enter.
+Nobody else can write into such a folder: it has a parent of its own that only its user may enter.
 """
 
 import os
@@ -12,41 +12,46 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from fmu_asset.errors import said
-
 from .errors import FmuFileError
 
-_tidied: set[Path] = set()
-_ROUNDS = 100
+_CANDIDATES = ("/tmp", "/var/tmp", "/dev/shm")
+"""Folders for temporary files if the usual one cannot be used."""
 _PLAIN_PATH = re.compile(r"[A-Za-z0-9/_.\-]+")
+_SEARCH_ROUNDS = 100
+"""Number of searches after which processes that always start others are given up."""
+_cleaned_parents: set[Path] = set()
 
 
 def plain_folder() -> Path:
-    """Return a new private folder whose path has ASCII letters, digits and `/_.-` only.
+    """Return a new private folder with only ASCII letters, digits and `/_.-` in its path.
 
-    Other characters in the path crash some FMUs (pythonfmu's decode nothing but `%20`). What a process that
-    is gone has left behind, since it and its worker were killed in the same moment, is removed on the way.
+    Other characters in the path crash some FMUs (pythonfmu's decode only `%20`). On the way, this
+    removes what an ended process has left behind because it and its worker were killed at once.
 
     Raises
     ------
     FmuFileError
         If no such folder can be made.
     """
-    candidates = [tempfile.gettempdir(), "/tmp", "/var/tmp", "/dev/shm"]
+    candidates = [tempfile.gettempdir(), *_CANDIDATES]
     for name in candidates:
         path = Path(name)
-        if _PLAIN_PATH.fullmatch(str(path.absolute())) and path.is_dir() and os.access(path, os.W_OK):
+        is_plain = _PLAIN_PATH.fullmatch(str(path.absolute()))
+        if is_plain and path.is_dir() and os.access(path, os.W_OK):
             _remove_leftovers(path)
             parent = tempfile.mkdtemp(prefix=f"{_prefix()}{os.getpid()}-", dir=path)
             folder = Path(parent, "own").absolute()
             folder.mkdir(0o700)
             return folder
-    raise FmuFileError(said("running.no_folder", candidates=candidates))
+    raise FmuFileError(
+        "FMUs need a writable folder for temporary files with a plain ASCII path, but none of "
+        f"{', '.join(candidates)} is one; set TMPDIR."
+    )
 
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Give a folder as `plain_folder` makes it for a while."""
+    """Return a context with a folder as `plain_folder` makes it, which is removed at the end."""
     folder = plain_folder()
     try:
         yield folder
@@ -55,49 +60,64 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def _remove_leftovers(parent: Path) -> None:
-    """Remove folders of ours whose process is gone, once for each parent, where the system tells that."""
-    if parent in _tidied or not Path("/proc/self").exists():
+    """Remove our folders whose process has ended, once for each parent, if the system tells."""
+    if parent in _cleaned_parents or not Path("/proc/self").exists():
         return
-    _tidied.add(parent)
+    _cleaned_parents.add(parent)
     for folder in parent.glob(f"{_prefix()}*"):
-        number = folder.name.removeprefix(_prefix()).partition("-")[0]
+        process, _, _ = folder.name.removeprefix(_prefix()).partition("-")
+        if not process.isdigit():
+            continue
         with suppress(OSError):
-            own = number.isdigit() and folder.lstat().st_uid == os.getuid()
-            if own and not Path("/proc", number).exists():
+            is_of_user = folder.lstat().st_uid == os.getuid()
+            if is_of_user and not Path("/proc", process).exists():
                 end_processes(folder)
                 remove_folder(folder)
 
 
 def _prefix() -> str:
-    """Return the beginning of our folders' names; two containers may share a folder, not process numbers."""
+    """Return the beginning of our folders' names, with the number of the process namespace.
+
+    Two containers may share a folder, but not process numbers.
+    """
     try:
-        return f"uav-twin-fmu-{Path('/proc/self/ns/pid').stat().st_ino}-"
+        namespace = Path("/proc/self/ns/pid").stat().st_ino
     except OSError:
-        return "uav-twin-fmu-0-"
+        namespace = 0
+    return f"uav-twin-fmu-{namespace}-"
 
 
 def end_processes(folder: str | os.PathLike[str]) -> None:
-    """End the processes whose folder for temporary files was in this one when their program began.
+    """Kill the processes whose folder for temporary files was this one when they began.
 
-    A process has that of its parent, in whatever group or session it hides and whoever has ended before it.
+    A process has inherited that folder from its parent, in whatever group or session it hides, and
+    even if the parent has ended.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder, or the beginning of its path.
     """
-    mark, clean = f"\0TMPDIR={os.fspath(folder)}".encode(), 0
-    for _ in range(_ROUNDS):
-        found = False
+    mark = f"\0TMPDIR={os.fspath(folder)}".encode()
+    empty_searches = 0
+    for _ in range(_SEARCH_ROUNDS):
+        has_found = False
         for process in Path("/proc").glob("[0-9]*"):
             with suppress(OSError):
-                if mark in b"\0" + (process / "environ").read_bytes():
+                environment = b"\0" + (process / "environ").read_bytes()
+                if mark in environment:
                     os.kill(int(process.name), signal.SIGKILL)
-                    found = True
-        clean = 0 if found else clean + 1
-        if clean == 2:  # one look misses the child of a process that ended meanwhile
+                    has_found = True
+        empty_searches = 0 if has_found else empty_searches + 1
+        # one search may miss the child of a process that ends meanwhile
+        if empty_searches == 2:
             return
         time.sleep(0.01)
 
 
 @contextmanager
-def _held(folder: str) -> Iterator[str]:
-    """Give a path of this very folder, wherever it is moved and whatever takes its place."""
+def _path_of_opened(folder: str) -> Iterator[str]:
+    """Return a context with a path of this very folder, even if it is moved or replaced."""
     descriptor = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
         yield f"/proc/self/fd/{descriptor}"
@@ -106,30 +126,37 @@ def _held(folder: str) -> Iterator[str]:
 
 
 def remove_folder(folder: str | os.PathLike[str]) -> None:
-    """Remove a folder and all that can be removed in it, however deep an FMU has nested it.
+    """Remove a folder and everything in it that can be removed, however deep an FMU has nested it.
 
-    Folders inside are first moved to the top: `shutil.rmtree` calls itself for each level, and the path of a
-    deep one is longer than the system allows. Links are not followed, not even those that a process of the
-    FMU, which cannot reach what it links to, puts in the place of a folder meanwhile.
+    Inner folders are first moved to the top: `shutil.rmtree` calls itself for each level, and the
+    path of a deep one is longer than the system allows. Links are not followed, not even those that
+    a process of the FMU puts in the place of a folder meanwhile: it cannot reach what it links to.
+
+    Parameters
+    ----------
+    folder : path-like
+        The folder.
     """
+    # strings instead of `Path` objects take half the time
     top = os.fspath(folder)
-    waiting, number = [top], 0
+    waiting = [top]
+    moved_count = 0
     while waiting:
-        here = waiting.pop()
-        with suppress(OSError), _held(here) as held:
-            os.chmod(held, 0o700)  # noqa: PTH101 - here and below, strings: half the time
-            for entry in list(os.scandir(held)):
+        current = waiting.pop()
+        with suppress(OSError), _path_of_opened(current) as opened:
+            os.chmod(opened, 0o700)  # noqa: PTH101
+            for entry in list(os.scandir(opened)):
                 with suppress(OSError):
                     if entry.is_dir(follow_symlinks=False):
-                        number += 1
-                        moved = f"{top}/.removed-{os.getpid()}-{number}"
+                        moved_count += 1
+                        moved = f"{top}/.removed-{os.getpid()}-{moved_count}"
                         os.rename(entry.path, moved)  # noqa: PTH104
                         waiting.append(moved)
                     else:
                         os.unlink(entry.path)  # noqa: PTH108
-        if here != top:
+        if current != top:
             with suppress(OSError):
-                os.rmdir(here)  # noqa: PTH106
+                os.rmdir(current)  # noqa: PTH106
     parent = os.path.dirname(top)  # noqa: PTH120
     with suppress(OSError):
         os.rmdir(top)  # noqa: PTH106

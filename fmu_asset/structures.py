@@ -1,6 +1,6 @@
-"""What follows from the names of a structure: the binding of its FMU, and the file by which that is a model.
+"""Files for the FMU of a structure: its binding, and the file that makes it a model of campaigns.
 
-With the latter campaigns are calibrated, and effects searched for: `docs/fmu_models.md`.
+By the latter, campaigns are calibrated and effects searched for: `docs/fmu_models.md`.
 """
 
 import numpy as np
@@ -8,76 +8,92 @@ import numpy as np
 from fe.structure.design import MeshDesign, MeshLoad, PointOutput
 from fe.structure.matrix_design import MatrixDesign, MatrixLoad, NodeOutput
 from fe.structure.tables import StructureDesign
+from fmu_asset.client.binding import Binding, parse_binding
 from fmu_asset.description import rendered
-from fmu_asset.door.binding import Binding, parse_binding
 from fmu_asset.errors import BindingError, FmuBuildError
 from reporting.toml_file import parse_toml
 
 
 def structure_binding_text(design: StructureDesign, frequencies: int = 0) -> str:
-    """Return the binding file of a structure's FMU: control, health, parameters, observations, monitors.
+    """Return the binding file of a structure's FMU.
+
+    It binds controls, health, parameters, observations and monitors.
 
     Parameters
     ----------
     design : StructureDesign
         The structure; its reduced model has the same names.
     frequencies : int
-        How many natural frequencies are observed, too; they cost the FMU more than all the rest.
+        Number of natural frequencies that are observed, too; they cost the FMU more time than all
+        the rest.
     """
     modes = [f"[{mode}]" for mode in range(1, frequencies + 1)]
-    return rendered("structure_binding.toml", design=design, modes=modes).decode().rstrip() + "\n"
+    text = rendered("structure_binding.toml", design=design, modes=modes).decode()
+    return text.rstrip() + "\n"
 
 
 def structure_binding(design: StructureDesign, frequencies: int = 0) -> Binding:
     """Return the binding of a structure's FMU; see `structure_binding_text`."""
     where = f"the binding of {design.name}"
-    return parse_binding(
-        parse_toml(structure_binding_text(design, frequencies), where, BindingError), where=where
-    )
+    content = parse_toml(structure_binding_text(design, frequencies), where, BindingError)
+    return parse_binding(content, where=where)
 
 
 def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
-    """Return the model file of a structure's FMU: forces, outputs, ports and parameters as its file has them.
+    """Return the file that makes a structure's FMU a model of campaigns.
 
-    A control in N is a force, and one of the name load_factor the load factor of flights, which
-    stand for any rest under it. Where a load of 1 N at a point meets a displacement output along
-    it, there is a port. Ports of the structure file are named in a comment alone: the FMU has no
-    input for a force there.
+    It has the forces, outputs, ports and parameters of the structure's file. A control in N is a
+    force, and one named load_factor is the load factor of flights. Where a load of 1 N at a point
+    meets a displacement output along it, there is a port. Ports of the structure file are named in
+    a comment only: the FMU has no input for a force there.
 
     Parameters
     ----------
     design : MeshDesign or MatrixDesign
         The structure.
     fmu : str
-        Path of its FMU, seen from the folder of the file.
+        Path of its FMU, relative to the folder of the file.
 
     Raises
     ------
     FmuBuildError
         If no control is a force or a load factor.
     """
-    forces = [part.name for part in design.control if part.unit == "N"]
-    flies = any(part.name == "load_factor" for part in design.control)
-    if not forces and not flies:
+    forces = [control.name for control in design.control if control.unit == "N"]
+    has_load_factor = any(control.name == "load_factor" for control in design.control)
+    if not forces and not has_load_factor:
         raise FmuBuildError(
             f"The structure {design.name} has no control in N and no load_factor, and a campaign "
-            'needs a load that is recorded: give a [[control]] with unit = "N" and a [[load]] of 1 '
-            "N tied to it, or a [[control]] load_factor."
+            'needs a load that is recorded: give a [[control]] with unit = "N" and a [[load]] of '
+            "1 N tied to it, or a [[control]] load_factor."
         )
-    ports = [
-        (load.control, output.name)
-        for load in design.load
-        for output in design.displacement
-        if load.control in forces and _meet(load, output)
-    ]
-    text = rendered("rig.toml", design=design, fmu=fmu, forces=forces, flies=flies, ports=ports)
-    return text.decode().rstrip() + "\n"
+    ports = []
+    for load in design.load:
+        for output in design.displacement:
+            if load.control in forces and _is_unit_force_along(load, output):
+                ports.append((load.control, output.name))
+    text = rendered(
+        "rig.toml",
+        design=design,
+        fmu=fmu,
+        forces=forces,
+        flies=has_load_factor,
+        ports=ports,
+    ).decode()
+    return text.rstrip() + "\n"
 
 
-def _meet(load: MeshLoad | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
-    """Return whether a load is 1 N at the place of an output and along it."""
-    place, read = (getattr(part, "point", getattr(part, "node", None)) for part in (load, output))
-    if place is None or load.force is None or place != read or output.direction is None:
+def _is_unit_force_along(load: MeshLoad | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
+    """Return whether a load is a force of 1 N at the point or node of an output, and along it."""
+    if load.force is None or output.direction is None:
+        return False
+    load_location = _location(load)
+    if load_location is None or load_location != _location(output):
         return False
     direction = np.asarray(output.direction) / np.linalg.norm(output.direction)
     return bool(np.abs(np.asarray(load.force) - direction).max() < 1e-9)
+
+
+def _location(part: MeshLoad | MatrixLoad | PointOutput | NodeOutput) -> object:
+    """Return the point or node of a load or output; None if it has none."""
+    return getattr(part, "point", getattr(part, "node", None))

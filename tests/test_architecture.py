@@ -37,14 +37,15 @@ ROOMS = dict(
 )
 """What the page says of the rooms of each package, from the ground up; a file at its root is a room, too."""
 
-LONGEST_MODULE, LONGEST_FUNCTION = 450, 60
-"""Lines of a module, and lines of code of a function (docstring, comments and blank lines left out)."""
+LONGEST_MODULE = 620
+"""Lines of a module, docstrings and all: one statement for one purpose needs more than a packed one."""
+LONGEST_FUNCTION = 60
+"""Lines of code of a function (docstring, comments and blank lines left out)."""
 
 LONGER: dict[str, str] = {
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
     "discrepancy/missing_force/backward.py:backward": "One compiled loop over the samples of a record.",
     "discrepancy/missing_force/kalman.py:forward": "One compiled loop over the samples of a record.",
-    "fmu_asset/slaves/table.py:structure_table": "A table: one call a variable.",
 }
 """What may be longer, each with its reason."""
 

@@ -15,7 +15,7 @@ from fe.structure.affine import static_responses as static_responses
 from fe.wing.design import load_design as load_design
 from fe.wing.operators import assemble as assemble
 from fe.wing.operators import flapwise_bending_modes as flapwise_bending_modes
-from fmu_asset.door.session import FmiAsset as FmiAsset
+from fmu_asset.client.session import FmiAsset as FmiAsset
 from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
 from scenarios import structure_files as structure_files
 from twin_master.assets.resolution import Overrides as Overrides

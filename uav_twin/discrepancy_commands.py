@@ -42,16 +42,7 @@ def run(
 ) -> None:
     """Find out what the model lacks: verdict, report, patch, residuals."""
     one_thread()
-    if (campaign is None) == (from_run is None):
-        raise CampaignFileError(
-            "Give either the folder of a campaign or --from-run with that of a mission."
-        )
-    if from_run is None and (from_step is not None or to_step is not None):
-        raise CampaignFileError("--from-step and --to-step belong to --from-run.")
-    if from_step is not None and to_step is not None and to_step < from_step:
-        raise CampaignFileError(
-            f"--to-step {to_step} lies before --from-step {from_step}: no step is left."
-        )
+    _check_source(campaign, from_run, from_step, to_step)
     source = campaign or from_run
     assert source is not None
     folder = out if out is not None else Path("verdicts") / source.resolve().name
@@ -82,26 +73,9 @@ def run(
         investigation = parts.investigate(
             data, choice.model, catalogue, seed=seed, on_search=in_progress.begin
         )
-    separability = None
-    self_calibration = None
-    if investigation.problem is not None:
-        tested_campaign = investigation.campaign
-        setting = investigation.problem.setting
-        with stage("What this campaign can decide"):
-            separability = parts.separability(tested_campaign, choice.model, setting, catalogue)
-        if calibrate is not None:
-            workers = 1 if choice.kind is parts.ModelKind.FMU else 2  # an FMU is its own process
-            title = "Trying the workflow on simulated campaigns"
-            with stage(title, calibrate, "campaigns") as progress:
-                self_calibration = parts.self_calibrate(
-                    tested_campaign,
-                    choice.model,
-                    catalogue,
-                    calibrate,
-                    seed=seed,
-                    workers=workers,
-                    advance=progress.advance,
-                )
+    separability, self_calibration = _decidability(
+        investigation, choice, catalogue, calibrate, seed
+    )
     pack = None if choice.design is None else partial(parts.packed_beside, choice)
     content = parts.ReportInput(
         investigation, origin, separability, self_calibration, choice.design, pack=pack
@@ -111,6 +85,63 @@ def run(
             folder, content, replace_it=replace, report=not no_report
         )
     _conclude(content, folder, None if no_report else report_file, json=json)
+
+
+def _check_source(
+    campaign: Path | None, from_run: Path | None, from_step: int | None, to_step: int | None
+) -> None:
+    """Refuse both sources of records or none of them, and steps that are not those of a mission.
+
+    Raises
+    ------
+    CampaignFileError
+        If the options do not fit together; the sentence says which.
+    """
+    if (campaign is None) == (from_run is None):
+        raise CampaignFileError(
+            "Give either the folder of a campaign or --from-run with that of a mission."
+        )
+    if from_run is None and (from_step is not None or to_step is not None):
+        raise CampaignFileError("--from-step and --to-step belong to --from-run.")
+    if from_step is not None and to_step is not None and to_step < from_step:
+        raise CampaignFileError(
+            f"--to-step {to_step} lies before --from-step {from_step}: no step is left."
+        )
+
+
+def _decidability(
+    investigation: "parts.Investigation",
+    choice: "parts.ModelChoice",
+    catalogue: "Sequence[parts.Effect]",
+    calibrate: int | None,
+    seed: int,
+) -> tuple["parts.Separability | None", "parts.SelfCalibration | None"]:
+    """Return what the campaign can decide, and how often the workflow is right on simulated ones.
+
+    Both are None where the records could not be compared with the model; the second also where no
+    number of simulated campaigns is given.
+    """
+    if investigation.problem is None:
+        return None, None
+    tested_campaign = investigation.campaign
+    with stage("What this campaign can decide"):
+        separability = parts.separability(
+            tested_campaign, choice.model, investigation.problem.setting, catalogue
+        )
+    if calibrate is None:
+        return separability, None
+    workers = 1 if choice.kind is parts.ModelKind.FMU else 2  # an FMU is its own process
+    with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as progress:
+        self_calibration = parts.self_calibrate(
+            tested_campaign,
+            choice.model,
+            catalogue,
+            calibrate,
+            seed=seed,
+            workers=workers,
+            advance=progress.advance,
+        )
+    return separability, self_calibration
 
 
 def _keep_so_far(

@@ -232,7 +232,7 @@ def simulate(
         with closing(
             parts.FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
         ) as asset:
-            _finish(asset, parts.fly(asset, experiment), file, out, plot)
+            _finish(asset, parts.run_experiment(asset, experiment), file, out, plot)
         return
     assert inputs is not None  # they go with a binding
     fmu_binding = _interpolated(parts.load_binding(binding), interpolation)
@@ -241,7 +241,7 @@ def simulate(
     with closing(
         parts.FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
     ) as asset:
-        _finish(asset, parts.fly_histories(asset, steps, histories), file, out, plot)
+        _finish(asset, parts.run_histories(asset, steps, histories), file, out, plot)
 
 
 def simulate_system(
@@ -287,7 +287,7 @@ def simulate_system(
             isolated=not in_process,
             parameters=experiment.parameters,
         ) as asset:
-            _finish(asset, parts.fly(asset, experiment), file, out, plot)
+            _finish(asset, parts.run_experiment(asset, experiment), file, out, plot)
 
 
 def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:

@@ -143,6 +143,12 @@ def _largest_reading(here: Here) -> float:
     return kept[key]
 
 
+def _sampling_interval(here: Here) -> float:
+    """Return the median time between two samples of the trials that the effect changes [s]."""
+    intervals = [np.diff(trial.time) for trial in here.asked.trials if len(trial.time) > 1]
+    return float(np.median(np.concatenate(intervals))) if intervals else 0.0
+
+
 def _largest_release(here: Here) -> float:
     releases = [
         abs(trial.release.displacement)
@@ -169,6 +175,7 @@ SCALES: dict[str, Callable[[Here], float]] = {
     "tip_station": partial(_station, 1),
     "largest_reading": _largest_reading,
     "largest_release": _largest_release,
+    "sampling_interval": _sampling_interval,
     "number": lambda here: here.target.number,
     "port_displacement": lambda here: here.port.displacement,
     "port_stiffness": lambda here: here.port.stiffness,

@@ -8,7 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.system.time_history import RecordedHistory
-from fmu_asset.door.runs import State
+from fmu_asset.client.runs import OperatingPoint
 
 
 class FmuExcitation(NamedTuple):
@@ -16,7 +16,7 @@ class FmuExcitation(NamedTuple):
 
     Attributes
     ----------
-    state : State
+    state : OperatingPoint
         Parameters and constant inputs of the FMU.
     step : float
         Communication step [s].
@@ -35,7 +35,7 @@ class FmuExcitation(NamedTuple):
         Whether the FMU is to come to rest.
     """
 
-    state: State
+    state: OperatingPoint
     step: float
     record: int
     inputs: tuple[str, ...] = ()
@@ -45,7 +45,7 @@ class FmuExcitation(NamedTuple):
     settles: bool = False
 
     @property
-    def recording(self) -> tuple[State, float, int]:
+    def recording(self) -> tuple[OperatingPoint, float, int]:
         """State, step and number of steps of a recorded answer."""
         return self.state, self.step, self.record
 

@@ -20,7 +20,8 @@ from fe.compilation import compiled_kernel
 from fe.runtime.motion import static_solution
 from fe.runtime.port_laws import PortLaws
 from fe.runtime.time_steps import LENGTH_TOLERANCE
-from fmu_asset.door.runs import Run, StateSpace
+from fmu_asset.client.runs import FmuRun
+from fmu_asset.client.state_space import FmuStateSpace
 
 CONVERGED = 1e-4
 """Largest rms change of a motion with laws when steps are halved, as a share of the motion."""
@@ -76,7 +77,7 @@ class FmuSimulator(FmuAtRest):
         end = max(float(times[-1]), float(trial.time[-1]))
         ports = self._law_ports(excitation, laws)
         system = self.system(excitation)
-        if system is not None and not system.jumps(ports.columns, ports.force_numbers):
+        if system is not None and not system.has_jumping_speed(ports.columns, ports.force_numbers):
             return self._motion_of_system(
                 system, excitation, trial, laws, ports, readout, end, refinement
             )
@@ -101,7 +102,7 @@ class FmuSimulator(FmuAtRest):
 
     def _motion_of_system(
         self,
-        system: StateSpace,
+        system: FmuStateSpace,
         excitation: FmuExcitation,
         trial: Trial,
         laws: PortLaws,
@@ -114,7 +115,7 @@ class FmuSimulator(FmuAtRest):
 
         Parameters
         ----------
-        system : StateSpace
+        system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
             What moves the FMU.
@@ -156,7 +157,7 @@ class FmuSimulator(FmuAtRest):
             refinement,
             memory,
         )
-        rows, direct = system.rows(columns, readout.derivatives)
+        rows, direct = system.output_rows(columns, readout.derivatives)
         constant = np.where(is_derivative, 0.0, undisturbed[columns])
         values = states @ rows.T + forces @ direct.T + constant
         if excitation.releases:
@@ -169,7 +170,7 @@ class FmuSimulator(FmuAtRest):
             values[0] = np.where(is_derivative, values[0], held_outputs)
         if not is_even:
             return sample(values, excitation.step, readout, [0] * len(columns))
-        rates = (states @ system.generator.T + forces @ system.push.T) @ rows.T
+        rates = (states @ system.state_matrix.T + forces @ system.input_matrix.T) @ rows.T
         if direct.any():
             rates += np.gradient(forces, stamps, axis=0) @ direct.T
         values = values[sample_rows[:-1]]
@@ -181,7 +182,7 @@ class FmuSimulator(FmuAtRest):
 
     def _start_with_laws(
         self,
-        system: StateSpace,
+        system: FmuStateSpace,
         excitation: FmuExcitation,
         laws: PortLaws,
         ports: LawPorts,
@@ -191,7 +192,7 @@ class FmuSimulator(FmuAtRest):
 
         Parameters
         ----------
-        system : StateSpace
+        system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
             What moves the FMU.
@@ -211,7 +212,7 @@ class FmuSimulator(FmuAtRest):
         compliance = gain[np.ix_(ports.columns, ports.force_numbers)]
         solution = static_solution(laws, without_laws[None], compliance, kernel=compiled_kernel())
         law_forces = np.bincount(ports.force_numbers, solution.forces[0], len(first_forces))
-        return StartState(system.at_rest(first_forces - law_forces), solution.memory)
+        return StartState(system.state_at_rest(first_forces - law_forces), solution.memory)
 
     # ------------------------------------------------------------ step by step
 
@@ -254,9 +255,9 @@ class FmuSimulator(FmuAtRest):
                 # an unstable coupling grows beyond all numbers
                 with np.errstate(all="ignore"):
                     return self._outputs_with_laws(run, laws, trial.name)
-            courses = [values.tobytes() for values in run.courses.values()]
-            key = (run.state, run.step, run.steps, *run.begin.items(), *courses)
-            return self.remembered(key, lambda: self.followed(run))
+            courses = [values.tobytes() for values in run.offsets.values()]
+            key = (run.operating_point, run.step, run.steps, *run.initial_offsets.items(), *courses)
+            return self.cached(key, lambda: self.outputs_of_run(run))
 
         parts = 1
         if len(laws) and fixed_step is None:
@@ -270,30 +271,32 @@ class FmuSimulator(FmuAtRest):
         outputs = outputs_by(parts)[:, list(columns)]
         return SteppedOutputs(outputs, fixed_step or longest / parts)
 
-    def _settled_with_laws(self, run: Run, laws: PortLaws, trial: str) -> "SettledRun":
+    def _settled_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> "SettledRun":
         """Return a run that has settled with laws under its first loads."""
         outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
-        if not run.courses or not np.any(outputs[:, columns]):
+        if not run.offsets or not np.any(outputs[:, columns]):
             return SettledRun(run, None)
 
-        def run_under(forces: FloatArray) -> Run:
-            loads = {name: np.full(1, value) for name, value in run.begin.items()}
+        def run_under(forces: FloatArray) -> FmuRun:
+            loads = {name: np.full(1, value) for name, value in run.initial_offsets.items()}
             begin = self.loads_less_laws(loads, laws, forces)
-            return run._replace(begin={name: float(values[0]) for name, values in begin.items()})
+            return run._replace(
+                initial_offsets={name: float(values[0]) for name, values in begin.items()}
+            )
 
         def outputs_under(forces: FloatArray) -> FloatArray:
             return self._outputs_at_begin(run_under(forces))
 
-        _, solution = self.rest_with_laws(laws, outputs_under, outputs, run.state, trial)
+        _, solution = self.rest_with_laws(laws, outputs_under, outputs, run.operating_point, trial)
         return SettledRun(run_under(solution.forces), solution.memory)
 
-    def _outputs_at_begin(self, run: Run) -> FloatArray:
+    def _outputs_at_begin(self, run: FmuRun) -> FloatArray:
         """Return the outputs (1, C) at the begin of a run."""
-        _, outputs, _ = self.begun(run)
+        _, outputs, _ = self.start_run(run)
         return outputs[None]
 
-    def _outputs_with_laws(self, run: Run, laws: PortLaws, trial: str) -> FloatArray:
+    def _outputs_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> FloatArray:
         """Return the outputs (K, C) of a run with laws; NaN if the coupling is unstable."""
         run, memory = self._settled_with_laws(run, laws, trial)
         ports = [self.ports.index(name) for name in dict.fromkeys(laws.ports)]
@@ -311,7 +314,7 @@ class FmuSimulator(FmuAtRest):
         first_step, speed_gain = self._speed_gain(run, inputs, speed_columns)
         coupling = PortCoupling(laws, names, speed_gain, run.step, memory)
         # step by step, with the force of the laws held over each step
-        asset, first, courses = self.begun(run)
+        asset, first, courses = self.start_run(run)
         outputs = [first]
         forces = np.column_stack([*courses.values()])
         port_columns = [list(courses).index(name) for name in inputs]
@@ -327,33 +330,33 @@ class FmuSimulator(FmuAtRest):
             if not np.isfinite(step_forces).all():
                 return np.full((len(forces) + 1, len(first)), np.nan)
             load = dict(zip(courses, step_forces.tolist(), strict=True))
-            with self.refusals():
+            with self.refusal_context():
                 outputs.append(asset.step(load=load).values)
         return np.array(outputs)
 
     def _speed_gain(
-        self, run: Run, inputs: Sequence[str], speed_columns: list[int]
+        self, run: FmuRun, inputs: Sequence[str], speed_columns: list[int]
     ) -> tuple[FloatArray, FloatArray]:
         """Return speeds (2, P) around the first step, and what unit forces add in it (P, P).
 
         Parameters
         ----------
-        run : Run
+        run : FmuRun
             The run without laws.
         inputs : sequence of str
             Force input of each port.
         speed_columns : list of int
             Column of each port's speed.
         """
-        first_courses = {name: course[:1] for name, course in run.courses.items()}
-        one_step = run._replace(steps=1, courses=first_courses)
-        undisturbed = self.followed(one_step)[:, speed_columns]
-        sizes = np.array([self.size(name) for name in inputs])
+        first_courses = {name: course[:1] for name, course in run.offsets.items()}
+        one_step = run._replace(steps=1, offsets=first_courses)
+        undisturbed = self.outputs_of_run(one_step)[:, speed_columns]
+        sizes = np.array([self.probing_amplitude(name) for name in inputs])
         changes = []
         for name in inputs:
-            push = first_courses.get(name, 0.0) + np.full(1, self.size(name))
-            pushed = one_step._replace(courses={**first_courses, name: push})
-            changes.append(self.followed(pushed)[1, speed_columns] - undisturbed[1])
+            push = first_courses.get(name, 0.0) + np.full(1, self.probing_amplitude(name))
+            pushed = one_step._replace(offsets={**first_courses, name: push})
+            changes.append(self.outputs_of_run(pushed)[1, speed_columns] - undisturbed[1])
         return undisturbed, np.stack(changes, axis=1) / sizes
 
     def _parts_for(
@@ -433,7 +436,7 @@ class SteppedOutputs(NamedTuple):
 class SettledRun(NamedTuple):
     """A run that begins at rest with laws, and their memory; None if they were never loaded."""
 
-    run: Run
+    run: FmuRun
     memory: FloatArray | None
 
 

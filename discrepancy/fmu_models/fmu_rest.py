@@ -14,7 +14,7 @@ from discrepancy.fmu_models.identified_fmu import LINEAR, RECORD, IdentifiedFmu
 from fe.compilation import compiled_kernel
 from fe.runtime.motion import StaticSolution, static_solution
 from fe.runtime.port_laws import PortLaws
-from fmu_asset.door.runs import State
+from fmu_asset.client.runs import OperatingPoint
 
 STATIC_ITERATIONS = 30
 """Iterations after which a law and an FMU at rest are given up."""
@@ -44,21 +44,21 @@ class FmuAtRest(IdentifiedFmu):
         super().__init__(description, folder)
         self._rest_is_linear: dict[tuple[str, ...], bool] = {}
 
-    def rest(self, states: Sequence[State], loads: Mapping[str, FloatArray]) -> FloatArray:
+    def rest(self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray]) -> FloatArray:
         """Return the outputs (L, C) at rest in states that differ in inputs.
 
         Where the FMU has to come to rest and is linear, what loads add is that of its system.
 
         Parameters
         ----------
-        states : sequence of State
+        states : sequence of OperatingPoint
             Parameters and constant inputs of each of the L rows.
         loads : mapping of str to (L,) array
             What is added to inputs in each row.
         """
         static = self.description.static
         if not static.settle:
-            return self.resting(states, loads, static.step, settle=False)
+            return self.outputs_at_rest(states, loads, static.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
         amounts = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
         # the largest load says whether the FMU is linear
@@ -69,13 +69,13 @@ class FmuAtRest(IdentifiedFmu):
         return np.array([outputs[row] for row in range(len(states))])
 
     def _settled_outputs(
-        self, state: State, amounts: FloatArray, names: tuple[str, ...]
+        self, state: OperatingPoint, amounts: FloatArray, names: tuple[str, ...]
     ) -> FloatArray:
         """Return the outputs (C,) of the settled FMU under amounts (E,) on some inputs.
 
         Parameters
         ----------
-        state : State
+        state : OperatingPoint
             Parameters and constant inputs.
         amounts : (E,) array
             What is added to the inputs.
@@ -104,20 +104,20 @@ class FmuAtRest(IdentifiedFmu):
         return self._stepped_rest(state, amounts, names)
 
     def _stepped_rest(
-        self, state: State, amounts: FloatArray, names: tuple[str, ...]
+        self, state: OperatingPoint, amounts: FloatArray, names: tuple[str, ...]
     ) -> FloatArray:
         """Return the outputs (C,) of the FMU itself when it has come to rest."""
         loads = dict(zip(names, amounts[:, None], strict=True))
         key = (state, names, amounts.tobytes())
         step = self.description.static.step
-        return self.remembered(key, lambda: self.resting([state], loads, step, settle=True)[0])
+        return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
-    def flexibility(self, state: State) -> FloatArray:
+    def flexibility(self, state: OperatingPoint) -> FloatArray:
         """Return the displacements (P, P) of the ports at rest under a unit force at each."""
         if not self.ports:
             # loads of zero may be outside of what the FMU takes
             return np.zeros((0, 0))
-        pushes = np.diag([self.size(name) for name in self.port_inputs])
+        pushes = np.diag([self.probing_amplitude(name) for name in self.port_inputs])
         # the first row is without a force
         loads = dict.fromkeys(self.port_inputs, np.zeros(len(pushes) + 1))
         for name, push in zip(self.port_inputs, pushes, strict=True):
@@ -127,13 +127,17 @@ class FmuAtRest(IdentifiedFmu):
         return np.asarray((displacements[1:] - displacements[0]).T / np.diag(pushes))
 
     def at_rest(
-        self, states: Sequence[State], loads: Mapping[str, FloatArray], laws: PortLaws, trial: str
+        self,
+        states: Sequence[OperatingPoint],
+        loads: Mapping[str, FloatArray],
+        laws: PortLaws,
+        trial: str,
     ) -> FloatArray:
         """Return the outputs (L, C) where laws follow the load path; the FMU confirms the result.
 
         Parameters
         ----------
-        states : sequence of State
+        states : sequence of OperatingPoint
             Parameters and constant inputs of each of the L rows.
         loads : mapping of str to (L,) array
             What is added to inputs in each row.
@@ -161,7 +165,7 @@ class FmuAtRest(IdentifiedFmu):
         return self.rest_with_laws(laws, outputs_under, outputs, states[0], trial).outputs
 
     def _refuse_first_row(
-        self, states: Sequence[State], loads: Mapping[str, FloatArray], trial: str
+        self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray], trial: str
     ) -> None:
         """Raise `ModelError` for the first row of a trial that the FMU refuses by itself."""
         for row, state in enumerate(states):
@@ -195,7 +199,7 @@ class FmuAtRest(IdentifiedFmu):
         laws: PortLaws,
         outputs_under: Callable[[FloatArray], FloatArray],
         outputs: FloatArray,
-        state: State,
+        state: OperatingPoint,
         trial: str,
     ) -> RestWithLaws:
         """Return the rest with laws, by iterations of laws and FMU.
@@ -208,7 +212,7 @@ class FmuAtRest(IdentifiedFmu):
             Forces (L, J) of the laws to outputs (L, C) at rest.
         outputs : (L, C) array
             Outputs without laws.
-        state : State
+        state : OperatingPoint
             State whose flexibility leads to where laws and FMU agree.
         trial : str
             Name of the trial, for sentences.

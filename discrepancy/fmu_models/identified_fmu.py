@@ -18,7 +18,8 @@ from discrepancy.fmu_models.system_motion import MOST_SYSTEMS, system_motion
 from discrepancy.fmu_models.variables import FmuVariables
 from discrepancy.system.excitation import Excitation, Load
 from discrepancy.system.time_history import RecordedHistory, equivalent_ramps
-from fmu_asset.door.runs import FmuRuns, Run, State, StateSpace, realised
+from fmu_asset.client.runs import FmuRun, FmuRuns, OperatingPoint
+from fmu_asset.client.state_space import FmuStateSpace, realise_state_space
 from fmu_asset.errors import FmuError
 from reporting.memory import ResultCache
 
@@ -49,7 +50,7 @@ class Pace(NamedTuple):
 class PacedSystem(NamedTuple):
     """The system at a step that shows all modes, if the FMU is linear; parts of an interval."""
 
-    system: StateSpace | None
+    system: FmuStateSpace | None
     excitation: FmuExcitation
     parts: int
 
@@ -66,7 +67,7 @@ class IdentifiedFmu(FmuRuns):
 
     Attributes
     ----------
-    nominal : State
+    nominal : OperatingPoint
         State of motions at the means of the parameters; set by the model.
     ports, port_inputs : list of str
         Names of the ports, and inputs of their forces.
@@ -76,12 +77,12 @@ class IdentifiedFmu(FmuRuns):
         Parameter or input that releases the FMU, and the parameter of its velocity.
     """
 
-    nominal = State()
+    nominal = OperatingPoint()
 
     def __init__(self, description: FmuModelDescription, folder: Path) -> None:
         self.description = description
         static = description.static
-        with self.refusals():
+        with self.refusal_context():
             self.names = FmuVariables(description, folder)
             super().__init__(
                 self.names.path,
@@ -128,14 +129,14 @@ class IdentifiedFmu(FmuRuns):
             variables.append(self.names.variable(release.hold))
         return variables
 
-    def refusals(self) -> AbstractContextManager[None]:
+    def refusal_context(self) -> AbstractContextManager[None]:
         """Return the context that adds the model's name to what the FMU refuses."""
         return ModelError.instead_of(FmuError, before=f"The FMU model {self.description.name!r}: ")
 
     def excitation(
         self,
         trial: Trial,
-        state: State,
+        state: OperatingPoint,
         ports: Sequence[str],
         levers: Mapping[str, float] | None = None,
     ) -> FmuExcitation:
@@ -145,7 +146,7 @@ class IdentifiedFmu(FmuRuns):
         ----------
         trial : Trial
             A dynamic trial.
-        state : State
+        state : OperatingPoint
             Parameters and constant inputs.
         ports : sequence of str
             Ports at which laws act.
@@ -160,7 +161,7 @@ class IdentifiedFmu(FmuRuns):
 
     # ------------------------------------------------------------ its linear system
 
-    def system(self, excitation: FmuExcitation) -> StateSpace | None:
+    def system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the FMU as a linear system; None if it is not linear.
 
         It is linear where one system gives its answers to single forces and releases, and predicts
@@ -173,58 +174,58 @@ class IdentifiedFmu(FmuRuns):
         if not may_be_linear or self._is_linear.get(kind) is False:
             return None
         key = (kind, *excitation.recording)
-        system: StateSpace | None = self._systems.get(key, lambda: self._identify(excitation))
+        system: FmuStateSpace | None = self._systems.get(key, lambda: self._identify(excitation))
         if system is not None and kind not in self._is_linear:
             self._is_linear[kind] = self._predicts(system, excitation, LINEAR)
         return system if self._is_linear.get(kind) else None
 
-    def _identify(self, excitation: FmuExcitation) -> StateSpace | None:
+    def _identify(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the linear system of the answers to unit forces and releases, if there is one."""
         answers = [self._answer_to_force(excitation, name) for name in excitation.inputs]
         answers += [self._answer_to_release(excitation, name) for name in excitation.releases]
         records = np.stack(answers, axis=2)[1:]
-        return realised(records, len(excitation.inputs), excitation.step)
+        return realise_state_space(records, len(excitation.inputs), excitation.step)
 
     def _answer_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (record + 1, C) after a unit force over the first step."""
-        size = self.size(name)
+        size = self.probing_amplitude(name)
         impulse = size * np.eye(1, excitation.record).ravel()
-        run = Run(*excitation.recording, courses={name: impulse})
+        run = FmuRun(*excitation.recording, offsets={name: impulse})
         key = (*excitation.recording, name, False)
-        return self.remembered(key, lambda: self._motion(excitation, run) / size)
+        return self.cached(key, lambda: self._motion(excitation, run) / size)
 
     def _answer_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
         """Return the outputs (record + 1, C) after a release by one unit."""
         usual = excitation.releases[name] or 1.0
         if self._is_input(name):
-            usual = self.size(name)
+            usual = self.probing_amplitude(name)
         size = self._release_sizes.setdefault(name, usual)
         run = self._run(excitation._replace(force=None), {name: size})
         key = (*excitation.recording, name, True)
-        return self.remembered(key, lambda: self._motion(excitation, run) / size)
+        return self.cached(key, lambda: self._motion(excitation, run) / size)
 
     def _is_input(self, name: str) -> bool:
         """Return whether a name is an input of the FMU, not a parameter."""
         return name in self.names.binding.load
 
-    def _motion(self, excitation: FmuExcitation, run: Run) -> FloatArray:
+    def _motion(self, excitation: FmuExcitation, run: FmuRun) -> FloatArray:
         """Return the outputs (steps + 1, C) of a run, less those of the undisturbed FMU."""
-        return self.followed(run) - self._undisturbed_outputs(excitation)
+        return self.outputs_of_run(run) - self._undisturbed_outputs(excitation)
 
     def _undisturbed_outputs(self, excitation: FmuExcitation) -> FloatArray:
         """Return the outputs (C,) at the start if nothing moves the FMU."""
         state, step, _ = excitation.recording
-        run = Run(state, step, 0)
-        return self.remembered((state, step), lambda: self.begun(run)[1])
+        run = FmuRun(state, step, 0)
+        return self.cached((state, step), lambda: self.start_run(run)[1])
 
-    def _predicts(self, system: StateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
+    def _predicts(self, system: FmuStateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
         """Return whether a system gives the motion of the FMU under all that moves it at once.
 
         Inputs of laws get random forces.
 
         Parameters
         ----------
-        system : StateSpace
+        system : FmuStateSpace
             The system.
         excitation : FmuExcitation
             What moves the FMU.
@@ -235,11 +236,11 @@ class IdentifiedFmu(FmuRuns):
         run = self._run(excitation, amounts)
         random = np.random.default_rng(0)
         forces = {
-            name: self.size(name) * random.uniform(-1.0, 1.0, run.steps)
+            name: self.probing_amplitude(name) * random.uniform(-1.0, 1.0, run.steps)
             for name in excitation.inputs
         }
-        forces |= run.courses
-        motion = self._motion(excitation, run._replace(courses=forces))
+        forces |= run.offsets
+        motion = self._motion(excitation, run._replace(offsets=forces))
         # the same by the system
         time = excitation.step * np.arange(run.steps + 1.0)
         loads = []
@@ -248,7 +249,7 @@ class IdentifiedFmu(FmuRuns):
             loads.append(Load(direction, history))
         start = self._start_state(system, excitation, amounts)
         states, acting = system_motion(system, Excitation(time, time, loads), start)
-        predicted = motion - states @ system.outputs.T - acting @ system.direct.T
+        predicted = motion - states @ system.output_matrix.T - acting @ system.feedthrough.T
         error = np.max(np.abs(predicted)[1:], axis=0)
         return bool(np.all(error <= tolerance * np.max(np.abs(motion), axis=0) + 1e-300))
 
@@ -287,11 +288,11 @@ class IdentifiedFmu(FmuRuns):
             at_begin = excitation._replace(force=None, record=0)
             run = self._run(at_begin, {name: amount})
             key = (excitation.state, excitation.step, name, amount, "begin")
-            outputs = self.remembered(key, lambda: self.begun(run)[1])
+            outputs = self.cached(key, lambda: self.start_run(run)[1])
             moved = float((outputs - self._undisturbed_outputs(excitation))[column])
             return moved - displacement
 
-        guess = self.size(name) if self._is_input(name) else displacement
+        guess = self.probing_amplitude(name) if self._is_input(name) else displacement
         solution = root_scalar(missing_displacement, x0=0.0, x1=guess, rtol=1e-10, maxiter=20)
         amount = float(solution.root)
         if not abs(missing_displacement(amount)) <= 1e-6 * abs(displacement):
@@ -302,11 +303,13 @@ class IdentifiedFmu(FmuRuns):
             )
         return amounts | {name: amount}
 
-    def _run(self, excitation: FmuExcitation, amounts: Mapping[str, float]) -> Run:
+    def _run(self, excitation: FmuExcitation, amounts: Mapping[str, float]) -> FmuRun:
         """Return the run by which the FMU follows an excitation, released by amounts."""
         begin = {name: amount for name, amount in amounts.items() if self._is_input(name)}
         parameters = {name: amount for name, amount in amounts.items() if name not in begin}
-        run = Run(excitation.state.having(parameters), excitation.step, excitation.record, begin)
+        run = FmuRun(
+            excitation.state.with_parameters(parameters), excitation.step, excitation.record, begin
+        )
         if excitation.force is None:
             return run
         for name, lever in excitation.levers.items():
@@ -317,21 +320,21 @@ class IdentifiedFmu(FmuRuns):
         courses = {
             name: 0.5 * lever * (at_begin + at_end) for name, lever in excitation.levers.items()
         }
-        return run._replace(courses=courses)
+        return run._replace(offsets=courses)
 
     def _start_state(
-        self, system: StateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
+        self, system: FmuStateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
     ) -> FloatArray:
         """Return the state (n,) at the begin: as released, and at rest under the first force."""
-        start: FloatArray = system.starts @ np.array([*amounts.values()])
+        start: FloatArray = system.release_states @ np.array([*amounts.values()])
         first_force = excitation.first_force
         if first_force:
-            return start + system.at_rest(first_force * excitation.lever_values)
+            return start + system.state_at_rest(first_force * excitation.lever_values)
         return start
 
     # ------------------------------------------------------------ pace
 
-    def pace(self, trial: Trial, state: State) -> Pace:
+    def pace(self, trial: Trial, state: OperatingPoint) -> Pace:
         """Return the first mode of the FMU and the communication step of a trial.
 
         The mode is the one that is most flexible at the first port; without a port, the loudest.
@@ -349,10 +352,12 @@ class IdentifiedFmu(FmuRuns):
         # the first mode
         mode = None
         if system is not None and self.ports:
-            mode = system.most_flexible(self.displacement_columns[0], 0)
+            mode = system.most_flexible_mode(self.displacement_columns[0], 0)
         frequency = self.description.scales.angular_frequency
         if not frequency:
-            frequency = self._loudest_frequency(excitation) if mode is None else mode[0]
+            frequency = (
+                self._loudest_frequency(excitation) if mode is None else mode.angular_frequency
+            )
         least_parts = max(parts, ceil(frequency * interval / PHASE))
         return Pace(frequency, self.description.motion.step or interval / least_parts)
 

@@ -26,7 +26,8 @@ from discrepancy.system.scales import PortScale, Scales
 from discrepancy.system.time_history import RecordedHistory, subdivide
 from fe.runtime.patch import SENSORS, LoadGain, LoadPlace, ModelPatch, PortForce, Primitive
 from fe.runtime.port_laws import PortLaws, port_laws
-from fmu_asset.door.runs import State, StateSpace
+from fmu_asset.client.runs import OperatingPoint
+from fmu_asset.client.state_space import FmuStateSpace
 from reporting.words import comma_list
 
 LATEST = 100.0
@@ -170,7 +171,7 @@ class FmuModel(DescribedModel):
                 return self._stiffnesses_of_system(system)
         return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]
 
-    def _stiffnesses_of_system(self, system: StateSpace) -> list[PortStiffness]:
+    def _stiffnesses_of_system(self, system: FmuStateSpace) -> list[PortStiffness]:
         """Return the stiffness of each port of a linear system."""
         stiffnesses = []
         for port, column in enumerate(self.fmu.displacement_columns):
@@ -321,8 +322,8 @@ class FmuModel(DescribedModel):
         is_usable = (
             at_mean is not None
             and system is not None
-            and len(at_mean.push) == len(system.push)
-            and not system.jumps(
+            and len(at_mean.input_matrix) == len(system.input_matrix)
+            and not system.has_jumping_speed(
                 np.array(displacement_columns, dtype=np.int64), np.arange(len(displacement_columns))
             )
         )
@@ -332,22 +333,22 @@ class FmuModel(DescribedModel):
                 "its ports move; it is not linear, or they are too few or too rough, or speeds "
                 "jump with forces."
             )
-        system = system.in_state_of(at_mean)
-        positions, _ = system.rows(displacement_columns, 0)
-        speeds, _ = system.rows(displacement_columns, 1)
+        system = system.in_coordinates_of(at_mean)
+        positions, _ = system.output_rows(displacement_columns, 0)
+        speeds, _ = system.output_rows(displacement_columns, 1)
         columns = self._output_columns(outputs)
-        rows, direct = system.rows(columns.columns, columns.derivatives)
+        rows, direct = system.output_rows(columns.columns, columns.derivatives)
         return PortedSystem(
-            generator=system.generator,
+            generator=system.state_matrix,
             ports=self.ports,
-            actions=system.push.T,
+            actions=system.input_matrix.T,
             positions=positions,
             speeds=speeds,
             outputs=rows,
             through=direct.T,
         )
 
-    def _system_at(self, trial: Trial, parameters: FloatArray) -> StateSpace | None:
+    def _system_at(self, trial: Trial, parameters: FloatArray) -> FmuStateSpace | None:
         """Return the linear system at values of the parameters; None if the FMU is not linear."""
         conditions = Conditions(parameters, health=trial.health[:1])
         state = self._state(trial, conditions, self.patch)
@@ -404,7 +405,7 @@ class FmuModel(DescribedModel):
 
     def _state(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH, row: int = 0
-    ) -> State:
+    ) -> OperatingPoint:
         """Return parameters and constant inputs of a row of a trial, with effects of a patch.
 
         Parameters
@@ -436,4 +437,4 @@ class FmuModel(DescribedModel):
         values = conditions.parameters.tolist()
         parameters |= dict(zip(self._parameter_keys, values, strict=True))
         parameters |= effect_parameters(patch, self.description.effects, parameters, self.what)
-        return State((), tuple(sorted(inputs.items()))).having(parameters)
+        return OperatingPoint((), tuple(sorted(inputs.items()))).with_parameters(parameters)

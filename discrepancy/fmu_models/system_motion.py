@@ -15,7 +15,7 @@ from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import InitialMotion, integrate_motion
 from fe.runtime.port_laws import NO_LAWS, PortLaws
 from fe.runtime.time_steps import loaded_steps, step_boundaries
-from fmu_asset.door.runs import StateSpace
+from fmu_asset.client.state_space import FmuStateSpace
 
 MOST_SYSTEMS = 64
 """Number of systems that are kept."""
@@ -54,7 +54,7 @@ class SystemMotion(NamedTuple):
 
 
 def system_motion(
-    system: StateSpace,
+    system: FmuStateSpace,
     excitation: Excitation,
     start: FloatArray,
     laws: PortLaws = NO_LAWS,
@@ -69,7 +69,7 @@ def system_motion(
 
     Parameters
     ----------
-    system : StateSpace
+    system : FmuStateSpace
         The system that moves.
     excitation : Excitation
         Forces, with directions (E,).
@@ -100,13 +100,13 @@ def system_motion(
     begin, end = equivalent_ramps(
         lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time
     )
-    direct_displacement = excitation.loads_at(boundaries.time, system.direct[ports.columns].T)
+    direct_displacement = excitation.loads_at(boundaries.time, system.feedthrough[ports.columns].T)
     steps = loaded_steps(modal, boundaries, begin, end, direct_displacement)
     # ports follow from the state at the begin
-    port_rows = system.outputs[ports.columns[coupled.first_laws]]
+    port_rows = system.output_matrix[ports.columns[coupled.first_laws]]
     rest_positions = ports.rest_positions[coupled.first_laws]
     positions = port_rows @ start + rest_positions
-    speeds = port_rows @ system.generator @ start
+    speeds = port_rows @ system.state_matrix @ start
     first = InitialMotion(
         q=np.concatenate((positions, 0.0 * start)),
         v=np.concatenate((speeds, start)),
@@ -114,7 +114,7 @@ def system_motion(
     )
     motion = integrate_motion(modal, laws, steps, first, compiled_kernel())
     # what acts on the system, laws too
-    forces = excitation.loads_at(excitation.sample_times, np.eye(system.push.shape[1]))
+    forces = excitation.loads_at(excitation.sample_times, np.eye(system.input_matrix.shape[1]))
     np.subtract.at(forces.T, ports.force_numbers, motion.port_forces.T)
     return SystemMotion(motion.v[:, len(positions) :], forces)
 
@@ -139,7 +139,7 @@ class SystemWithPorts(NamedTuple):
 
 @lru_cache(maxsize=MOST_SYSTEMS)
 def _with_ports(
-    system: StateSpace,
+    system: FmuStateSpace,
     names: tuple[str, ...],
     columns: tuple[int, ...],
     force_numbers: tuple[int, ...],
@@ -148,7 +148,7 @@ def _with_ports(
 
     Parameters
     ----------
-    system : StateSpace
+    system : FmuStateSpace
         The system, of order n.
     names : tuple of str
         Port of each law.
@@ -157,16 +157,16 @@ def _with_ports(
     """
     ports, first_laws = np.unique(names, return_index=True)
     count = len(first_laws)
-    order = len(system.generator)
+    order = len(system.state_matrix)
     column = np.array(columns, dtype=np.int64)[first_laws]
     number = np.array(force_numbers, dtype=np.int64)[first_laws]
     # rates of ports and state
-    port_rates = system.outputs[column] @ system.generator
-    directions = np.vstack((port_rates @ system.push, system.push))
+    port_rates = system.output_matrix[column] @ system.state_matrix
+    directions = np.vstack((port_rates @ system.input_matrix, system.input_matrix))
     damping = np.zeros((count + order, count + order))
-    damping[:, count:] = -np.vstack((port_rates @ system.generator, system.generator))
+    damping[:, count:] = -np.vstack((port_rates @ system.state_matrix, system.state_matrix))
     # displacement that comes at once with the force
-    at_once = system.direct[column, number]
+    at_once = system.feedthrough[column, number]
     at_rest = system.gain[column, number]
     modal = ModalSystem(
         np.zeros(count + order),

@@ -10,7 +10,8 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import ModelError
 from discrepancy.fmu_models.description import FmuModelDescription, FmuOutputSection
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector, expand, load_binding
+from fmu_asset.client.binding import Binding, BindingHeader, load_binding
+from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding, expand
 from reporting.words import counted
 
 REVOLUTIONS = ("1/min", "rpm", "r/min", "rev/min")
@@ -67,7 +68,7 @@ class FmuVariables:
         step = description.motion.step or description.static.step
         file = description.binding_file(folder)
         if file is None:
-            base = Binding(binding=Header(name=description.name, step_size=step))
+            base = Binding(binding=BindingHeader(name=description.name, step_size=step))
         else:
             base = load_binding(file)
         self._variables = _variables_by_name(base)
@@ -80,7 +81,7 @@ class FmuVariables:
         parameters = self._bound_parameters(base.parameter)
         observed = self._observed_variables()
         self.columns = {item.name: column for column, item in enumerate(observed)}
-        outputs = Vector(
+        outputs = VectorBinding(
             variables=tuple(item.variable for item in observed),
             unit=tuple(item.unit for item in observed),
         )
@@ -101,7 +102,7 @@ class FmuVariables:
         """Return the key under which a parameter is set: the binding's key, or the FMU's name."""
         return self._parameter_keys.get(name, name)
 
-    def _bound_inputs(self) -> dict[str, Input]:
+    def _bound_inputs(self) -> dict[str, InputBinding]:
         """Return the inputs that trials set, by the FMU's names; note factors of `[[input]]`."""
         description = self._description
         inputs = description.inputs
@@ -125,14 +126,16 @@ class FmuVariables:
             if not is_in_revolutions:
                 unit = self._unit_of_quantity(section.quantity, section.variable)
             units[section.variable] = unit
-        bound: dict[str, Input] = {}
+        bound: dict[str, InputBinding] = {}
         for name, unit in units.items():
             if name is not None:
                 variable = self.variable(name)
-                bound[variable] = Input(variable=variable, unit=unit)
+                bound[variable] = InputBinding(variable=variable, unit=unit)
         return bound
 
-    def _bound_parameters(self, known: Mapping[str, Parameter]) -> dict[str, Parameter]:
+    def _bound_parameters(
+        self, known: Mapping[str, ParameterBinding]
+    ) -> dict[str, ParameterBinding]:
         """Return the parameters that the binding does not have, or has in another unit.
 
         The value and the range that the binding has in another unit are left out.
@@ -142,14 +145,14 @@ class FmuVariables:
         if description.release is not None:
             units[description.release.displacement] = "m"
             units[description.release.velocity] = "m/s"
-        bound: dict[str, Parameter] = {}
+        bound: dict[str, ParameterBinding] = {}
         for name, unit in units.items():
             if name is None:
                 continue
             key = self.parameter(name)
             if key not in known or unit != known[key].unit:
                 variable = known[key].variable if key in known else key
-                bound[key] = Parameter(variable=variable, unit=unit)
+                bound[key] = ParameterBinding(variable=variable, unit=unit)
         return bound
 
     def _observed_variables(self) -> list[ObservedVariable]:

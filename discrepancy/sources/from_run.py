@@ -17,7 +17,7 @@ from calibration.result.file import load_calibration
 from discrepancy.campaign import records
 from discrepancy.errors import CampaignDataError, CampaignFileError, DiscrepancyError, said
 from discrepancy.system.structures import WingModel
-from fmu_asset.door.binding import load_binding
+from fmu_asset.client.binding import load_binding
 from fmu_asset.errors import FmuError
 from fmu_asset.packing.patch_file import load_patch
 from reporting.errors import DamagedFileError

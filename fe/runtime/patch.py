@@ -36,6 +36,7 @@ from .sensor_primitives import RunOffset as RunOffset
 from .sensor_primitives import Sensor as Sensor
 from .sensor_primitives import SensorDrift as SensorDrift
 from .sensor_primitives import SensorGain as SensorGain
+from .sensor_primitives import SensorLag as SensorLag
 from .sensor_primitives import SensorRecord as SensorRecord
 from .sensor_primitives import SensorRotation as SensorRotation
 from .sensor_primitives import SensorSaturation as SensorSaturation
@@ -149,6 +150,7 @@ SENSORS = (
     SensorRotation,
     ThermalStrain,
     HighPass,
+    SensorLag,
     Clock,
     LoggerClock,
     Line,

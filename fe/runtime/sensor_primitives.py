@@ -243,6 +243,73 @@ class HighPass(Sensor):
     quantity: str = ""
 
 
+class SensorLag(Sensor):
+    """A channel shows now what it should have shown `lag` [s] earlier: a late filter or logger.
+
+    With a negative lag the recorded force is the late one. Ring-downs have no force that a reading
+    could follow late, so that a lag changes forced and driven trials alone.
+    """
+
+    channel: str
+    lag: Annotated[float, "s"]
+    quantity: str = ""
+
+    def readings(
+        self, record: SensorRecord, values: FloatArray, rates: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the readings (N, C) of earlier moments, and their rates; see `Sensor.readings`.
+
+        Before the first sample a settled record stood still; another one had its first rate. After
+        the last sample the readings go on with their last rate.
+        """
+        if record.kind not in ("forced", "driven") or len(record.time) == 1:
+            return values, rates
+        earlier = record.time - self.lag
+        shown, shown_rates = interpolated_by_cubics(record.time, values, rates, earlier)
+        first_rate = np.zeros_like(rates[0]) if record.settled else rates[0]
+        before = earlier < record.time[0]
+        shown[before] = values[0] + np.outer(earlier[before] - record.time[0], first_rate)
+        shown_rates[before] = first_rate
+        after = earlier > record.time[-1]
+        shown[after] = values[-1] + np.outer(earlier[after] - record.time[-1], rates[-1])
+        shown_rates[after] = rates[-1]
+        return shown, shown_rates
+
+
+def interpolated_by_cubics(
+    time: FloatArray, values: FloatArray, rates: FloatArray, moments: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return columns and their rates at other moments, by a Hermite cubic over each interval.
+
+    The cubic has the given values and rates at both ends of its interval.
+
+    Parameters
+    ----------
+    time : (N,) array
+        Increasing times [s], at least two.
+    values, rates : (N, C) array
+        The columns at these times, and their time derivatives.
+    moments : (M,) array
+        The times that are asked for [s]; outside of the record the cubics at its ends go on.
+
+    Returns
+    -------
+    values, rates : (M, C) array
+        The columns and their time derivatives at the moments.
+    """
+    last_interval = len(time) - 2
+    interval = np.clip(np.searchsorted(time, moments, side="right") - 1, 0, last_interval)
+    length = (time[interval + 1] - time[interval])[:, np.newaxis]
+    s = (moments - time[interval])[:, np.newaxis] / length
+    begin, end = values[interval], values[interval + 1]
+    begin_rate, end_rate = rates[interval], rates[interval + 1]
+    shown = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * begin + s**2 * (3.0 - 2.0 * s) * end
+    shown += length * s * (1.0 - s) * ((1.0 - s) * begin_rate - s * end_rate)
+    shown_rates = 6.0 * s * (1.0 - s) * (end - begin) / length
+    shown_rates += (1.0 - s) * (1.0 - 3.0 * s) * begin_rate + s * (3.0 * s - 2.0) * end_rate
+    return shown, shown_rates
+
+
 class Clock(Sensor):
     """A sample stamped t was taken at (1 + `rate`) t + `zero` [s], t since the first stamp."""
 

@@ -13,19 +13,19 @@ from typing import Any
 
 from fmu_asset.description import PLACEHOLDER, Declaration
 from fmu_asset.packing.contents import python_members, sealed
-from fmu_asset.slaves.variables import Table
+from fmu_asset.slaves.variables import VariableTable
 
 _IMPORTS = """import json
 
 from .companions.{name} import {behaviour} as Behaviour
-from .slaves.base import Contents
+from .slaves.contents import SlaveContents
 from .slaves.variables import FmuVariable
 
 
 def load_contents(resources):
     \"\"\"Return the variables that were packed, and their behaviour.\"\"\"
     rows = json.loads((resources / "variables.json").read_text(encoding="utf-8"))
-    return Contents(tuple(FmuVariable(**row) for row in rows), Behaviour)
+    return SlaveContents(tuple(FmuVariable(**row) for row in rows), Behaviour)
 
 """
 
@@ -65,10 +65,10 @@ def companion_declaration(name: str, description: Mapping[str, Any]) -> Declarat
         The model name.
     description : mapping
         The TOML file: `description`, and `group`, a list of tables with `variables` and `repeat`. A
-        variable has the keys of `Table.add`, with `low` and `high` for its range; an output may
-        name the input that it depends on directly as `of`.
+        variable has the keys of `VariableTable.add`, with `low` and `high` for its range; an output
+        may name the input that it depends on directly as `of`.
     """
-    table = Table({})
+    table = VariableTable({})
     dependencies: dict[str, list[str]] = {"status": []}
     for group in description["group"]:
         for number in range(1, group.get("repeat", 1) + 1):
@@ -79,13 +79,13 @@ def companion_declaration(name: str, description: Mapping[str, Any]) -> Declarat
 
 
 def _add_variable(
-    table: Table, dependencies: dict[str, list[str]], row: Mapping[str, Any], number: int
+    table: VariableTable, dependencies: dict[str, list[str]], row: Mapping[str, Any], number: int
 ) -> None:
     """Add a variable to the table, and its direct dependency if it is an output.
 
     Parameters
     ----------
-    table : Table
+    table : VariableTable
         The variables so far.
     dependencies : dict of str to list of str
         The inputs that each output depends on directly.
@@ -99,6 +99,6 @@ def _add_variable(
         keys[key] = value.format(n=number) if isinstance(value, str) else value
     source = keys.pop("of", None)
     value_range = (keys.pop("low", None), keys.pop("high", None))
-    table.add(**keys, box=value_range)
+    table.add(**keys, limits=value_range)
     if keys["causality"] == "output":
         dependencies[keys["name"]] = [] if source is None else [source]

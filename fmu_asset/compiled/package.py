@@ -20,7 +20,7 @@ from fe.runtime.reduced_arrays import ReducedArrays
 from fmu_asset import description
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.instances.plan import Interface
-from fmu_asset.slaves.table import Roles
+from fmu_asset.slaves.table import StructureRoles
 from fmu_asset.slaves.variables import ENUMERATIONS, TRANSIENT, FmuVariable
 from reporting.choices import require_one_of
 
@@ -159,7 +159,7 @@ HOST = "It is compiled C and needs nothing but the C library; its sources are in
 def compiled_members(
     model: ReducedArrays,
     declaration: description.Declaration,
-    roles: Roles,
+    roles: StructureRoles,
     *,
     fmi: FmiVersion = 2,
     interface: Interface = "co-simulation",
@@ -172,7 +172,7 @@ def compiled_members(
         The reduced structure.
     declaration : Declaration
         What the FMU declares for co-simulation.
-    roles : Roles
+    roles : StructureRoles
         The role of each of its variables.
     fmi : {2, 3}
         The version of FMI: the same sources but for its functions. In FMI 3, numbered variables,
@@ -224,7 +224,9 @@ def compiled_members(
 
 
 def variable_sources(
-    table: Sequence[FmuVariable], roles: Roles, arrays: Sequence[description.ArrayVariable] = ()
+    table: Sequence[FmuVariable],
+    roles: StructureRoles,
+    arrays: Sequence[description.ArrayVariable] = (),
 ) -> dict[str, bytes]:
     """Return the C sources that declare the variables; placeholders stand for GUID and content tag.
 
@@ -232,7 +234,7 @@ def variable_sources(
     ----------
     table : sequence of FmuVariable
         The variables, in order of their value reference.
-    roles : Roles
+    roles : StructureRoles
         The role of each of them.
     arrays : sequence of ArrayVariable
         The rows of the table that pass together, in FMI 3.

@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping
 from typing import Literal, cast
 
-from fmu_asset.door.binding import Binding
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.session import FmiAsset
-from fmu_asset.door.values import Values
+from fmu_asset.client.binding import Binding
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.values import Values
 from fmu_asset.errors import (
     BindingError,
     CouplingError,
@@ -121,7 +121,7 @@ class CoupledAsset(FmiAsset):
             iterations=iterations,
             tolerance=tolerance,
         )
-        self._settle(exchange, fmus, parameters or {})
+        self._set_up(exchange, fmus, parameters or {})
 
     @property
     def schedule(self) -> Schedule:
@@ -131,7 +131,7 @@ class CoupledAsset(FmiAsset):
     @property
     def log(self) -> tuple[tuple[str, str], ...]:
         """The last messages of the FMUs: status, and component with text."""
-        fmus = cast("CoupledFmus", self._housing)
+        fmus = cast("CoupledFmus", self._host)
         messages = []
         for name, asset in fmus.assets.items():
             for status, text in asset.log:

@@ -15,17 +15,18 @@ from typing import NamedTuple, Self, cast
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.life import PackedState
-from fmu_asset.door.placement import Housing, ResetTrial, Start
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.instance_host import InstanceHost
+from fmu_asset.client.reset_trial import InstanceStart, ResetTrial
+from fmu_asset.client.saved_state import PackedState
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import (
     FmuEndedError,
     FmuError,
     FmuStateError,
     IterationError,
 )
-from fmu_asset.instances.plan import Instance, Settings
+from fmu_asset.instances.plan import InitialValues, Instance
 from reporting.words import comma_list
 
 from .outputs import OutputSelection
@@ -90,7 +91,7 @@ def errors_of_component(component: str) -> Iterator[None]:
         raise type(error)(sentence, error.messages, time) from error
 
 
-class CoupledFmus(Housing):
+class CoupledFmus(InstanceHost):
     """Several FMUs as one instance, and as its own housing, as `FmiAsset` needs them.
 
     Parameters
@@ -171,12 +172,12 @@ class CoupledFmus(Housing):
 
     # ------------------------------------------------------------------ life
 
-    def start(self, start: Start, *, renewed: bool = False) -> Self:
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> Self:
         """Bring the components to their start."""
-        start.make(self)
+        start.initialise(self)
         return self
 
-    def contradicted(self, request: bytes, reply: FloatArray) -> None:
+    def replace_if_contradicted(self, request: bytes, reply: FloatArray) -> None:
         """Leave it to the components whether they began where they should."""
 
     def renew(self) -> Instance:
@@ -201,7 +202,7 @@ class CoupledFmus(Housing):
     # ------------------------------------------------------------------ the interface of an
     # instance
 
-    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
         """Initialise the components in order; each takes the initial outputs of those before it.
 
         An input whose source comes later starts at the FMU's own start value.
@@ -210,7 +211,7 @@ class CoupledFmus(Housing):
         ----------
         start_time : float
             Ignored: the components have it from their bindings.
-        parameters : Settings
+        parameters : InitialValues
             Parameters of the system, by value reference.
         with_inputs : bool
             Whether the inputs in the request block hold already.

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from fe.runtime.arrays import FloatArray
-from fmu_asset.door.units import IDENTITY
+from fmu_asset.client.units import IDENTITY
 
 from .structure import Endpoint
 from .wiring import ConnectedVariable

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo
-from fmu_asset.door.binding import expand
-from fmu_asset.door.units import IDENTITY, Conversion
+from fmu_asset.client.bound_variables import expand
+from fmu_asset.client.units import IDENTITY, Conversion
 from fmu_asset.errors import CouplingError
 from fmu_asset.instances.plan import Interface
 from reporting.words import comma_list

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
-from fmu_asset.door.binding import Binding, Header, Input, Parameter, Vector
-from fmu_asset.door.exchange import Exchange
-from fmu_asset.door.units import IDENTITY
+from fmu_asset.client.binding import Binding, BindingHeader
+from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding
+from fmu_asset.client.exchange import Exchange
+from fmu_asset.client.units import IDENTITY
 from fmu_asset.errors import BindingError, CouplingError
-from fmu_asset.instances.plan import Settings
+from fmu_asset.instances.plan import InitialValues
 
 from .structure import Component, Connector, Endpoint
 from .wiring import ConnectedVariable, Wiring
@@ -44,12 +45,12 @@ class SystemDescription(FmuDescription):
         """Return the definitions of units that hold for a variable."""
         return self.definitions[variable.name]
 
-    def settings_of_components(self, settings: Settings) -> dict[str, dict[str, float]]:
+    def settings_of_components(self, settings: InitialValues) -> dict[str, dict[str, float]]:
         """Return values of the system's variables by component and variable, in the FMUs' units.
 
         Parameters
         ----------
-        settings : Settings
+        settings : InitialValues
             Values of variables of the system, by value reference.
         """
         by_component: dict[str, dict[str, float]] = {}
@@ -328,15 +329,15 @@ def _stepped_component(
         binding=_component_header(exchange.binding, component, is_linear=is_linear),
         limits=exchange.binding.limits,
         load={
-            variable: Input(variable=variable, unit=units[variable])
+            variable: InputBinding(variable=variable, unit=units[variable])
             for variable in (*fed, *sent_inputs, *constants)
         },
         parameter={
-            variable: Parameter(variable=variable, unit=units[variable])
+            variable: ParameterBinding(variable=variable, unit=units[variable])
             for variable in (*settings, *tuned_parameters)
         },
         observation={
-            end.variable: Vector(variables=(end.variable,), unit=units[end.variable])
+            end.variable: VectorBinding(variables=(end.variable,), unit=units[end.variable])
             for end in output_ends
         },
     )
@@ -353,9 +354,9 @@ def _stepped_component(
     )
 
 
-def _component_header(binding: Binding, component: Component, *, is_linear: bool) -> Header:
+def _component_header(binding: Binding, component: Component, *, is_linear: bool) -> BindingHeader:
     """Return the head of a component's binding, from the binding of its system."""
-    return Header(
+    return BindingHeader(
         name=component.name,
         step_size=binding.step_size / component.substeps,
         decimation=component.substeps if is_linear else 1,

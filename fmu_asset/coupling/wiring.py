@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.units import IDENTITY, Conversion, between
+from fmu_asset.client.units import IDENTITY, Conversion, between
 from fmu_asset.errors import CouplingError, FmuError
 from reporting.words import comma_list
 

@@ -1,21 +1,19 @@
-"""One instance of an FMU in this process: one batched set and get per step, whatever the FMI version.
+"""An instance of an FMU in this process, the same for all versions of FMI and both interfaces.
 
-The worker process runs this; `FmiAsset` runs it directly when it is told not to isolate.
+A step is one batch of prepared set calls, the step itself, and one batch of get calls. The worker
+process runs this; `FmiAsset` runs it directly when it is told not to isolate.
 """
 
 import ctypes
 import itertools
 import os
-import sys
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, NamedTuple
 
-from fmpy import calloc, fmi1, fmi2, free
 from fmpy.fmi1 import FMICallException
-from fmpy.logging import addLoggerProxy
 
 from fmu_asset.errors import (
     FmuCallError,
@@ -23,60 +21,68 @@ from fmu_asset.errors import (
     FmuError,
     FmuStateError,
     FmuWorkerError,
-    said,
     visible,
 )
 
-from .plan import Group, Instance, Lines, Plan, Settings, exchanged, prepared
-
-STATUS_NAMES = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
-OK, WARNING, DISCARD, ERROR, FATAL, PENDING = range(6)
-ACCEPTED = frozenset({OK, WARNING})
-_MESSAGES_IN_ERROR = 10
-_NO_STOP_TIME = (
-    ". It was told no end of the experiment: if it asks for one, give `stop_time` in the table [binding] of "
-    "its binding"
+from .fmi_callbacks import callbacks, register, unregister
+from .plan import (
+    DoubleBlock,
+    InitialValues,
+    Instance,
+    LinearInputs,
+    Plan,
+    VariableGroup,
+    group_arguments,
+    prepare_call,
+)
+from .statuses import (
+    ACCEPTED,
+    DISCARD,
+    ERROR,
+    FATAL,
+    PENDING,
+    instantiation_failure,
+    refuse_negative,
+    status_name,
 )
 
-Calls = list[tuple[str, Callable[[], int], Callable[[], object] | None]]
-"""Name of the function, the prepared call, and what converts the values before or after it, if needed."""
-
-
-# ---------------------------------------------------------------------- what FMUs log
-
+_MESSAGES_IN_ERROR = 10
 _LONGEST_LOG = 1000
+_NO_STOP_TIME = (
+    ". It was told no end of the experiment: if it asks for one, give `stop_time` in the table "
+    "[binding] of its binding"
+)
+_LOST = "The instance was lost to a fatal error; reset the asset to go on."
 
-# fmpy's native proxy, which formats the messages of C FMUs, knows one logger in a process.
-_logging: "dict[bytes, FmuInstance]" = {}
+FmpyInstance = Any
+"""An instance by fmpy, which states no types."""
+
 _instance_numbers = itertools.count(1)
 
 
-def _log(_: object, instance_name: bytes, status: int, category: bytes, message: bytes) -> None:
-    instance = _logging.get(instance_name or b"")
-    if instance is not None:
-        instance.log(None, status, category, message)
+class FmiCall(NamedTuple):
+    """A prepared call of a C function that sets or reads a group of variables.
 
+    Attributes
+    ----------
+    function : str
+        Name of the function, without the prefix of its version.
+    call : callable
+        Makes the call and returns its status.
+    convert_before, convert_after : callable or None
+        Converts values before they are set, and after they are read, where that is needed.
+    """
 
-_MODULES = {1: fmi1, 2: fmi2}
-_LOGGERS = {1: fmi1.fmi1CallbackLoggerTYPE(_log), 2: fmi2.fmi2CallbackLoggerTYPE(_log)}
-
-
-def callbacks(fmi_version: int) -> Any:
-    """Return new callbacks for FMI 1 or 2, whose logger knows all instances."""
-    module, name = _MODULES[fmi_version], f"fmi{fmi_version}Callback"
-    given = getattr(module, f"{name}Functions")()  # what is not said, such as `stepFinished`, is none
-    given.logger = _LOGGERS[fmi_version]
-    given.allocateMemory = getattr(module, f"{name}AllocateMemoryTYPE")(calloc)
-    given.freeMemory = getattr(module, f"{name}FreeMemoryTYPE")(free)
-    addLoggerProxy(ctypes.byref(given))
-    return given
-
-
-# ---------------------------------------------------------------------- an instance
+    function: str
+    call: Callable[[], int]
+    convert_before: Callable[[], object] | None = None
+    convert_after: Callable[[], object] | None = None
 
 
 class FmuInstance(Instance):
-    """One instance in this process; subclasses speak the interfaces, and the table of classes the versions.
+    """An instance in this process.
+
+    Subclasses implement the two interfaces; `classes` names fmpy's class for each version of FMI.
 
     Parameters
     ----------
@@ -86,7 +92,7 @@ class FmuInstance(Instance):
     Attributes
     ----------
     messages : deque of (int, str)
-        The last ones that the FMU has logged and nobody has taken yet: status and text.
+        Last messages of the FMU that nobody has taken yet: status and text.
 
     Raises
     ------
@@ -94,41 +100,49 @@ class FmuInstance(Instance):
         If the binary cannot be loaded or the instance cannot be made.
     """
 
-    # Wherever the FMU or fmpy goes, `chdir(".")` comes back to the working directory.
+    # An FMU, or fmpy, may change the working directory: `with chdir(".")` comes back to it.
 
-    classes: ClassVar[dict[int, type[Any]]]
-    """fmpy's class for each FMI version: that of FMI 2, or one with its methods."""
+    classes: ClassVar[dict[int, type[FmpyInstance]]]
+    """fmpy's class for each version of FMI: that of FMI 2, or one with its methods."""
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(plan)
-        # Communication point and step size of a step, where they stand in the request.
-        self._begin = ctypes.c_double.from_buffer(self.request, 0)
-        self._size = ctypes.c_double.from_buffer(self.request, 8)
-        self._plan, self._version = plan, plan.fmu.major_version
+        # time and step size, where they stand in the request
+        self._step_begin = ctypes.c_double.from_buffer(self.request, 0)
+        self._step_size = ctypes.c_double.from_buffer(self.request, 8)
+        self._plan = plan
+        self._version = plan.fmu.major_version
         self._prefix = "fmi" if self._version == 1 else f"fmi{self._version}"
-        self._lines = Lines(self.request, plan) if plan.linear_count else None
+        self._lines = LinearInputs(self.request, plan) if plan.linear_count else None
         self._name = f"{plan.instance_name}-{os.getpid()}-{next(_instance_numbers)}"
         self.messages: deque[tuple[int, str]] = deque(maxlen=_LONGEST_LOG)
-        self._errors = 0
-        _logging[self._name.encode()] = self
-        self._ended: float | None = None
-        self._phase = "instantiated"
+        self._error_count = 0
+        self._end_time: float | None = None
+        self._phase: Literal["instantiated", "stepping"] = "instantiated"
+        self._fmu = self._load()
+        # prepare the calls of a step
+        self._values = self.request if self._lines is None else self._lines.values
+        self._set_calls = self._group_calls("Set", plan.inputs, self._values, 2)
+        self._get_calls = self._group_calls("Get", plan.outputs, self.reply, 0)
+        self._motion_calls = [] if self._lines is None else self._calls_that_move(self._lines)
+
+    def _load(self) -> FmpyInstance:
+        """Return fmpy's object with the binary loaded and the instance made."""
+        register(self._name, self)
         with chdir("."):
             try:
-                self._fmu = self._instantiated()
+                fmu = self._instantiate()
             except Exception as error:
-                _logging.pop(self._name.encode())
-                raise FmuCallError(_why_not_instantiated(error), self._texts()) from error
-        for function in vars(self._fmu.dll).values():
-            # fmpy lets negative statuses pass.
+                unregister(self._name)
+                sentence = instantiation_failure(error)
+                raise FmuCallError(sentence, self._last_messages()) from error
+        for function in vars(fmu.dll).values():
+            # fmpy ignores negative statuses
             if getattr(function, "restype", None) is ctypes.c_int:
-                function.errcheck = _refuse_negative
-        self._values = self.request if self._lines is None else self._lines.values
-        self._set = self._blocks("Set", plan.inputs, self._values, 2)
-        self._get = self._blocks("Get", plan.outputs, self.reply, 0)
-        self._moving = [] if self._lines is None else self._calls_of(self._lines)
+                function.errcheck = refuse_negative
+        return fmu
 
-    def _instantiated(self) -> Any:
+    def _instantiate(self) -> FmpyInstance:
         """Return fmpy's object, instantiated."""
         plan = self._plan
         fmu = self.classes[self._version](
@@ -137,19 +151,22 @@ class FmuInstance(Instance):
             unzipDirectory=plan.folder,
             instanceName=self._name,
         )
-        if self._version == 3:
-            fmu.instantiate(loggingOn=True, logMessage=self.log)
+        if self._version == 1:
+            fmu.instantiate(loggingOn=True, functions=callbacks(1))
+        elif self._version == 2:
+            fmu.instantiate(loggingOn=True, callbacks=callbacks(2))
         else:
-            given = {"functions" if self._version == 1 else "callbacks": callbacks(self._version)}
-            fmu.instantiate(loggingOn=True, **given)
+            fmu.instantiate(loggingOn=True, logMessage=self.log)
         if not fmu.component:
             raise RuntimeError("no instance was returned")
         return fmu
 
-    # ------------------------------------------------------------------ what an interface says
+    # ------------------------------------------------------------------ what an interface does
 
-    def _start(self, start_time: float, parameters: Settings, *, with_inputs: bool) -> None:
-        """Bring the instance to its first communication point."""
+    def _go_to_start(
+        self, start_time: float, parameters: InitialValues, *, with_inputs: bool
+    ) -> None:
+        """Bring the instance to its first communication point; parameters as in `initialise`."""
         fmu = self._fmu
         experiment = {
             "startTime": start_time,
@@ -160,35 +177,37 @@ class FmuInstance(Instance):
             fmu.setupExperiment(**experiment)
         if self._plan.configuration:
             fmu.enterConfigurationMode()
-            self._apply(self._plan.configuration)
+            self._set_initial_values(self._plan.configuration)
             fmu.exitConfigurationMode()
-        self._apply(parameters)
-        fmu.enterInitializationMode(**(experiment if self._version == 3 else {}))
+        self._set_initial_values(parameters)
+        if self._version < 3:
+            fmu.enterInitializationMode()
+        else:
+            fmu.enterInitializationMode(**experiment)
         if with_inputs:
-            self._make(self._set)
+            self._make_calls(self._set_calls)
         fmu.exitInitializationMode()
 
     @abstractmethod
-    def _advance(self) -> None:
-        """Make one communication step from `_begin` over `_size`; the inputs are set."""
+    def _do_step(self) -> None:
+        """Make one communication step from `_step_begin` over `_step_size`; the inputs are set."""
 
     @abstractmethod
-    def _calls_of(self, lines: Lines) -> Calls:
-        """Return what makes inputs move: calls that tell how fast, or that set them again."""
+    def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
+        """Return the calls that make inputs move: they set derivatives, or the inputs again."""
 
-    def _send(self) -> None:
+    def _send_inputs(self) -> None:
         """Set the inputs of the request block."""
         if self._lines is not None:
-            self._lines.aim()
-        self._make(self._set + self._moving)
+            self._lines.begin_step()
+        self._make_calls(self._set_calls + self._motion_calls)
 
-    def _follow(self, lines: Lines) -> None:
-        """Set the inputs where their lines are at a later communication point of the step."""
-        lines.move(self._begin.value)
-        self._make(self._set + self._moving)
+    def _send_moved_inputs(self, lines: LinearInputs) -> None:
+        """Set the inputs at a later communication point of the step."""
+        lines.move_to(self._step_begin.value)
+        self._make_calls(self._set_calls + self._motion_calls)
 
-    def _free(self) -> None:
-        """Terminate and free the instance."""
+    def _terminate_and_free(self) -> None:
         if self._phase == "stepping":
             try:
                 self._fmu.terminate()
@@ -197,61 +216,71 @@ class FmuInstance(Instance):
                     return
         self._fmu.freeInstance()
 
-    # ------------------------------------------------------------------ what the twin asks; see `Instance`
+    # ------------------------------------------------------------------ calls of `Instance`
 
-    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and go to the first communication point."""
-        errors = self._errors
+        errors_before = self._error_count
         if self._lines is not None:
-            self._lines.stand()
-        with self._calls("initialisation"):
-            self._start(start_time, parameters, with_inputs=with_inputs)
+            self._lines.hold()
+        with self._fmpy_calls("initialisation"):
+            self._go_to_start(start_time, parameters, with_inputs=with_inputs)
             self._phase = "stepping"
-        if self._errors > errors:
+        if self._error_count > errors_before:
             hint = "" if self._plan.stop_time is not None else _NO_STOP_TIME
-            raise FmuCallError(f"The FMU refused its initialisation{hint}.", self._texts())
+            raise FmuCallError(f"The FMU refused its initialisation{hint}.", self._last_messages())
 
     def step(self) -> None:
         """Make the step that the request block describes."""
         if self.lost:
-            raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
-        if self._ended is not None:
-            raise FmuEndedError(said("running.ended", time=self._ended), time=self._ended)
-        self._send()
+            raise FmuWorkerError(_LOST)
+        if self._end_time is not None:
+            raise FmuEndedError(
+                f"The FMU has ended its simulation at t = {self._end_time:g} s; reset the asset to "
+                "start anew.",
+                time=self._end_time,
+            )
+        self._send_inputs()
         if self._plan.substeps == 1:
-            self._advance()
+            self._do_step()
         else:
-            self._advance_many()
-        self._make(self._get, "reading outputs")
+            self._do_substeps()
+        self._make_calls(self._get_calls, "reading outputs")
 
-    def _advance_many(self) -> None:
-        first, size = self._begin.value, self._size.value
+    def _do_substeps(self) -> None:
+        """Make all communication steps between two observations."""
+        begin = self._step_begin.value
+        size = self._step_size.value
         number = 0
         try:
             for number in range(self._plan.substeps):
-                self._begin.value = first + number * size
+                self._step_begin.value = begin + number * size
                 if number and self._lines is not None:
-                    self._follow(self._lines)
-                self._advance()
+                    self._send_moved_inputs(self._lines)
+                self._do_step()
         except FmuError as error:
             if number == 0 or isinstance(error, FmuEndedError):
                 raise
-            # Between two observations it cannot go back to the last one.
+            # between two observations it cannot go back to the last one
             self.lost = True
-            why = said("running.substep", error=error, number=number + 1, of=self._plan)
-            raise type(error)(why, error.messages) from error
+            sentence = (
+                f"{error.sentence} It was step {number + 1} of the {self._plan.substeps} between "
+                "two observations: reset the asset or restore a state to go on."
+            )
+            raise type(error)(sentence, error.messages) from error
         finally:
-            self._begin.value = first  # the request is the caller's, and what a later start is compared by
+            # the request is the caller's, and a later start is compared with it
+            self._step_begin.value = begin
 
     def read(self) -> None:
         """Read the outputs of this moment into the reply block."""
-        with self._calls("reading the outputs"):
-            self._make(self._get, "reading outputs")
+        with self._fmpy_calls("reading the outputs"):
+            self._make_calls(self._get_calls, "reading outputs")
 
     def save(self) -> bytes:
         """Return the serialised FMU state."""
         fmu = self._fmu
-        with self._calls("saving the state"):
+        with self._fmpy_calls("saving the state"):
             state = fmu.getFMUState()
             try:
                 return bytes(fmu.serializeFMUState(state))
@@ -260,28 +289,31 @@ class FmuInstance(Instance):
 
     def restore(self, content: bytes) -> None:
         """Restore a serialised FMU state."""
-        fmu, errors = self._fmu, self._errors
-        with self._calls("restoring the state"):
+        fmu = self._fmu
+        errors_before = self._error_count
+        with self._fmpy_calls("restoring the state"):
             state = fmu.deserializeFMUState(content)
             try:
                 fmu.setFMUState(state)
             finally:
                 fmu.freeFMUState(state)
-        self._ended = None
-        if self._errors > errors:
-            raise FmuStateError("The FMU refused the state.", self._texts())
+        self._end_time = None
+        if self._error_count > errors_before:
+            raise FmuStateError("The FMU refused the state.", self._last_messages())
 
     def reset(self) -> None:
         """Bring the instance back to the moment after its instantiation."""
-        with self._calls("reset"):
+        with self._fmpy_calls("reset"):
             if self._phase == "stepping":
                 self._fmu.terminate()
             self._fmu.reset()
-            self._phase, self._ended = "instantiated", None
+            self._phase = "instantiated"
+            self._end_time = None
 
-    def log(self, _: object, status: int, category: bytes, message: bytes) -> None:
-        """Take a message of the FMU."""
-        self._errors += status in (ERROR, FATAL)
+    def log(self, environment: object, status: int, category: bytes, message: bytes) -> None:
+        """Keep a message of the FMU; the signature is that of fmpy's callback in FMI 3."""
+        if status in (ERROR, FATAL):
+            self._error_count += 1
         text = (message or b"").decode("utf-8", "replace").rstrip()
         self.messages.append((int(status), visible(text)))
 
@@ -292,122 +324,122 @@ class FmuInstance(Instance):
         return messages
 
     def close(self) -> None:
-        """Free the instance; one that was lost to a fatal error is left alone, since freeing it can crash."""
-        _logging.pop(self._name.encode(), None)
+        """Free the instance, unless it was lost to a fatal error: freeing that one can crash."""
+        unregister(self._name)
         if self.lost:
             return
         self.lost = True
         with chdir("."):
-            self._free()
+            self._terminate_and_free()
 
-    # ------------------------------------------------------------------ inside
+    # ------------------------------------------------------------------ C calls
 
-    def _prepared(self, name: str, *arguments: Any) -> Callable[[], int]:
-        """Return a call of a C function of the instance such as SetReal, with C values."""
-        before = f"{self._plan.fmu.model_identifier}_" if self._version == 1 else ""
-        function = getattr(self._fmu.dll, before + self._prefix + name)
-        return prepared(function, ctypes.c_void_p.from_param(self._fmu.component), *arguments)
+    def _prepared_call(self, name: str, *arguments: object) -> Callable[[], int]:
+        """Return a call of a C function of the instance, such as SetReal, with C values."""
+        model_prefix = f"{self._plan.fmu.model_identifier}_" if self._version == 1 else ""
+        function = getattr(self._fmu.dll, f"{model_prefix}{self._prefix}{name}")
+        component = ctypes.c_void_p.from_param(self._fmu.component)
+        return prepare_call(function, component, *arguments)
 
-    def _blocks(self, verb: str, groups: tuple[Group, ...], doubles: Any, begin: int) -> Calls:
-        calls: Calls = []
+    def _group_calls(
+        self,
+        verb: Literal["Set", "Get"],
+        groups: tuple[VariableGroup, ...],
+        doubles: DoubleBlock,
+        begin: int,
+    ) -> list[FmiCall]:
+        """Return the calls that set or read groups of variables.
+
+        Parameters
+        ----------
+        verb : {"Set", "Get"}
+            What is done.
+        groups : tuple of VariableGroup
+            The groups, which follow one another in the block.
+        doubles : C array of double
+            The block.
+        begin : int
+            Position of the first value.
+        """
+        is_sent = verb == "Set"
+        calls = []
         for group in groups:
-            arguments, convert = exchanged(self._version, group, doubles, begin, sent=verb == "Set")
-            calls.append((verb + group.kind, self._prepared(verb + group.kind, *arguments), convert))
+            arguments = group_arguments(self._version, group, doubles, begin, sent=is_sent)
+            function = f"{verb}{group.kind}"
+            call = self._prepared_call(function, *arguments.values)
+            if is_sent:
+                calls.append(FmiCall(function, call, convert_before=arguments.convert))
+            else:
+                calls.append(FmiCall(function, call, convert_after=arguments.convert))
             begin += group.count
         return calls
 
-    def _apply(self, parameters: Settings) -> None:
-        for kind, reference, values in parameters:
+    def _set_initial_values(self, initial_values: InitialValues) -> None:
+        for kind, reference, values in initial_values:
             if kind == "String":
                 self._fmu.setString([reference], values)
                 continue
             doubles = (ctypes.c_double * len(values))(*map(float, values))
-            self._make(self._blocks("Set", (Group(kind, (reference,), len(values)),), doubles, 0))
+            group = VariableGroup(kind, (reference,), len(values))
+            self._make_calls(self._group_calls("Set", (group,), doubles, 0))
 
-    def _make(self, calls: Calls, what: str = "setting inputs") -> None:
-        """Make calls that set values, with the conversion before, or that read them."""
-        for name, call, convert in calls:
-            if convert is not None and name[0] == "S":
-                convert()
+    def _make_calls(self, calls: list[FmiCall], purpose: str = "setting inputs") -> None:
+        """Make prepared calls; `purpose` says what for, if one is refused."""
+        for function, call, convert_before, convert_after in calls:
+            if convert_before is not None:
+                convert_before()
             status = call()
             if status not in ACCEPTED:
-                raise self._call_error(self._prefix + name, status, what)
-            if convert is not None and name[0] == "G":
-                convert()
-
-    def _end(self, time: float) -> FmuEndedError:
-        """Take note that the FMU has ended its simulation, and return the error that says so."""
-        self._ended = time
-        return FmuEndedError(
-            f"The FMU asked to end the simulation in {self._where()}, and ended at t = {time:g} s.",
-            self._texts(),
-            time,
-        )
-
-    def _where(self) -> str:
-        """Return which step is made, for an error."""
-        return f"the step from t = {self._begin.value:g} s"
+                raise self._call_error(f"{self._prefix}{function}", status, purpose)
+            if convert_after is not None:
+                convert_after()
 
     @contextmanager
-    def _calls(self, what: str) -> Iterator[None]:
+    def _fmpy_calls(self, purpose: str) -> Iterator[None]:
+        """Translate failures of calls that fmpy makes, and come back to the working directory."""
         if self.lost:
-            raise FmuWorkerError("The instance was lost to a fatal error; reset the asset to go on.")
+            raise FmuWorkerError(_LOST)
         with chdir("."):
             try:
                 yield
             except FMICallException as error:
-                raise self._call_error(str(error.function), int(error.status), what) from error
+                status = int(error.status)
+                raise self._call_error(str(error.function), status, purpose) from error
 
-    def _call_error(self, function: str, status: int, what: str) -> FmuCallError:
-        # What the standard still allows after an error is not worth the trouble: another instance is made.
+    # ------------------------------------------------------------------ errors
+
+    def _ended_error(self, time: float) -> FmuEndedError:
+        """Record that the FMU has ended its simulation, and return the error that says so."""
+        self._end_time = time
+        return FmuEndedError(
+            f"The FMU asked to end the simulation in {self._step_label()}, and ended at "
+            f"t = {time:g} s.",
+            self._last_messages(),
+            time,
+        )
+
+    def _step_label(self) -> str:
+        """Return what errors call the present step."""
+        return f"the step from t = {self._step_begin.value:g} s"
+
+    def _call_error(self, function: str, status: int, purpose: str) -> FmuCallError:
+        """Return the error for a call that was not accepted, and give the instance up if it must.
+
+        FMI allows some calls after an error. They are not used: the asset makes another instance.
+        """
         self.lost = self.lost or status != DISCARD
-        after = {
-            DISCARD: "the FMU did not accept it and stays where it was; try other inputs or a smaller step",
+        consequence = {
+            DISCARD: "the FMU did not accept it and stays where it was; try other inputs or a "
+            "smaller step",
             ERROR: "its values are no longer to be trusted; reset the asset or restore a state",
             PENDING: "asynchronous steps are not supported; export it to step synchronously",
         }.get(status, "the instance is lost; reset the asset or restore a state")
-        if what == "initialisation" and self._plan.stop_time is None:
-            after += _NO_STOP_TIME
-        return FmuCallError(f"{function} returned {status_name(status)} in {what}: {after}.", self._texts())
-
-    def _texts(self) -> list[str]:
-        return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]
-
-
-def status_name(status: int) -> str:
-    """Return what FMI calls a status."""
-    return STATUS_NAMES[status] if 0 <= status < len(STATUS_NAMES) else str(status)
-
-
-def _refuse_negative(status: int, function: Any, arguments: tuple[Any, ...]) -> int:
-    """Check what a C function that fmpy calls has returned."""
-    if status < 0:
-        raise FMICallException(function=function.__name__, status=status)
-    return status
-
-
-def _why_not_instantiated(error: Exception) -> str:
-    text = " ".join(str(error).split())
-    text = text.rpartition(".so: ")[2].removesuffix(".")  # without our folder
-    if "shared library" in str(error):
-        return (
-            f"The FMU's binary cannot be loaded on this machine ({text}); it was built for another processor "
-            "or system, or it needs a library that is not installed."
+        if purpose == "initialisation" and self._plan.stop_time is None:
+            consequence += _NO_STOP_TIME
+        return FmuCallError(
+            f"{function} returned {status_name(status)} in {purpose}: {consequence}.",
+            self._last_messages(),
         )
-    if "undefined symbol" in text:
-        return f"The FMU's binary lacks a function that its FMI version requires ({text}); export it again."
-    return f"The FMU could not be instantiated ({text})."
 
-
-def forget_modules(folder: str) -> None:
-    """Take what an FMU in Python has imported from its folder out of this process.
-
-    Otherwise the next FMU with a module of the same name, or the caller, would be given that module, and the
-    folder is about to be removed. Instances that still run keep what they have.
-    """
-    inside = folder.rstrip(os.sep) + os.sep
-    sys.path[:] = [entry for entry in sys.path if not (entry + os.sep).startswith(inside)]
-    # A copy is one step, unlike a list of items: other threads import too.
-    for name, module in sys.modules.copy().items():
-        if str(getattr(module, "__file__", None) or "").startswith(inside):
-            sys.modules.pop(name, None)
+    def _last_messages(self) -> list[str]:
+        return [text for _, text in self.take_log()][-_MESSAGES_IN_ERROR:]

@@ -1,4 +1,7 @@
-"""What an instance is asked, and what it exchanges with its FMU: a plan, sent to a worker, and C calls."""
+"""The interface of FMU instances, and the plan of what one exchanges with its FMU.
+
+The plan is sent to the worker process, and the C calls of a step are prepared from it.
+"""
 
 import ctypes
 import math
@@ -6,7 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,17 +18,38 @@ from reporting.arrays import Float
 Interface = Literal["co-simulation", "model-exchange"]
 
 SOLVER_TOLERANCE = 1e-6
-"""Relative, of our solver, unless the binding gives another or the FMU declares a smaller one."""
+"""Relative tolerance of our solver, unless the binding states one or the FMU a smaller one."""
 
 REPORT_PERIOD = 0.02
-"""Seconds after which many steps report what is done, at the end of the step that is being made."""
+"""Seconds after which a run of many steps reports how many it has made."""
 
-Settings = list[tuple[str, int, list[float] | list[str]]]
-"""FMI base type, value reference, values: one for a scalar, all elements for an array; texts of a String."""
+DoubleBlock = ctypes.Array[ctypes.c_double]
+"""A C array of doubles."""
+
+
+class InitialValue(NamedTuple):
+    """Values of a variable that are set before the initialisation.
+
+    Attributes
+    ----------
+    kind : str
+        FMI base type.
+    reference : int
+        Value reference.
+    values : list of float or list of str
+        One value for a scalar, all elements for an array; texts for a String.
+    """
+
+    kind: str
+    reference: int
+    values: list[float] | list[str]
+
+
+InitialValues = list[InitialValue]
 
 
 @dataclass(frozen=True)
-class Group:
+class VariableGroup:
     """Variables of one base type, set or read in one call.
 
     Attributes
@@ -48,18 +72,18 @@ class Group:
 
 @dataclass(frozen=True, kw_only=True)
 class FmuIdentity:
-    """What an FMU declares that an instance of it has to know.
+    """Declarations of an FMU that an instance of it needs.
 
     Attributes
     ----------
     fmi_version, guid, model_identifier : str
         As declared; the identifier is that of `interface`.
     interface : {"co-simulation", "model-exchange"}
-        How it is run.
+        Interface by which it is run.
     states, event_indicators : int
         Numbers of continuous states and event indicators (model exchange).
     completed_step : bool
-        Whether it wants to hear of completed integrator steps (model exchange).
+        Whether it wants to be told of completed integrator steps (model exchange).
     """
 
     fmi_version: str = "2.0"
@@ -78,18 +102,18 @@ class FmuIdentity:
 
 @dataclass(frozen=True)
 class Plan:
-    """What an instance is and what it exchanges.
+    """What an instance is and what it exchanges with its FMU.
 
     Attributes
     ----------
     folder : str
-        Where the FMU is extracted.
+        Folder of the extracted FMU.
     fmu : FmuIdentity
-        Which FMU it is.
+        The FMU.
     instance_name : str
-        As FMI wants it.
-    inputs, outputs : tuple of Group
-        What is set and read at every step, in the order of the request and of the reply block.
+        Name that FMI asks for.
+    inputs, outputs : tuple of VariableGroup
+        Variables that are set and read at every step, in the order of the request and reply blocks.
     substeps : int
         Communication steps of the FMU between two observations.
     tolerance : float or None
@@ -98,20 +122,20 @@ class Plan:
         Relative tolerance of our solver (model exchange).
     stop_time : float or None
         End of the experiment that the FMU is told [s].
-    configuration : Settings
+    configuration : list of InitialValue
         Structural parameters (FMI 3), set before everything else.
     """
 
     folder: str
     fmu: FmuIdentity
     instance_name: str
-    inputs: tuple[Group, ...]
-    outputs: tuple[Group, ...]
+    inputs: tuple[VariableGroup, ...]
+    outputs: tuple[VariableGroup, ...]
     substeps: int = 1
     tolerance: float | None = None
     solver_tolerance: float = SOLVER_TOLERANCE
     stop_time: float | None = None
-    configuration: Settings = field(default_factory=list)
+    configuration: InitialValues = field(default_factory=list)
 
     @property
     def linear_count(self) -> int:
@@ -120,77 +144,115 @@ class Plan:
 
     @property
     def input_count(self) -> int:
-        """Number of values behind time and step size in a request: all inputs, then where lines begin."""
+        """Number of values after time and step size in a request.
+
+        These are all inputs, and then the values at which straight lines begin.
+        """
         return sum(group.count for group in self.inputs) + self.linear_count
 
 
-_C_TYPES: dict[str, Any] = {
-    "Real": ctypes.c_double, "Float64": ctypes.c_double, "Float32": ctypes.c_float, "Integer": ctypes.c_int,
-    **{name: getattr(ctypes, f"c_{name.lower()}") for bits in (8, 16, 32, 64)
-       for name in (f"Int{bits}", f"UInt{bits}")},
-}  # fmt: skip
-_BOOLEANS: dict[int, Any] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctypes.c_bool}
+# ---------------------------------------------------------------------- C calls
+
+CType = Any
+"""A simple C type by ctypes, which states none for their common use."""
+CFunction = Any
+"""A C function by ctypes, which has no public type."""
+
+_C_TYPES: dict[str, CType] = {
+    "Real": ctypes.c_double,
+    "Float64": ctypes.c_double,
+    "Float32": ctypes.c_float,
+    "Integer": ctypes.c_int,
+    "Int8": ctypes.c_int8,
+    "Int16": ctypes.c_int16,
+    "Int32": ctypes.c_int32,
+    "Int64": ctypes.c_int64,
+    "UInt8": ctypes.c_uint8,
+    "UInt16": ctypes.c_uint16,
+    "UInt32": ctypes.c_uint32,
+    "UInt64": ctypes.c_uint64,
+}
+_BOOLEAN_TYPES: dict[int, CType] = {1: ctypes.c_ubyte, 2: ctypes.c_int, 3: ctypes.c_bool}
+"""C type of a Boolean, by the major version of FMI."""
 
 
-def values_of(block: Any) -> Float:
-    """Return a ctypes array of doubles as an array that shares its memory."""
+class GroupArguments(NamedTuple):
+    """Arguments of a C function that sets or reads a group of variables, after the instance.
+
+    Attributes
+    ----------
+    values : tuple
+        C values.
+    convert : callable or None
+        Converts the numbers of the block before they are set, or into the block after they are
+        read; None if the FMU reads and writes the block itself.
+    """
+
+    values: tuple[object, ...]
+    convert: Callable[[], object] | None
+
+
+def values_of(block: DoubleBlock) -> Float:
+    """Return a C array of doubles as an array that shares its memory."""
     return np.frombuffer(memoryview(block).cast("B"))
 
 
-def exchanged(
-    fmi_version: int, group: Group, doubles: Any, begin: int, *, sent: bool
-) -> tuple[tuple[Any, ...], Callable[[], object] | None]:
-    """Return what a C function that sets or reads variables takes after the instance, and a conversion.
+def group_arguments(
+    fmi_version: int, group: VariableGroup, doubles: DoubleBlock, begin: int, *, sent: bool
+) -> GroupArguments:
+    """Return the arguments of a C function that sets or reads a group of variables.
 
     Parameters
     ----------
     fmi_version : int
         1, 2 or 3.
-    group : Group
-        The variables, of one base type; enumerations are integers, see `FmuDescription.exchange_kind`.
-    doubles : ctypes array of double
-        The block of their values.
+    group : VariableGroup
+        The variables; enumerations are integers, see `FmuDescription.exchange_kind`.
+    doubles : C array of double
+        The block of values.
     begin : int
-        Where the group begins in it.
+        Position of the first value of the group in it.
     sent : bool
         Whether the values are set.
-
-    Returns
-    -------
-    tuple of (tuple, callable or None)
-        C values; what converts the numbers of the block before they are set, or into the block after they
-        are read: None where the FMU reads and writes the block itself.
     """
-    kind = _BOOLEANS[fmi_version] if group.kind == "Boolean" else _C_TYPES[group.kind]
+    c_type = _BOOLEAN_TYPES[fmi_version] if group.kind == "Boolean" else _C_TYPES[group.kind]
     convert = None
-    if kind is ctypes.c_double and group.count:
-        values = (kind * group.count).from_buffer(doubles, 8 * begin)
+    if c_type is ctypes.c_double and group.count:
+        values = (c_type * group.count).from_buffer(doubles, 8 * begin)
     else:
-        values = (kind * group.count)()
-        pair = [np.ctypeslib.as_array(values), values_of(doubles)[begin : begin + group.count]]
-        target, source = pair if sent else reversed(pair)
-        convert = partial(np.copyto, target, source, casting="unsafe")
-    length = len(group.references)
-    counts = [length, group.count] if fmi_version == 3 else [length]
-    first, *further = [ctypes.c_size_t.from_param(count) for count in counts]
-    references = ctypes.byref((ctypes.c_uint * length)(*group.references))
-    return (references, first, ctypes.byref(values), *further), convert
+        values = (c_type * group.count)()
+        in_block = values_of(doubles)[begin : begin + group.count]
+        in_fmu = np.ctypeslib.as_array(values)
+        if sent:
+            convert = partial(np.copyto, in_fmu, in_block, casting="unsafe")
+        else:
+            convert = partial(np.copyto, in_block, in_fmu, casting="unsafe")
+    reference_count = len(group.references)
+    references = (ctypes.c_uint * reference_count)(*group.references)
+    arguments: tuple[object, ...] = (
+        ctypes.byref(references),
+        ctypes.c_size_t.from_param(reference_count),
+        ctypes.byref(values),
+    )
+    if fmi_version == 3:
+        arguments += (ctypes.c_size_t.from_param(group.count),)
+    return GroupArguments(arguments, convert)
 
 
-# Without declared types ctypes passes C values as they are: a third of the time of a call that converts.
+# Without declared types ctypes passes C values as they are, in a third of the time.
 _Function = ctypes.CFUNCTYPE(ctypes.c_int)
 
 
-def prepared(function: Any, *arguments: Any) -> Callable[[], int]:
-    """Return a call without arguments.
+def prepare_call(function: CFunction, *arguments: object) -> Callable[[], int]:
+    """Return a call without arguments, so that a step looks up and converts nothing.
 
     Parameters
     ----------
     function : C function
-        One that returns an FMI status.
+        Function that returns an FMI status.
     *arguments
-        C values: results of `from_param` and `byref`, or objects such as `c_double`, whose value at the
-        moment of the call is passed. A Python number would not be of the right type.
+        C values: results of `from_param` and `byref`, or objects such as `c_double`, whose value at
+        the moment of the call is passed. A Python number would not be of the right type.
 
     Returns
     -------
@@ -203,57 +265,68 @@ def prepared(function: Any, *arguments: Any) -> Callable[[], int]:
 
 
 _ROUNDING = 1e-12
-"""Of the step: what the moment of its end may lack."""
+"""Share of a step by which a time may miss its end."""
 
 
-class Lines:
-    """What the FMU is given within a step, of a request that says where each line begins and ends.
+class LinearInputs:
+    """Inputs that move in straight lines over a step.
+
+    A request holds the inputs at the end of the step (those that move first), and last the values
+    at which the lines begin.
 
     Parameters
     ----------
-    request : ctypes array of double
-        The request block: time, step size, the inputs at the end of the step (those that move first), and
-        where they begin.
+    request : C array of double
+        The request block: time, step size, inputs, and begins of lines.
     plan : Plan
         What is exchanged.
 
     Attributes
     ----------
-    values : ctypes array of double
-        Time, step size, and the inputs of the moment.
-    slopes : ctypes array of double
+    values : C array of double
+        Time, step size, and the inputs of the present moment.
+    slopes : C array of double
         Derivatives in time of the inputs that move.
     """
 
-    def __init__(self, request: Any, plan: Plan) -> None:
+    def __init__(self, request: DoubleBlock, plan: Plan) -> None:
         count = plan.linear_count
         self.values = (ctypes.c_double * (len(request) - count))()
         self.slopes = (ctypes.c_double * count)()
-        self._request, self._all = values_of(request), values_of(self.values)
-        self._moving, self._slopes = self._all[2 : 2 + count], values_of(self.slopes)
-        self._end, self._begin = self._request[2 : 2 + count], self._request[-count:]
-        self._substeps, self._start, self._span = plan.substeps, 0.0, 1.0
+        self._request = values_of(request)
+        self._at_end = self._request[2 : 2 + count]
+        self._at_begin = self._request[-count:]
+        self._present = values_of(self.values)
+        self._present_moving = self._present[2 : 2 + count]
+        self._slopes = values_of(self.slopes)
+        self._substeps = plan.substeps
+        self._start_time = 0.0
+        self._duration = 1.0
 
-    def stand(self) -> None:
+    def hold(self) -> None:
         """Give the inputs of the request as they are, as in an initialisation."""
-        self._all[:] = self._request[: len(self._all)]
+        self._present[:] = self._request[: len(self._present)]
 
-    def aim(self) -> None:
-        """Take the lines of a new request, and give the inputs of its begin."""
-        self._start, self._span = self._request[0], self._request[1] * self._substeps
-        self._slopes[:] = (self._end - self._begin) / self._span
-        self.stand()
-        self._moving[:] = self._begin
+    def begin_step(self) -> None:
+        """Take the lines of a new request, and give the inputs at its begin."""
+        self._start_time = self._request[0]
+        self._duration = self._request[1] * self._substeps
+        self._slopes[:] = (self._at_end - self._at_begin) / self._duration
+        self.hold()
+        self._present_moving[:] = self._at_begin
 
-    def move(self, time: float) -> None:
-        """Give the inputs of a moment [s]; one that stays keeps its value to the bit, and so does the end."""
-        share = (time - self._start) / self._span
-        there = share >= 1.0 - _ROUNDING
-        self._moving[:] = self._end if there else self._begin + share * (self._end - self._begin)
+    def move_to(self, time: float) -> None:
+        """Give the inputs at a time [s]; those at the end equal the request to the bit."""
+        fraction = (time - self._start_time) / self._duration
+        if fraction >= 1.0 - _ROUNDING:
+            self._present_moving[:] = self._at_end
+        else:
+            change = fraction * (self._at_end - self._at_begin)
+            self._present_moving[:] = self._at_begin + change
 
 
 class Instance(Protocol):
-    """What an asset asks of an FMU in this process, in a worker, or of several.
+    """An instance of an FMU: in this process, in a worker, or of several coupled FMUs.
 
     Parameters
     ----------
@@ -262,33 +335,34 @@ class Instance(Protocol):
 
     Attributes
     ----------
-    request, reply : ctypes array of double
-        Two blocks that are allocated once: time, step size, then all inputs; and all outputs. Integers and
-        Booleans are doubles there.
+    request, reply : C array of double
+        Two blocks that are allocated once: time, step size and all inputs; and all outputs.
+        Integers and Booleans are doubles there.
     lost : bool
         Whether it cannot be used any more.
     """
 
-    request: Any
-    reply: Any
+    request: DoubleBlock
+    reply: DoubleBlock
     lost: bool
 
     def __init__(self, plan: Plan) -> None:
+        output_count = sum(group.count for group in plan.outputs)
         self.request = (ctypes.c_double * (2 + plan.input_count))()
-        self.reply = (ctypes.c_double * max(sum(group.count for group in plan.outputs), 1))()
+        self.reply = (ctypes.c_double * max(output_count, 1))()
         self.lost = False
 
-    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
         """Set parameters, and inputs if wanted, and go to the first communication point.
 
         Parameters
         ----------
         start_time : float
             Start time [s].
-        parameters : Settings
-            What is set before initialisation.
+        parameters : list of InitialValue
+            Values that are set before the initialisation.
         with_inputs : bool
-            Whether the inputs of the request block are set, instead of the FMU's own start values.
+            Whether the inputs of the request block are set, instead of the FMU's start values.
 
         Raises
         ------
@@ -297,7 +371,7 @@ class Instance(Protocol):
         """
 
     def step(self) -> None:
-        """Make the step that the request block describes; the reply block then holds the outputs.
+        """Make the step that the request block describes; the outputs are then in the reply block.
 
         Raises
         ------
@@ -310,7 +384,7 @@ class Instance(Protocol):
         """
 
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
-        """Make many steps; end after one whose outputs are not all finite.
+        """Make many steps; stop after one whose outputs are not all finite.
 
         Parameters
         ----------
@@ -326,21 +400,26 @@ class Instance(Protocol):
         FmuCallError, FmuWorkerError
             As `step`.
         """
-        request, reply = (np.frombuffer(memoryview(block).cast("B")) for block in (self.request, self.reply))
-        step, dot, now, done = self.step, reply.dot, time.monotonic, 0
-        due = now() + REPORT_PERIOD
+        request = values_of(self.request)
+        reply = values_of(self.reply)
+        # local names are faster in the loop
+        step = self.step
+        sum_of_squares = reply.dot
+        now = time.monotonic
+        done = 0
+        next_report = now() + REPORT_PERIOD
         try:
-            for asked, answered in zip(requests, replies, strict=True):
-                request[:] = asked
+            for request_row, reply_row in zip(requests, replies, strict=True):
+                request[:] = request_row
                 step()
-                answered[:] = reply
+                reply_row[:] = reply
                 done += 1
-                # The sum of squares can be infinite for large values too.
-                if not math.isfinite(dot(reply)) and not np.isfinite(reply).all():
+                # a fast test first: the sum of squares can be infinite for large values, too
+                if not math.isfinite(sum_of_squares(reply)) and not np.isfinite(reply).all():
                     return
-                if now() > due:
+                if now() > next_report:
                     report(done)
-                    due = now() + REPORT_PERIOD
+                    next_report = now() + REPORT_PERIOD
         finally:
             report(done)
 
@@ -351,7 +430,7 @@ class Instance(Protocol):
         """Return the serialised state."""
 
     def restore(self, content: bytes) -> None:
-        """Go back to a state.
+        """Go back to a serialised state.
 
         Raises
         ------
@@ -368,4 +447,4 @@ class Instance(Protocol):
         """Return and forget the messages that the FMU has logged: status and text."""
 
     def close(self) -> None:
-        """Free it."""
+        """Free the instance."""

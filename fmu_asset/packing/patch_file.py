@@ -32,6 +32,7 @@ from fe.runtime.patch import (
     PortForce,
     Primitive,
     RunOffset,
+    SensorLag,
 )
 from fe.runtime.sensors import check_channels
 from fmu_asset.errors import PatchFileError
@@ -54,6 +55,7 @@ _REASONS_WITHOUT_MEANING = {
     Clock: "inputs and outputs of an FMU belong to the communication points of its master, so "
     "there is no second clock that could be wrong",
     LoggerClock: "what an FMU is given carries the time of its master, and nothing is logged",
+    SensorLag: "an output is read at its communication point, and none before is kept",
     RunOffset: "an FMU has no runs between which its zero could have moved; a constant offset is a "
     "sensor_drift with exponent 0",
 }

@@ -41,7 +41,7 @@ from fmu_asset.packing.contents import (
     with_identity,
     write_fmu,
 )
-from fmu_asset.slaves.effects import effect_rows, switch_of
+from fmu_asset.slaves.effects import effect_rows, switch_name
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.choices import require_one_of
 from reporting.files import hash_members
@@ -150,7 +150,7 @@ def build_fmu(
     if patch is not None:
         effects = patch.for_gauges(len(model.gauges)).plain
         for effect in effects:
-            start[switch_of(effect)] = float(options.get("activate", False))
+            start[switch_name(effect)] = float(options.get("activate", False))
         table += effect_rows(effects, len(table), start)
         patch_members = _patched_members(model, effects, options.get("arrays"))
     check_start_values(table)
@@ -203,7 +203,7 @@ def _python_structure_members(
     members = python_members(
         declaration,
         "Structure_",
-        imports="from .slaves.behaviour import load_contents\n",
+        imports="from .slaves.structure_contents import load_contents\n",
         resources={"reduced_model.npz": model.to_bytes(), "start.json": start_text.encode()},
     )
     runtime_folder = f"resources/{declaration.identifier}_runtime/fe"

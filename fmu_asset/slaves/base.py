@@ -1,9 +1,9 @@
-"""The FMI slave of all FMUs that are packed here: phases, values, refusals, log and the bytes of a state.
+"""The FMI slave of all FMUs that are packed here: phases, values, refusals, log and saved states.
 
-What an FMU does is told by a table of variables and a behaviour. This file is copied into the FMUs: standard
-library and relative imports only. Nothing here raises, because an exception that reaches the FMI wrapper of
-pythonfmu is fatal to the instance: whatever cannot be done is logged, named by the output `status`, and
-leaves the state and the outputs as they were.
+A table of variables and a behaviour say what an FMU does. This file is copied into the FMUs:
+standard library and relative imports only. No method raises an exception, because one that reaches
+the FMI wrapper of pythonfmu is fatal to the instance. A call that cannot be carried out is logged
+and named by the output `status`, and leaves the state and the other outputs as they were.
 """
 
 from __future__ import annotations
@@ -16,52 +16,34 @@ from functools import partial, partialmethod
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from .variables import FmuVariable, Status
+from .contents import SlaveContents, UnacceptableValuesError
+from .variables import Status
 
 INSTANTIATED, INITIALISING, READY, REFUSED, TERMINATED = range(5)
 """Phases of an instance; REFUSED is an initialisation that was not accepted."""
 
 _DISCARD, _ERROR = 2, 3
+"""Statuses of FMI in log messages."""
 _MAGIC = b"UAVSLAV2"
-_HEADER = struct.Struct("<8s16sI")
-_WHY = {
+_STATE_HEADER = struct.Struct("<8s16sI")
+"""Header of a saved state: magic, tag of the FMU's content, number of doubles."""
+_TAG_LENGTH = 16
+_PHASE_NAMES = {
     INSTANTIATED: "before initialisation",
     INITIALISING: "during initialisation",
     REFUSED: "after an initialisation that was refused",
     TERMINATED: "after termination",
 }
-_KINDS = {"Real": ("Real",), "Integer": ("Integer", "Enumeration"), "Boolean": ("Boolean",)}
-
-
-class UnacceptableValuesError(ValueError):
-    """The values lie in their ranges, but the asset cannot have them; one sentence with its full stop."""
-
-
-class Contents(NamedTuple):
-    """What the FMU's resources hold.
-
-    Attributes
-    ----------
-    table : tuple of FmuVariable
-        Inputs, parameters and outputs, in this order; one output is `status`. Tunable parameters and further
-        inputs may follow at its end: the behaviour is told of them by `tune(values by name, start time)`.
-    make_behaviour : callable
-        Makes afresh what the FMU does: `start(parameters by name, time [s], inputs)` and
-        `advance(time, duration, inputs)` return the outputs, the first of the table in order, Booleans 0 or
-        1; `state()` all that is remembered without the parameters, as floats; `restore(parameters, state)`
-        takes it back. A call either completes or raises and leaves everything as it was.
-    later : tuple of slice
-        Outputs that are computed when somebody reads them, since most masters do not: groups of rows that
-        follow one another, of which the behaviour's `later(number)` returns the values.
-    """
-
-    table: tuple[FmuVariable, ...]
-    make_behaviour: Callable[[], Any]
-    later: tuple[slice, ...] = ()
+_KINDS_OF_CALLS = {
+    "Real": ("Real",),
+    "Integer": ("Integer", "Enumeration"),
+    "Boolean": ("Boolean",),
+}
+"""Kinds of variables that the calls of a base type may set."""
 
 
 class LogMessage(NamedTuple):
-    """What the FMI wrapper of pythonfmu reads from the log queue."""
+    """A message as the FMI wrapper of pythonfmu reads it from the log queue."""
 
     status: int
     category: str
@@ -69,59 +51,72 @@ class LogMessage(NamedTuple):
 
 
 class Slave:
-    """FMI co-simulation slave; the build joins a subclass of it with pythonfmu's `Fmi2Slave`.
+    """An FMI co-simulation slave; the build joins a subclass of it with pythonfmu's `Fmi2Slave`.
 
     Class attributes
     ----------------
     content_tag : str
         The content hash of the FMU; a state that was saved by another FMU is refused.
     load_contents : static method
-        Takes the folder of resources and returns `Contents`.
+        Takes the folder of resources and returns `SlaveContents`.
     """
 
     content_tag: ClassVar[str] = ""
-    load_contents: ClassVar[staticmethod[[Path], Contents]]
+    load_contents: ClassVar[staticmethod[[Path], SlaveContents]]
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.log_queue: list[LogMessage] = []
         resources = str(kwargs["resources"])
         contents = type(self).load_contents(Path(resources))
-        # The wrapper puts the resources in front of sys.path for every instance and leaves them there.
+        # The wrapper puts the resources in front of sys.path for every instance and leaves them.
         while resources in sys.path:
             sys.path.remove(resources)
-        self._table = contents.table
+        table = contents.table
+        self._table = table
         self._behaviour = contents.make_behaviour()
-        self._low = [-math.inf if row.minimum is None else row.minimum for row in self._table]
-        self._high = [math.inf if row.maximum is None else row.maximum for row in self._table]
-        self._values = [0.0 if row.start is None else float(row.start) for row in self._table]
-        causalities = [row.causality for row in self._table]
-        self._input_count = next(n for n, causality in enumerate(causalities) if causality != "input")
+        # values and ranges by value reference
+        self._values = [0.0 if row.start is None else float(row.start) for row in table]
+        self._low = [-math.inf if row.minimum is None else row.minimum for row in table]
+        self._high = [math.inf if row.maximum is None else row.maximum for row in table]
+        # sections of the table: inputs, parameters, outputs, tunable rows
+        causalities = [row.causality for row in table]
+        is_input = [causality == "input" for causality in causalities]
+        self._input_count = is_input.index(False)
         self._first_output = causalities.index("output")
-        self._end = len(causalities) - causalities[::-1].index("output")
-        self._tuned = {row.name: row.reference for row in self._table[self._end :]}
-        self._status = next(row.reference for row in self._table if row.name == "status")
-        self._later = [(frozenset(range(part.start, part.stop)), part) for part in contents.later]
-        self._pending = [True] * len(self._later)
+        self._end_of_outputs = len(causalities) - causalities[::-1].index("output")
+        self._tunable = {row.name: row.reference for row in table[self._end_of_outputs :]}
+        self._status = next(row.reference for row in table if row.name == "status")
+        # groups of outputs that are computed when they are read
+        self._groups = contents.later
+        self._group_references = [
+            frozenset(range(group.start, group.stop)) for group in contents.later
+        ]
+        self._pending = [True] * len(contents.later)
+        # whether inputs or parameters have changed since the last outputs
         self._stale = True
         self._phase = INSTANTIATED
-        self._time = self._start_time = 0.0
+        self._time = 0.0
+        self._start_time = 0.0
 
     # ------------------------------------------------------------------ life of an instance
 
     def setup_experiment(self, start_time: float = 0.0, *_: object) -> None:
-        """Take the start time."""
+        """Take the start time [s]."""
         if math.isfinite(start_time):
-            self._time = self._start_time = float(start_time)
+            self._time = float(start_time)
+            self._start_time = float(start_time)
         else:
             self._refuse(Status.NOT_FINITE, f"the start time is {start_time!r}; it must be finite")
 
     def enter_initialization_mode(self) -> None:
-        """Begin initialisation."""
+        """Begin the initialisation."""
         if self._phase in (INSTANTIATED, REFUSED):
             self._phase = INITIALISING
         else:
-            self._refuse(Status.BAD_CALL, "initialisation was entered a second time; reset the FMU first")
+            self._refuse(
+                Status.BAD_CALL, "initialisation was entered a second time; reset the FMU first"
+            )
 
     def exit_initialization_mode(self) -> None:
         """Check parameters and inputs, and find the initial state."""
@@ -135,75 +130,125 @@ class Slave:
         self._phase = TERMINATED
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Advance by one communication step, the inputs held; False (fmi2Discard) means nothing changed."""
-        step = partial(self._behaviour.advance, current_time, step_size)
+        """Advance by one communication step, with the inputs held.
+
+        Parameters
+        ----------
+        current_time, step_size : float
+            Begin and duration of the step [s].
+
+        Returns
+        -------
+        bool
+            False (fmi2Discard) if nothing changed.
+        """
         if not self._may_step(current_time, step_size):
             return False
-        consequence = "the step was refused and the state is as it was"
-        if not self._done(step, self._input_count, f"the step from t = {current_time:g} s", consequence):
-            return False
-        self._time = current_time + step_size
-        return True
+        is_done = self._compute_outputs(
+            partial(self._behaviour.advance, current_time, step_size),
+            self._input_count,
+            f"the step from t = {current_time:g} s",
+            "the step was refused and the state is as it was",
+        )
+        if is_done:
+            self._time = current_time + step_size
+        return is_done
 
     def _initialise(self) -> bool:
-        begin = partial(self._behaviour.start, self._parameters(self._values), self._time)
-        return self._done(begin, self._first_output, "the initialisation", "the initialisation was refused")
+        """Compute the outputs at the start; return whether that was possible."""
+        return self._compute_outputs(
+            partial(self._behaviour.start, self._parameters(self._values), self._time),
+            self._first_output,
+            "the initialisation",
+            "the initialisation was refused",
+        )
 
-    def _done(self, act: Callable[..., Sequence[float]], last: int, what: str, consequence: str) -> bool:
-        """Whether values were acceptable and something was done with the inputs, whose outputs are kept."""
+    def _compute_outputs(
+        self,
+        compute: Callable[[Sequence[float]], Sequence[float]],
+        checked_rows: int,
+        action: str,
+        consequence: str,
+    ) -> bool:
+        """Compute outputs from the inputs and keep them; return whether that was possible.
+
+        Parameters
+        ----------
+        compute : callable
+            Returns the outputs that belong to inputs.
+        checked_rows : int
+            Number of rows, from the first, whose values must lie in their ranges.
+        action : str
+            What is done, for messages.
+        consequence : str
+            What a refusal means, for messages.
+        """
         try:
-            if not self._acceptable(last, consequence):
+            if not self._check_ranges(checked_rows, consequence):
                 return False
-            outputs = act(self._values[: self._input_count])
+            outputs = compute(self._values[: self._input_count])
         except UnacceptableValuesError as error:
-            return self._refuse(Status.OUTSIDE_RANGE, f"{error} {consequence[:1].upper()}{consequence[1:]}")
+            sentence = f"{consequence[:1].upper()}{consequence[1:]}"
+            return self._refuse(Status.OUTSIDE_RANGE, f"{error} {sentence}")
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
-            return self._refuse(Status.INTERNAL, f"{what} failed: {error!r}")
+            return self._refuse(Status.INTERNAL, f"{action} failed: {error!r}")
         self._values[self._first_output : self._first_output + len(outputs)] = outputs
         self._values[self._status] = Status.OK
         self._stale = False
-        self._pending = [True] * len(self._later)
+        self._pending = [True] * len(self._pending)
         return True
 
-    def _acceptable(self, last: int, consequence: str) -> bool:
-        """Whether the first rows and those to be tuned lie in their ranges; the latter are handed on."""
-        if not self._in_range(0, last, consequence):
+    def _check_ranges(self, checked_rows: int, consequence: str) -> bool:
+        """Refuse values outside of their ranges, and hand tunable values to the behaviour.
+
+        Parameters are those of `_compute_outputs`.
+        """
+        if not self._in_range(0, checked_rows, consequence):
             return False
-        if self._tuned:
-            if not self._in_range(self._end, len(self._values), consequence):
+        if self._tunable:
+            if not self._in_range(self._end_of_outputs, len(self._values), consequence):
                 return False
-            values = {name: self._values[reference] for name, reference in self._tuned.items()}
+            values = {name: self._values[number] for name, number in self._tunable.items()}
             self._behaviour.tune(values, self._start_time)
         return True
 
     def _may_step(self, current_time: float, step_size: float) -> bool:
+        """Return whether a step is acceptable now; refuse it if not."""
         if self._phase != READY:
-            return self._refuse(Status.BAD_CALL, f"a step was asked for {_WHY[self._phase]}")
-        if not (step_size > 0.0 and math.isfinite(step_size) and math.isfinite(current_time)):
+            phase = _PHASE_NAMES[self._phase]
+            return self._refuse(Status.BAD_CALL, f"a step was asked for {phase}")
+        is_finite = math.isfinite(step_size) and math.isfinite(current_time)
+        if not (step_size > 0.0 and is_finite):
             return self._refuse(
                 Status.BAD_STEP,
-                f"the step from t = {current_time!r} s over {step_size!r} s was refused: the communication "
-                "point must be finite, the step size finite and positive",
+                f"the step from t = {current_time!r} s over {step_size!r} s was refused: the "
+                "communication point must be finite, the step size finite and positive",
             )
-        if abs(current_time - self._time) > 1e-6 * step_size + 1e-9 * abs(self._time):
+        tolerance = 1e-6 * step_size + 1e-9 * abs(self._time)
+        if abs(current_time - self._time) > tolerance:
             return self._refuse(
                 Status.BAD_STEP,
-                f"the step from t = {current_time!r} s was refused: the FMU stands at t = {self._time!r} s",
+                f"the step from t = {current_time!r} s was refused: the FMU stands at t = "
+                f"{self._time!r} s",
             )
         return True
 
     def _parameters(self, values: Sequence[float]) -> dict[str, float]:
-        return {row.name: values[row.reference] for row in self._table if row.causality == "parameter"}
+        """Return the parameters by name among the values of all rows."""
+        rows = [row for row in self._table if row.causality == "parameter"]
+        return {row.name: values[row.reference] for row in rows}
 
     # ------------------------------------------------------------------ values
 
     def _set(self, kind: str, vrs: Sequence[int], values: Sequence[float]) -> None:
-        """Set inputs and tunable parameters at any time, others before the end of initialisation."""
+        """Set inputs and tunable parameters at any time, others until the end of initialisation."""
         for vr, value in zip(vrs, values, strict=True):
             row = self._table[vr] if 0 <= vr < len(self._table) else None
-            if row is None or row.causality == "output" or row.kind not in _KINDS[kind]:
+            if row is None or row.causality == "output" or row.kind not in _KINDS_OF_CALLS[kind]:
                 name = "an unknown variable" if row is None else row.name
-                self._refuse(Status.BAD_CALL, f"{name} (value reference {vr}) cannot be set as {kind}")
+                self._refuse(
+                    Status.BAD_CALL, f"{name} (value reference {vr}) cannot be set as {kind}"
+                )
             elif row.variability == "fixed" and self._phase in (READY, TERMINATED):
                 self._refuse(
                     Status.BAD_CALL,
@@ -218,7 +263,7 @@ class Slave:
     set_boolean = partialmethod(_set, "Boolean")
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
-        """Return values; some outputs are computed when they are asked for."""
+        """Return values; some outputs are computed when they are read."""
         values = self._values
         if min(vrs, default=0) < 0 or max(vrs, default=0) >= len(values):
             unknown = next(vr for vr in vrs if not 0 <= vr < len(values))
@@ -227,23 +272,24 @@ class Slave:
         if self._stale and self._phase == INITIALISING:
             self._initialise()
         if self._phase not in (INSTANTIATED, REFUSED):
-            for number, (rows, part) in enumerate(self._later):
-                if self._pending[number] and not rows.isdisjoint(vrs):
-                    self._complete(number, part)
+            for number, references in enumerate(self._group_references):
+                if self._pending[number] and not references.isdisjoint(vrs):
+                    self._compute_group(number)
         return [values[vr] for vr in vrs]
 
-    def _complete(self, number: int, part: slice) -> None:
-        """Compute a group of outputs that is asked for and not known yet."""
+    def _compute_group(self, number: int) -> None:
+        """Compute a group of outputs that is read and not known yet."""
+        group = self._groups[number]
         try:
-            self._values[part] = self._behaviour.later(number)
+            self._values[group] = self._behaviour.later(number)
             self._pending[number] = False
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
             self._refuse(Status.INTERNAL, f"values could not be read: {error!r}")
-            self._values[part] = [math.nan] * (part.stop - part.start)
+            self._values[group] = [math.nan] * (group.stop - group.start)
 
     def get_integer(self, vrs: Sequence[int]) -> list[int]:
         """Return integers and enumerations."""
-        return [int(value) if value - value == 0.0 else 0 for value in self.get_real(vrs)]
+        return [int(value) if math.isfinite(value) else 0 for value in self.get_real(vrs)]
 
     def get_boolean(self, vrs: Sequence[int]) -> list[bool]:
         """Return Booleans."""
@@ -262,64 +308,101 @@ class Slave:
     # ------------------------------------------------------------------ state
 
     def _get_fmu_state(self) -> bytes:
-        """Return everything that the future depends on, and every value that can be read, as bytes."""
-        flags = (self._stale, *self._pending)
-        head = (float(self._phase), self._time, self._start_time, *map(float, flags))
-        body = [*head, *map(float, self._values), *self._behaviour.state()]
-        tag = self.content_tag.encode("ascii")[:16].ljust(16, b"\0")
-        return _HEADER.pack(_MAGIC, tag, len(body)) + struct.pack(f"<{len(body)}d", *body)
+        """Return all on which the future depends, and all values that can be read, as bytes.
+
+        The numbers are the phase, the time and the start time; flags of stale and pending outputs;
+        the values of all rows; and the state of the behaviour.
+        """
+        flags = [float(flag) for flag in (self._stale, *self._pending)]
+        head = [float(self._phase), self._time, self._start_time, *flags]
+        numbers = [*head, *map(float, self._values), *self._behaviour.state()]
+        tag = self.content_tag.encode("ascii")[:_TAG_LENGTH].ljust(_TAG_LENGTH, b"\0")
+        header = _STATE_HEADER.pack(_MAGIC, tag, len(numbers))
+        return header + struct.pack(f"<{len(numbers)}d", *numbers)
 
     def _set_fmu_state(self, state: object) -> None:
         """Restore what `_get_fmu_state` returned; anything else is refused."""
-        count, flags = len(self._values), 4 + len(self._later)
+        flags_begin = 3
+        values_begin = flags_begin + 1 + len(self._pending)
+        values_end = values_begin + len(self._values)
         try:
-            body = self._unpacked(state)
-            values = body[flags : flags + count]
-            self._behaviour.restore(self._parameters(values), body[flags + count :])
+            numbers = self._numbers_of_state(state)
+            values = numbers[values_begin:values_end]
+            self._behaviour.restore(self._parameters(values), numbers[values_end:])
         except Exception as error:  # noqa: BLE001 - an exception here is fatal to the instance
             self._refuse(Status.BAD_STATE, f"the FMU state was not restored: {error}")
             return
-        self._phase, self._time, self._start_time = int(body[0]), body[1], body[2]
-        self._stale, *self._pending = (flag != 0.0 for flag in body[3:flags])
+        phase, self._time, self._start_time = numbers[:flags_begin]
+        self._phase = int(phase)
+        self._stale, *self._pending = (flag != 0.0 for flag in numbers[flags_begin:values_begin])
         self._values[:] = values
 
-    def _unpacked(self, state: object) -> tuple[float, ...]:
-        """Return the numbers of a state; raises `ValueError` for one of another FMU or a damaged one."""
-        if not isinstance(state, bytes) or len(state) < _HEADER.size:
+    def _numbers_of_state(self, state: object) -> tuple[float, ...]:
+        """Return the numbers of a saved state.
+
+        Raises
+        ------
+        ValueError
+            If it is damaged, or of another FMU.
+        """
+        if not isinstance(state, bytes) or len(state) < _STATE_HEADER.size:
             raise ValueError("it is not a state of this kind of FMU")
-        magic, tag, count = _HEADER.unpack_from(state)
-        if magic != _MAGIC or len(state) < _HEADER.size + 8 * count:
+        magic, tag, count = _STATE_HEADER.unpack_from(state)
+        if magic != _MAGIC or len(state) < _STATE_HEADER.size + 8 * count:
             raise ValueError("it is damaged or not a state of this kind of FMU")
         if tag.rstrip(b"\0").decode("ascii", "replace") != self.content_tag:
             raise ValueError("it was saved by an FMU with other content")
-        return struct.unpack_from(f"<{count}d", state, _HEADER.size)
+        return struct.unpack_from(f"<{count}d", state, _STATE_HEADER.size)
 
     # A state is bytes already.
     _fmu_state_to_bytes = _fmu_state_from_bytes = staticmethod(bytes)
 
     # ------------------------------------------------------------------ refusals
 
-    def _in_range(self, first: int, last: int, consequence: str) -> bool:
+    def _in_range(self, first: int, end: int, consequence: str) -> bool:
+        """Return whether the values of rows lie in their ranges; refuse the first that does not.
+
+        Parameters
+        ----------
+        first, end : int
+            First row, and end of the rows.
+        consequence : str
+            What a refusal means, for messages.
+        """
         values = self._values
-        for index in range(first, last):
+        for index in range(first, end):
             value = values[index]
-            if self._low[index] <= value <= self._high[index] and value - value == 0.0:
+            if self._low[index] <= value <= self._high[index] and math.isfinite(value):
                 continue
             row = self._table[index]
             if not math.isfinite(value):
                 return self._refuse(
-                    Status.NOT_FINITE, f"{row.name} is {value!r}, which is not finite; {consequence}"
+                    Status.NOT_FINITE,
+                    f"{row.name} is {value!r}, which is not finite; {consequence}",
                 )
+            unit = "" if row.unit in (None, "1") else f" {row.unit}"
             return self._refuse(
                 Status.OUTSIDE_RANGE,
-                f"{row.name} = {value!r} lies outside its range {self._low[index]:g} to {self._high[index]:g}"
-                f"{'' if row.unit in (None, '1') else f' {row.unit}'}; {consequence}",
+                f"{row.name} = {value!r} lies outside its range {self._low[index]:g} to "
+                f"{self._high[index]:g}{unit}; {consequence}",
             )
         return True
 
     def _refuse(self, status: int, sentence: str) -> bool:
+        """Set the output `status`, log a sentence, and return False.
+
+        Parameters
+        ----------
+        status : Status
+            Why a call is refused.
+        sentence : str
+            The same for people.
+        """
         self._values[self._status] = status
-        level = _DISCARD if self._phase == READY and status != Status.BAD_STATE else _ERROR
-        category = "logStatusDiscard" if level == _DISCARD else "logStatusError"
-        self.log_queue.append(LogMessage(level, category, sentence))
+        is_discarded = self._phase == READY and status != Status.BAD_STATE
+        if is_discarded:
+            message = LogMessage(_DISCARD, "logStatusDiscard", sentence)
+        else:
+            message = LogMessage(_ERROR, "logStatusError", sentence)
+        self.log_queue.append(message)
         return False

@@ -1,16 +1,13 @@
-"""What a structure does in one communication step: static equilibrium, or its modes integrated in time.
+"""The behaviour of a structure's FMU: static equilibrium, or its modes integrated in time.
 
-Missing effects may be switched on and changed between steps: a patch of the structure, and sensors on what it
-shows. Copied into the FMU, where `fe.runtime` is the folder `fe` beside it; `structure_behaviour.c` does the
-same for a structure without effects.
+Missing effects may be switched on and changed between steps: a patch of the structure, and sensors
+that read its outputs. This file is copied into the FMU, where `fe.runtime` is the folder `fe`
+beside it; `structure_behaviour.c` does the same for a structure without effects.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,32 +19,30 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.reduced_results import ReducedResponse
 from fe.runtime.transient import ModalIntegrator, TransientState
 
-from .base import Contents, UnacceptableValuesError
-from .table import MODE_COUNT, Roles, structure_table
+from .contents import UnacceptableValuesError
+from .table import MODE_COUNT, StructureRoles
 from .variables import TRANSIENT, FmuVariable
 
 if TYPE_CHECKING:
-    from .effects import Acting, Effects
+    from .effects import ActiveEffects, SwitchableEffects
 
 
 BOUND, POINT_OR_BOUND, MODES = range(3)
-"""Groups of outputs that are computed when they are read."""
+"""Groups of outputs that are computed when they are read.
 
-
-def later_outputs(table: Sequence[FmuVariable], roles: Roles) -> tuple[slice, ...]:
-    """Return the rows of the groups `BOUND`, `POINT_OR_BOUND` and `MODES`."""
-    reference = {row.name: row.reference for row in table}
-    other = reference[roles.load_point or roles.displacement_bound or ""]
-    bound, first = reference["strain_error_bound"], reference["frequency[1]"]
-    count = 2 * sum(name.startswith("frequency[") for name in reference)
-    return slice(bound, bound + 1), slice(other, other + 1), slice(first, first + count)
+They are the bound of the strains, the load point or else the bound of the displacements, and the
+modes.
+"""
+_NONE_LENGTH = -1.0
+"""Length that stands for a part of a saved state that is None."""
 
 
 class StructureBehaviour:
-    """A structure in time; a call either completes or raises and leaves everything as it was.
+    """The behaviour of a structure: a call either completes or raises and changes nothing.
 
-    Outputs are gauges, displacements and accelerations. While effects of structure or loads are on, and in
-    every motion of a structure that can have them, it is the wing for patches that rests and moves.
+    Outputs are gauges, displacements and accelerations. While effects of structure or loads are on,
+    and in every motion of a structure that can have them, the wing for patches is at rest and
+    moves, instead of the reduced model itself.
 
     Parameters
     ----------
@@ -55,222 +50,395 @@ class StructureBehaviour:
         The reduced structure.
     table : sequence of FmuVariable
         Its variables, the inputs first.
-    roles : Roles
-        Which of them is what.
-    effects : Effects, optional
+    roles : StructureRoles
+        Roles of variables.
+    effects : SwitchableEffects, optional
         Missing effects of a wing.
     """
 
     def __init__(
-        self, model: ReducedModel, table: Sequence[FmuVariable], roles: Roles, effects: Effects | None = None
+        self,
+        model: ReducedModel,
+        table: Sequence[FmuVariable],
+        roles: StructureRoles,
+        effects: SwitchableEffects | None = None,
     ) -> None:
-        self._model, self._roles, self._effects = model, roles, effects
+        self._model = model
+        self._roles = roles
+        self._effects = effects
         self._inputs = [row.name for row in table if row.causality == "input"]
-        self._resting = [0.0] * len(model.accelerations)
-        self._own = len(model.input_names) - len(model.controls)  # what modes depend on
+        self._accelerations_at_rest = [0.0] * len(model.accelerations)
+        # of the values of the model, those of controls come last and do not change the modes
+        self._structural_count = len(model.input_names) - len(model.controls)
+        # set before the initialisation and between steps
         self._parameters: Mapping[str, float] = {}
-        self._tuned: tuple[Mapping[str, float], float] = ({}, 0.0)
-        self._moves, self._begun = False, 0.0
-        self._acting: Acting | None = None  # of the effects
+        self._is_transient = False
+        self._tuned: Mapping[str, float] = {}
+        self._tuned_start_time = 0.0
+        # the present state; without an integrator, the model itself is at rest
+        self._begin_time = 0.0
+        self._active: ActiveEffects | None = None
         self._vector: FloatArray | None = None
         self._integrator: ModalIntegrator | None = None
-        self._state: TransientState | None = None  # without an integrator, the model itself is at rest
+        self._state: TransientState | None = None
         self._static: ReducedResponse | None = None
         self._filters: list[float] | None = None
-        self._shown: list[float] = []
+        self._readings: list[float] = []
 
-    def tune(self, values: Mapping[str, float], start: float) -> None:
-        """Take the variables of the effects by name, and the time at the start of the simulation [s]."""
-        self._tuned = values, start
+    def tune(self, values: Mapping[str, float], start_time: float) -> None:
+        """Take the variables of the effects.
 
-    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Begin in equilibrium under the inputs, or just let go of where a force held the structure aside.
+        Parameters
+        ----------
+        values : mapping of str to float
+            Their values by name.
+        start_time : float
+            Time at the start of the simulation [s].
+        """
+        self._tuned = values
+        self._tuned_start_time = start_time
+
+    def start(
+        self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]
+    ) -> Sequence[float]:
+        """Return the outputs in equilibrium under the inputs, or just after a release.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float
+            Parameters by name.
+        time : float
+            Start time [s].
+        inputs : sequence of float
+            Inputs in the order of the table.
 
         Raises
         ------
         UnacceptableValuesError
             If the structure cannot have the effects that are on.
         """
-        return self._whole(time, 0.0, inputs, parameters)
+        return self._completely(time, 0.0, inputs, parameters)
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> Sequence[float]:
-        """Advance by one step of `duration` [s] with inputs and effects held; raises as `start`."""
+        """Return the outputs after one step, with inputs and effects held.
+
+        Parameters
+        ----------
+        time, duration : float
+            Begin and duration of the step [s].
+        inputs : sequence of float
+            Inputs in the order of the table.
+
+        Raises
+        ------
+        UnacceptableValuesError
+            If the structure cannot have the effects that are on.
+        """
         if self._vector is None:
             raise RuntimeError("the structure was not initialised")
-        return self._whole(time, duration, inputs)
+        return self._completely(time, duration, inputs)
 
     def later(self, group: int) -> list[float]:
-        """Return the outputs of a group: the bound, the other bound or the load point, the modes."""
+        """Return the outputs of a group.
+
+        Parameters
+        ----------
+        group : int
+            `BOUND`, `POINT_OR_BOUND` or `MODES`.
+        """
         if self._vector is None:
             raise RuntimeError("the structure was not initialised")
         if group == MODES:
-            modes = self._model.modes(self._vector) if self._integrator is None else self._integrator.modes
-            frequency = modes.frequency[:MODE_COUNT]
-            return [*frequency.tolist(), *rayleigh_damping_ratio(*self._damping, frequency).tolist()]
+            return self._modes(self._vector)
         if group == POINT_OR_BOUND and self._roles.load_point is not None:
-            # as sensors show it, where they are on
-            return [self._shown[-1] if self._shown else self._point()]
-        self._static = self._static or self._model.static_response(self._vector)
-        bounds = self._static.strain_error_bound, self._static.displacement_error_bound
-        return [bounds[group]]
+            # as sensors read it, where they are on
+            return [self._readings[-1] if self._readings else self._point_displacement()]
+        static = self._static_response(self._vector)
+        if group == BOUND:
+            return [static.strain_error_bound]
+        return [static.displacement_error_bound]
 
-    def _point(self) -> float:
+    def _modes(self, vector: FloatArray) -> list[float]:
+        """Return frequencies [Hz] and damping ratios of the modes in the table."""
+        integrator = self._integrator
+        modes = self._model.modes(vector) if integrator is None else integrator.modes
+        frequency = modes.frequency[:MODE_COUNT]
+        alpha, beta = self._damping
+        damping_ratio = rayleigh_damping_ratio(alpha, beta, frequency)
+        return [*frequency.tolist(), *damping_ratio.tolist()]
+
+    def _static_response(self, vector: FloatArray) -> ReducedResponse:
+        """Return the static response of the model, computed once for each step."""
+        if self._static is None:
+            self._static = self._model.static_response(vector)
+        return self._static
+
+    def _point_displacement(self) -> float:
         """Return the displacement of the point whose load holds the structure aside [m]."""
         if self._integrator is not None and self._state is not None:
-            return self._integrator.point_displacement(self._state, self._held(self._integrator))
-        self._static = self._static or self._model.static_response(self._vector)
-        return float(self._model.static_load[self._roles.point_load] @ self._static.coordinates)
+            load = self._holding_load(self._integrator)
+            return self._integrator.point_displacement(self._state, load)
+        assert self._vector is not None
+        static = self._static_response(self._vector)
+        return float(self._model.static_load[self._roles.point_load] @ static.coordinates)
+
+    # ------------------------------------------------------------ saved states
 
     def state(self) -> list[float]:
-        """Return all that is remembered, without the parameters."""
-        now, values = self._state, None if self._acting is None else self._acting.values
-        motion = () if now is None else (now.displacement, now.velocity, now.load, *now.memory)
-        parts = (self._vector, values, (self._begun,), self._filters, self._shown, *motion)
-        # a part that is not there has the length -1
-        told = (item for part in parts for item in ((-1.0,) if part is None else (len(part), *part)))
-        return [float(len(parts)), *map(float, told)]
+        """Return everything that is remembered, without the parameters.
+
+        The numbers are the number of parts, then the length and the numbers of each part.
+        """
+        motion: list[Sequence[float] | FloatArray] = []
+        if self._state is not None:
+            state = self._state
+            motion = [state.displacement, state.velocity, state.load, *state.memory]
+        parts: list[Sequence[float] | FloatArray | None] = [
+            self._vector,
+            None if self._active is None else self._active.values,
+            (self._begin_time,),
+            self._filters,
+            self._readings,
+            *motion,
+        ]
+        numbers = [float(len(parts))]
+        for part in parts:
+            if part is None:
+                numbers.append(_NONE_LENGTH)
+            else:
+                numbers.append(float(len(part)))
+                numbers += map(float, part)
+        return numbers
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
-        """Take back what `state` returned; `parameters` are those of that moment."""
+        """Go back to what `state` returned.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float
+            Parameters of that moment by name.
+        state : sequence of float
+            What `state` returned.
+
+        Raises
+        ------
+        ValueError
+            If a number is not finite.
+        """
         if not np.isfinite(list(state)).all():
             raise ValueError("it holds a number that is not finite")
-        numbers = iter(state)
-        parts = [
-            None if length < 0.0 else [next(numbers) for _ in range(int(length))]
-            for length in (next(numbers) for _ in range(int(next(numbers))))
-        ]
-        vector, values, begun, filters, shown, *motion = parts
-        self._keep(parameters)
+        vector, values, begin_time, filters, readings, *motion = _parts_of_state(state)
+        self._take_parameters(parameters)
         self._static = None
-        self._begun, self._filters, self._shown = (begun or [0.0])[0], filters, shown or []
+        self._begin_time = begin_time[0] if begin_time else 0.0
+        self._filters = filters
+        self._readings = readings or []
         self._vector = None if vector is None else np.array(vector)
         if self._effects is not None and values is not None:
-            self._acting = self._effects.acting(values)
-        self._integrator = self._state = None
+            self._active = self._effects.active(values)
+        self._integrator = None
+        self._state = None
         if motion and self._vector is not None:
-            self._integrator = self._made(self._vector)
-            place, velocity, load, *memory = map(np.array, motion)
-            self._state = TransientState(place, velocity, load, *([np.array(memory)] if memory else []))
+            self._integrator = self._make_integrator(self._vector)
+            displacement, velocity, load, *memory = map(np.array, motion)
+            self._state = TransientState(displacement, velocity, load)
+            if memory:
+                self._state = TransientState(displacement, velocity, load, np.array(memory))
 
-    # ------------------------------------------------------------ parts
+    # ------------------------------------------------------------ steps
 
-    def _keep(self, parameters: Mapping[str, float]) -> None:
+    def _take_parameters(self, parameters: Mapping[str, float]) -> None:
         self._parameters = dict(parameters)
-        self._damping = parameters["damping.alpha"], parameters["damping.beta"]
-        self._moves = int(parameters["response"]) == TRANSIENT
+        self._damping = (parameters["damping.alpha"], parameters["damping.beta"])
+        self._is_transient = int(parameters["response"]) == TRANSIENT
 
-    def _whole(
-        self, time: float, duration: float, inputs: Sequence[float], start: Mapping[str, float] | None = None
+    def _completely(
+        self,
+        time: float,
+        duration: float,
+        inputs: Sequence[float],
+        start_parameters: Mapping[str, float] | None = None,
     ) -> list[float]:
-        """Make a step, or a start with parameters, completely, or leave everything as it was."""
-        before = dict(self.__dict__)
+        """Return the outputs after a start or a step; after an error everything is as it was.
+
+        Parameters
+        ----------
+        time, duration : float
+            Begin and duration of the step [s].
+        inputs : sequence of float
+            Inputs in the order of the table.
+        start_parameters : mapping of str to float, optional
+            Parameters of a start; None for a step.
+        """
+        attributes_before = dict(self.__dict__)
         try:
-            if start is not None:
-                self._keep(start)
-                self._begun = self._tuned[1]
-                self._vector = self._state = self._integrator = self._filters = None
-            return self._go(time, duration, inputs)
+            if start_parameters is not None:
+                self._take_parameters(start_parameters)
+                self._begin_time = self._tuned_start_time
+                self._vector = None
+                self._state = None
+                self._integrator = None
+                self._filters = None
+            return self._outputs_after(time, duration, inputs)
         except Exception as error:
-            self.__dict__.update(before)
+            self.__dict__.update(attributes_before)
             if not isinstance(error, FiniteElementError):
                 raise
-            sentence = str(error)
-            raise UnacceptableValuesError(sentence if sentence.endswith(".") else f"{sentence}.") from error
+            sentence = str(error).removesuffix(".")
+            raise UnacceptableValuesError(f"{sentence}.") from error
 
-    def _go(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
+    def _outputs_after(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
         """Begin, where there is no state yet, or advance; return the outputs."""
-        changed = self._effects is not None and self._take_effects(self._effects)
-        before, parameters, own = self._vector, self._parameters, self._own
-        values = {**parameters, **dict(zip(self._inputs, inputs, strict=True))}
+        has_changed = self._effects is not None and self._take_effects(self._effects)
+        values = {**self._parameters, **dict(zip(self._inputs, inputs, strict=True))}
         vector = np.array([values[name] for name in self._roles.chosen])
-        integrator, state, static = self._integrator, self._state, None
-        if not (self._moves or (self._acting is not None and self._acting.changes_structure)):
-            integrator = state = None
-            static = self._model.static_response(vector)
-            outputs = [*static.strain.tolist(), *static.displacement.tolist(), *self._resting]
+        has_patched_structure = self._active is not None and self._active.changes_structure
+        integrator: ModalIntegrator | None = None
+        state: TransientState | None = None
+        static: ReducedResponse | None = None
+        if self._is_transient or has_patched_structure:
+            integrator, state = self._next_motion(vector, time, duration, has_changed=has_changed)
+            outputs: list[float] = integrator.outputs(state).tolist()
         else:
-            same = before is not None and vector[:own].tobytes() == before[:own].tobytes()
-            if integrator is None or changed or not same:
-                integrator = self._made(vector)
-                if self._integrator is not None and state is not None:
-                    state = integrator.take_over(state, self._integrator)
-            load = integrator.structure.load_coefficients(vector)
-            if not self._moves:
-                state = integrator.equilibrium(load, state)
-            elif state is not None:
-                state = integrator.advance(state, duration, load, time - self._begun)
-            elif self._roles.release is None:
-                state = integrator.state_at_rest(load)
-            else:
-                state = integrator.state_after_release(
-                    parameters[self._roles.release], load, self._held(integrator)
-                )
-            outputs = integrator.outputs(state).tolist()
-        self._vector, self._integrator, self._state, self._static = vector, integrator, state, static
-        return outputs if self._acting is None else self._show(outputs, duration, time + duration)
+            static = self._model.static_response(vector)
+            outputs = [
+                *static.strain.tolist(),
+                *static.displacement.tolist(),
+                *self._accelerations_at_rest,
+            ]
+        self._vector = vector
+        self._integrator = integrator
+        self._state = state
+        self._static = static
+        if self._active is None:
+            return outputs
+        return self._read_by_sensors(self._active, outputs, duration, time + duration)
 
-    def _held(self, integrator: ModalIntegrator) -> int:
-        """Return the number of the load that holds the structure aside."""
+    def _next_motion(
+        self, vector: FloatArray, time: float, duration: float, *, has_changed: bool
+    ) -> tuple[ModalIntegrator, TransientState]:
+        """Return the integrator and the state after a start or a step.
+
+        Parameters
+        ----------
+        vector : (V,) ndarray
+            Values of the model.
+        time, duration : float
+            Begin and duration of the step [s].
+        has_changed : bool
+            Whether the effects have changed.
+        """
+        integrator = self._integrator
+        state = self._state
+        # another integrator where the structure has changed
+        if integrator is None or has_changed or self._structure_differs(vector):
+            integrator = self._make_integrator(vector)
+            if self._integrator is not None and state is not None:
+                state = integrator.take_over(state, self._integrator)
+        load = integrator.structure.load_coefficients(vector)
+        if not self._is_transient:
+            return integrator, integrator.equilibrium(load, state)
+        if state is not None:
+            since_begin = time - self._begin_time
+            return integrator, integrator.advance(state, duration, load, since_begin)
+        if self._roles.release is None:
+            return integrator, integrator.state_at_rest(load)
+        release = self._parameters[self._roles.release]
+        holding_load = self._holding_load(integrator)
+        return integrator, integrator.state_after_release(release, load, holding_load)
+
+    def _structure_differs(self, vector: FloatArray) -> bool:
+        """Return whether values that change the modes differ from the last ones, to the bit."""
+        if self._vector is None:
+            return True
+        count = self._structural_count
+        return vector[:count].tobytes() != self._vector[:count].tobytes()
+
+    def _holding_load(self, integrator: ModalIntegrator) -> int:
+        """Return the number of the load that holds the structure aside before a release."""
         holding = integrator.structure.holding_load
         return self._roles.point_load if holding is None else holding
 
-    def _take_effects(self, effects: Effects) -> bool:
+    def _make_integrator(self, vector: FloatArray) -> ModalIntegrator:
+        """Return the structure in time; a wing with effects in its basis for patches."""
+        if self._effects is None or self._effects.wing is None:
+            alpha, beta = self._damping
+            return ModalIntegrator(self._model.structure_at(vector), alpha, beta)
+        assert self._active is not None
+        return self._effects.integrator(vector, self._damping, self._active)
+
+    # ------------------------------------------------------------ effects
+
+    def _take_effects(self, effects: SwitchableEffects) -> bool:
         """Take the effects as they are tuned; return whether they changed."""
-        values = effects.values(self._tuned[0])
-        old = self._acting
-        if old is not None and old.values == values:
+        values = effects.values(self._tuned)
+        previous = self._active
+        if previous is not None and previous.values == values:
             return False
-        self._acting = effects.acting(values)
-        if old is None or old.filters != self._acting.filters:
+        self._active = effects.active(values)
+        if previous is None or previous.filters != self._active.filters:
             self._filters = None
         return True
 
-    def _show(self, values: list[float], duration: float, end: float) -> list[float]:
-        """Return what sensors make of outputs."""
+    def _read_by_sensors(
+        self, active: ActiveEffects, outputs: list[float], duration: float, end: float
+    ) -> list[float]:
+        """Return outputs as sensors read them, and keep the memory of the sensors' filters.
+
+        Parameters
+        ----------
+        active : ActiveEffects
+            The effects.
+        outputs : list of float
+            Outputs of the structure.
+        duration, end : float
+            Duration and end of the step [s].
+        """
         assert self._effects is not None
-        assert self._acting is not None
-        if not len(self._acting.patch):
-            self._filters, self._shown = None, []
-            return values
-        across = None
-        if self._integrator is not None and self._state is not None and self._acting.changes_structure:
-            seen = self._integrator.structure.strain_component_rows @ self._integrator.displacement(
-                self._state
-            )
-            across = np.pad(seen, ((0, 0), (0, len(values) + 1 - seen.shape[1])))
+        if not len(active.patch):
+            self._filters = None
+            self._readings = []
+            return outputs
         release = self._parameters.get(self._roles.release or "", 0.0)
-        kind = "flight" if not self._moves else "ringdown" if release else "forced"
-        since = end - self._begun if self._moves else end
-        self._shown, self._filters = self._effects.shown(
-            self._acting, np.array([*values, self._point()]), across, self._filters, duration,
-            kind=kind, time=since, start=self._begun, release=release,
-        )  # fmt: skip
-        return self._shown[:-1]
+        kind = "flight"
+        if self._is_transient:
+            kind = "ringdown" if release else "forced"
+        readings = self._effects.readings(
+            active,
+            np.array([*outputs, self._point_displacement()]),
+            self._strains_across(active, len(outputs) + 1),
+            self._filters,
+            duration,
+            kind=kind,
+            time=end - self._begin_time if self._is_transient else end,
+            start=self._begin_time,
+            release=release,
+        )
+        self._filters = readings.filter_memory
+        self._readings = readings.values
+        return self._readings[:-1]
 
-    def _made(self, vector: FloatArray) -> ModalIntegrator:
-        """Return the structure in time; that of a wing with effects in its basis for patches."""
-        if self._effects is None or self._effects.wing is None:
-            return ModalIntegrator(self._model.structure_at(vector), *self._damping)
-        assert self._acting is not None
-        return self._effects.integrator(vector, self._damping, self._acting)
+    def _strains_across(self, active: ActiveEffects, channels: int) -> FloatArray | None:
+        """Return the strains across the gauges and in shear (2, channels), zero for other channels.
+
+        None if no sensor needs them.
+        """
+        if self._integrator is None or self._state is None or not active.changes_structure:
+            return None
+        displacement = self._integrator.displacement(self._state)
+        strains = self._integrator.structure.strain_component_rows @ displacement
+        missing = channels - strains.shape[1]
+        return np.pad(strains, ((0, 0), (0, missing)))
 
 
-def load_contents(resources: Path) -> Contents:
-    """Return what the files that `fmu_asset.packing.structure_fmu` packed describe."""
-    model = ReducedModel.load(resources / "reduced_model.npz")
-    start = json.loads((resources / "start.json").read_text(encoding="utf-8"))
-    own = {name: value for name, value in start.items() if not name.startswith("effect.")}
-    table, roles = structure_table(model, own)
-    later, behaviour = later_outputs(table, roles), partial(StructureBehaviour, model, table, roles)
-    if not (resources / "effects.json").is_file():
-        return Contents(table, behaviour, later)
-    # a plain structure needs nothing of these
-    from fe.runtime.patch_arrays import PatchArrays
-
-    from .effects import Effects, effect_rows
-
-    effects = json.loads((resources / "effects.json").read_text(encoding="utf-8"))
-    file = resources / "patch_arrays.npz"
-    arrays = PatchArrays.load(file) if file.is_file() else None
-    rows = effect_rows(effects, len(table), start)
-    return Contents(table + rows, lambda: behaviour(Effects(effects, len(model.gauges), arrays)), later)
+def _parts_of_state(state: Sequence[float]) -> list[list[float] | None]:
+    """Return the parts of a saved state; see `StructureBehaviour.state`."""
+    numbers = iter(state)
+    parts: list[list[float] | None] = []
+    for _ in range(int(next(numbers))):
+        length = next(numbers)
+        if length < 0.0:
+            parts.append(None)
+        else:
+            parts.append([next(numbers) for _ in range(int(length))])
+    return parts

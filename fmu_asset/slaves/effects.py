@@ -1,8 +1,8 @@
-"""Missing effects of a wing: their variables, the patch that these make, and how it acts on what is shown.
+"""Missing effects of a wing's FMU: their variables, the patch that they make, and sensor readings.
 
-An effect has a switch and every number of its primitives as tunable parameters; they stand at the end of the
-table, so that value references before them stay. Copied into the FMU, where a plain structure needs nothing
-of it.
+An effect has a switch, and every number of its primitives, as tunable parameters. They stand at the
+end of the table, so that value references before them stay. This file is copied into the FMU; a
+structure without effects does not need it.
 """
 
 from __future__ import annotations
@@ -21,148 +21,225 @@ from fe.runtime.patched_wing import PatchedWing
 from fe.runtime.sensors import FilterMemory, SensorRecord, apply_sensors, needs_structure
 from fe.runtime.transient import ModalIntegrator
 
-from .base import UnacceptableValuesError
-from .variables import FmuVariable, Table
+from .contents import UnacceptableValuesError
+from .variables import FmuVariable, VariableTable
 
 TEMPERATURE = "temperature_difference"
-"""Input of FMUs with an effect of temperature: the wing's temperature less the reference temperature [K]."""
+"""Input of FMUs with an effect of temperature: difference from the reference temperature [K]."""
 
 ROTATING_PORT = "root"
 """The port of the wing whose motion is a rotation."""
 
 RANGES: Mapping[str, tuple[float, float]] = {"side": (-1.0, 1.0), "element_count": (1.0, 1000.0)}
-"""Ranges of the whole numbers of primitives; of the others the wing says itself what cannot be."""
+"""Ranges of the whole numbers of primitives; the wing itself refuses impossible other numbers."""
+_TEMPERATURE_RANGE = (-100.0, 100.0)
+
+EffectRecord = Mapping[str, Any]
+"""An effect as JSON: `id`, and `primitives` as `ModelPatch.to_list` gives them."""
 
 
 def output_channels(gauge_count: int) -> tuple[tuple[str, str], ...]:
-    """Return names and quantities of the outputs that sensors show, in the behaviour's order."""
+    """Return name and quantity of the outputs that sensors read, in the behaviour's order.
+
+    Parameters
+    ----------
+    gauge_count : int
+        Number of gauges of the wing.
+    """
     strains = tuple((f"strain[{gauge}]", "strain") for gauge in range(1, gauge_count + 1))
-    return (*strains, ("tip_displacement", "displacement"), ("load_point_displacement", "displacement"))
+    displacements = (
+        ("tip_displacement", "displacement"),
+        ("load_point_displacement", "displacement"),
+    )
+    return strains + displacements
 
 
-def numbers_of(effect: Mapping[str, Any]) -> dict[str, tuple[int, str]]:
-    """Return the numbers of an effect by their variables: which primitive has them under which key.
+class PrimitiveNumber(NamedTuple):
+    """A number of an effect: the position of its primitive in the effect, and its key there."""
 
-    A number is called `effect.<id>.<key>`; where several primitives of the effect have one of that name,
-    `effect.<id>.<key>[n]`, n the number of the primitive from 1.
+    primitive: int
+    key: str
+
+
+def numbers_of(effect: EffectRecord) -> dict[str, PrimitiveNumber]:
+    """Return the numbers of an effect by the names of their variables.
+
+    A number is called `effect.<id>.<key>`; where several primitives of the effect have one of that
+    name, `effect.<id>.<key>[n]`, with the number n of the primitive from 1.
 
     Parameters
     ----------
     effect : mapping
-        `id`, and `primitives` as `ModelPatch.to_list` gives them.
+        The effect, see `EffectRecord`.
     """
-    found = [
-        (number, key)
-        for number, primitive in enumerate(effect["primitives"])
-        for key, value in primitive.items()
-        if isinstance(value, int | float)
-    ]
-    often = Counter(key for _, key in found)
-    return {
-        f"effect.{effect['id']}.{key}" + (f"[{number + 1}]" if often[key] > 1 else ""): (number, key)
-        for number, key in found
-    }
+    numbers = []
+    for position, primitive in enumerate(effect["primitives"]):
+        for key, value in primitive.items():
+            if isinstance(value, int | float):
+                numbers.append(PrimitiveNumber(position, key))
+    uses = Counter(number.key for number in numbers)
+    by_name = {}
+    for number in numbers:
+        name = f"effect.{effect['id']}.{number.key}"
+        if uses[number.key] > 1:
+            name += f"[{number.primitive + 1}]"
+        by_name[name] = number
+    return by_name
 
 
 def _unit(primitive: Mapping[str, Any], key: str) -> str:
     """Return the unit of a primitive's number in the spelling of FMI, "1" for none."""
     unit = PRIMITIVES[str(primitive["kind"])].units.get(key, "1")
     if unit in (CHANNEL_UNIT, PER_RELEASE):
-        channel = str(primitive["channel"])
-        displacement = channel.endswith("displacement") or primitive.get("quantity") == "displacement"
+        is_displacement = (
+            str(primitive["channel"]).endswith("displacement")
+            or primitive.get("quantity") == "displacement"
+        )
         if unit == CHANNEL_UNIT:
-            return "m" if displacement else "1"
-        return "1" if displacement else "1/m"
-    moving, _, turning = unit.partition(" or ")
-    return (turning if turning and primitive.get("port") == ROTATING_PORT else moving).replace(" ", ".")
+            return "m" if is_displacement else "1"
+        return "1" if is_displacement else "1/m"
+    # "N s / m or N m s / rad": for translation or rotation
+    of_translation, _, of_rotation = unit.partition(" or ")
+    if of_rotation and primitive.get("port") == ROTATING_PORT:
+        return of_rotation.replace(" ", ".")
+    return of_translation.replace(" ", ".")
 
 
-def switch_of(effect: Mapping[str, Any]) -> str:
-    """Return the name of the switch of an effect."""
+def switch_name(effect: EffectRecord) -> str:
+    """Return the name of the variable that switches an effect on."""
     return f"effect.{effect['id']}.active"
 
 
 def effect_rows(
-    effects: Sequence[Mapping[str, Any]], first: int, start: Mapping[str, float]
+    effects: Sequence[EffectRecord], first: int, start: Mapping[str, float]
 ) -> tuple[FmuVariable, ...]:
     """Return the rows that effects append to the table of variables.
 
     Parameters
     ----------
     effects : sequence of mapping
-        `id` and `primitives` of each.
+        The effects, see `EffectRecord`.
     first : int
         Value reference of the first row.
     start : mapping of str to float
-        Start values by variable name; a switch that is not there is off, a number has its value in the patch.
+        Start values by variable name. A switch that is missing is off, and a number has its value
+        in the patch.
     """
-    table = Table({}, first)
+    table = VariableTable({}, first)
     for effect in effects:
-        words = " and ".join(dict.fromkeys(str(item["kind"]) for item in effect["primitives"]))
-        switch = switch_of(effect)
-        table.add(
-            switch, "parameter",
-            f"Whether the effect {effect['id']} ({words.replace('_', ' ')}) acts: 0 off, 1 on",
-            unit="1", box=(0.0, 1.0), default=start.get(switch, 0.0), tunable=True,
-        )  # fmt: skip
-        for name, (number, key) in numbers_of(effect).items():
-            primitive = effect["primitives"][number]
-            value, place = primitive[key], primitive.get("port") or primitive.get("channel") or ""
-            where = f" at {place}" if place not in ("", "*") else ""
-            text = f"{key.replace('_', ' ')} of {str(primitive['kind']).replace('_', ' ')}{where}"
-            whole = isinstance(value, int)
-            table.add(
-                name, "parameter", text[:1].upper() + text[1:],
-                kind="Integer" if whole else "Real", unit=None if whole else _unit(primitive, key),
-                box=RANGES[key] if whole else (None, None), default=start.get(name, value), tunable=True,
-            )  # fmt: skip
-    kinds = {item["kind"] for effect in effects for item in effect["primitives"]}
+        _add_switch(table, effect, start)
+        for name, number in numbers_of(effect).items():
+            primitive = effect["primitives"][number.primitive]
+            _add_number(table, name, primitive, number.key, start)
+    kinds = {primitive["kind"] for effect in effects for primitive in effect["primitives"]}
     if kinds & {"thermal_strain", "modulus_temperature"}:
         table.add(
-            TEMPERATURE, "input", "Temperature of the wing less the reference temperature",
-            unit="K", box=(-100.0, 100.0), default=start.get(TEMPERATURE, 0.0),
-        )  # fmt: skip
+            TEMPERATURE,
+            "input",
+            "Temperature of the wing less the reference temperature",
+            unit="K",
+            limits=_TEMPERATURE_RANGE,
+            default=start.get(TEMPERATURE, 0.0),
+        )
     return table.rows()
 
 
+def _add_switch(table: VariableTable, effect: EffectRecord, start: Mapping[str, float]) -> None:
+    """Add the switch of an effect to a table; `start` as in `effect_rows`."""
+    kinds = dict.fromkeys(str(primitive["kind"]) for primitive in effect["primitives"])
+    words = " and ".join(kinds).replace("_", " ")
+    name = switch_name(effect)
+    table.add(
+        name,
+        "parameter",
+        f"Whether the effect {effect['id']} ({words}) acts: 0 off, 1 on",
+        unit="1",
+        limits=(0.0, 1.0),
+        default=start.get(name, 0.0),
+        tunable=True,
+    )
+
+
+def _add_number(
+    table: VariableTable,
+    name: str,
+    primitive: Mapping[str, Any],
+    key: str,
+    start: Mapping[str, float],
+) -> None:
+    """Add a number of a primitive to a table.
+
+    Parameters
+    ----------
+    table : VariableTable
+        The table.
+    name : str
+        Name of the variable.
+    primitive : mapping
+        The primitive.
+    key : str
+        Key of the number in it.
+    start : mapping of str to float
+        Start values by variable name.
+    """
+    value = primitive[key]
+    place = primitive.get("port") or primitive.get("channel") or ""
+    where = "" if place in ("", "*") else f" at {place}"
+    kind = str(primitive["kind"]).replace("_", " ")
+    text = f"{key.replace('_', ' ')} of {kind}{where}"
+    is_whole = isinstance(value, int)
+    table.add(
+        name,
+        "parameter",
+        text[:1].upper() + text[1:],
+        kind="Integer" if is_whole else "Real",
+        unit=None if is_whole else _unit(primitive, key),
+        limits=RANGES[key] if is_whole else (None, None),
+        default=start.get(name, value),
+        tunable=True,
+    )
+
+
 def active_primitives(
-    effects: Sequence[Mapping[str, Any]], value: Mapping[str, float]
+    effects: Sequence[EffectRecord], values: Mapping[str, float]
 ) -> list[dict[str, Any]]:
-    """Return the primitives of the effects that are switched on, with the values of their variables.
+    """Return the primitives of the effects that are on, with the values of their variables.
 
     Parameters
     ----------
     effects : sequence of mapping
-        `id` and `primitives` of each.
-    value : mapping of str to float
+        The effects, see `EffectRecord`.
+    values : mapping of str to float
         Values by variable name; a switch is on above one half.
     """
-    rows: list[dict[str, Any]] = []
+    active: list[dict[str, Any]] = []
     for effect in effects:
-        if value[switch_of(effect)] <= 0.5:
+        if values[switch_name(effect)] <= 0.5:
             continue
-        own = [dict(primitive) for primitive in effect["primitives"]]
-        for name, (number, key) in numbers_of(effect).items():
-            own[number][key] = type(own[number][key])(value[name])
-        rows += own
-    return rows
+        primitives = [dict(primitive) for primitive in effect["primitives"]]
+        for name, number in numbers_of(effect).items():
+            primitive = primitives[number.primitive]
+            number_type = type(primitive[number.key])
+            primitive[number.key] = number_type(values[name])
+        active += primitives
+    return active
 
 
-class Acting(NamedTuple):
+class ActiveEffects(NamedTuple):
     """Effects with the values of their variables.
 
     Attributes
     ----------
     values : tuple of float
-        Of the variables.
+        Values of the variables.
     patch : ModelPatch
-        What is on.
+        The effects that are on.
     temperature : float
-        Less the reference temperature [K].
+        Difference from the reference temperature [K].
     changes_structure : bool
-        Whether more is on than what sensors make of the readings.
-    filters : list of tuple
-        The chain of filters, whose memory stays where it is the same.
+        Whether more is on than changes of the sensors' readings.
+    filters : list of (str, str, float)
+        Channel, quantity and order of each filter; the memory of filters stays while these do.
     """
 
     values: tuple[float, ...]
@@ -172,79 +249,162 @@ class Acting(NamedTuple):
     filters: list[tuple[str, str, float]]
 
 
-class Effects:
+class SensorReadings(NamedTuple):
+    """Readings of all channels at one moment.
+
+    Attributes
+    ----------
+    values : list of float
+        The readings.
+    filter_memory : list of float
+        Memory of the sensors' filters for the next moment.
+    """
+
+    values: list[float]
+    filter_memory: list[float]
+
+
+class SwitchableEffects:
     """Missing effects that can be switched on and changed between steps.
 
     Parameters
     ----------
     effects : sequence of mapping
-        `id` and `primitives` of each effect.
+        The effects, see `EffectRecord`.
     gauge_count : int
         Number of gauges of the wing.
     arrays : PatchArrays, optional
-        The wing for patches; None where the effects are of sensors alone.
+        The wing for patches; None if the effects are of sensors alone.
+
+    Attributes
+    ----------
+    wing : PatchedWing or None
+        The wing for patches.
     """
 
     def __init__(
-        self, effects: Sequence[Mapping[str, Any]], gauge_count: int, arrays: PatchArrays | None = None
+        self,
+        effects: Sequence[EffectRecord],
+        gauge_count: int,
+        arrays: PatchArrays | None = None,
     ) -> None:
-        self._effects, self._channels = effects, output_channels(gauge_count)
+        self._effects = effects
+        self._channels = output_channels(gauge_count)
         self.wing = None if arrays is None else PatchedWing(arrays)
         self._names = tuple(row.name for row in effect_rows(effects, 0, {}))
-        self._last: tuple[object, ModalIntegrator] | None = None  # it never changes
+        # the last integrator, which never changes, and what it was made for
+        self._last_integrator: ModalIntegrator | None = None
+        self._last_key: object = None
 
     def values(self, tuned: Mapping[str, float]) -> tuple[float, ...]:
-        """Return the values of the variables in their order."""
+        """Return the values of the variables in their order, from values by name."""
         return tuple(tuned[name] for name in self._names)
 
-    def acting(self, values: Sequence[float]) -> Acting:
-        """Return the effects as values of the variables have them; raises `InvalidPatchError`."""
-        named = dict(zip(self._names, values, strict=True))
-        patch = ModelPatch.from_list(active_primitives(self._effects, named))
-        filters = [(item.channel, item.quantity, item.order) for item in patch if isinstance(item, HighPass)]
-        return Acting(tuple(values), patch, named.get(TEMPERATURE, 0.0), needs_structure(patch), filters)
+    def active(self, values: Sequence[float]) -> ActiveEffects:
+        """Return the effects for values of the variables, in their order.
 
-    def shown(
-        self, acting: Acting, values: FloatArray, across: FloatArray | None,
-        memory: Sequence[float] | None, duration: float, *, time: float, **record: Any,
-    ) -> tuple[list[float], list[float]]:  # fmt: skip
-        """Return what sensors show of the values (C,) of the channels, and what they remember.
+        Raises
+        ------
+        InvalidPatchError
+            If a primitive cannot have its numbers.
+        """
+        by_name = dict(zip(self._names, values, strict=True))
+        patch = ModelPatch.from_list(active_primitives(self._effects, by_name))
+        filters = []
+        for primitive in patch:
+            if isinstance(primitive, HighPass):
+                filters.append((primitive.channel, primitive.quantity, primitive.order))
+        return ActiveEffects(
+            values=tuple(values),
+            patch=patch,
+            temperature=by_name.get(TEMPERATURE, 0.0),
+            changes_structure=needs_structure(patch),
+            filters=filters,
+        )
+
+    def readings(
+        self,
+        active: ActiveEffects,
+        values: FloatArray,
+        strains_across: FloatArray | None,
+        filter_memory: Sequence[float] | None,
+        duration: float,
+        *,
+        kind: str,
+        time: float,
+        start: float,
+        release: float,
+    ) -> SensorReadings:
+        """Return the sensors' readings of the channels at the end of a step.
 
         Parameters
         ----------
-        acting : Acting
+        active : ActiveEffects
             The effects.
-        values, across : (C,), (2, C) ndarray
-            What there is, and strains across and in shear; None: no sensor needs them.
-        memory : sequence of float, optional
-            From the sample before, `duration` earlier.
-        time : float
-            Of the sample, as of `SensorRecord` [s].
-        **record
-            The other values of `SensorRecord`.
+        values : (C,) ndarray
+            True values of the channels.
+        strains_across : (2, C) ndarray, optional
+            Strains across the gauges and in shear; None if no sensor needs them.
+        filter_memory : sequence of float, optional
+            Memory of the filters from the last readings; None if the signals had settled.
+        duration : float
+            Time since the last readings [s].
+        kind : {"flight", "forced", "ringdown"}
+            Kind of trial, see `SensorRecord`.
+        time, start : float
+            Time of the readings, and of the start of the simulation [s].
+        release : float
+            Displacement from which the structure was released [m].
 
         Raises
         ------
         UnacceptableValuesError
             If a reading is not finite.
         """
-        row = SensorRecord(
-            self._channels, time=np.array([time]), temperature=np.array([acting.temperature]), **record
+        record = SensorRecord(
+            self._channels,
+            time=np.array([time]),
+            temperature=np.array([active.temperature]),
+            kind=kind,
+            start=start,
+            release=release,
         )
-        transverse, shear = (None, None) if across is None else across[:, np.newaxis]
-        filters = FilterMemory(memory, duration)
-        (shown,), _ = apply_sensors(
-            acting.patch, row, values[np.newaxis], None, transverse, shear, high_pass=filters.filter_row
+        transverse = shear = None
+        if strains_across is not None:
+            transverse, shear = strains_across[:, np.newaxis]
+        filters = FilterMemory(filter_memory, duration)
+        (readings,), _ = apply_sensors(
+            active.patch,
+            record,
+            values[np.newaxis],
+            None,
+            transverse,
+            shear,
+            high_pass=filters.filter_row,
         )
-        if not math.isfinite(float(shown.sum())):
+        if not math.isfinite(float(readings.sum())):
             raise UnacceptableValuesError("With the effects that are on, an output is not finite.")
-        return shown.tolist(), filters.states
+        return SensorReadings(readings.tolist(), filters.states)
 
-    def integrator(self, vector: FloatArray, damping: tuple[float, float], acting: Acting) -> ModalIntegrator:
-        """Return the wing for patches in time, the last one where nothing changed."""
+    def integrator(
+        self, vector: FloatArray, damping: tuple[float, float], active: ActiveEffects
+    ) -> ModalIntegrator:
+        """Return the wing for patches in time; the last one if nothing changed.
+
+        Parameters
+        ----------
+        vector : (V,) ndarray
+            Values of the model; the two last ones, the controls, do not matter.
+        damping : (float, float)
+            Rayleigh damping [1/s], [s].
+        active : ActiveEffects
+            The effects.
+        """
         assert self.wing is not None
-        key = (vector[:-2].tobytes(), damping, acting.values)
-        if self._last is None or self._last[0] != key:
-            structure = self.wing.structure_at(vector, acting.patch, acting.temperature)
-            self._last = key, ModalIntegrator(structure, *damping)
-        return self._last[1]
+        key = (vector[:-2].tobytes(), damping, active.values)
+        if self._last_integrator is None or self._last_key != key:
+            alpha, beta = damping
+            structure = self.wing.structure_at(vector, active.patch, active.temperature)
+            self._last_integrator = ModalIntegrator(structure, alpha, beta)
+            self._last_key = key
+        return self._last_integrator

@@ -1,26 +1,27 @@
-"""The table of variables of a structure's FMU, of which the wing has names and texts of its own.
+"""The table of variables of a structure's FMU; the wing has names and texts of its own.
 
 Copied into the FMU.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import TIP_FORCE, WING_MODEL_NAME
 
-from .variables import QUASI_STATIC, TRANSIENT, Causality, FmuVariable, Table
+from .variables import QUASI_STATIC, TRANSIENT, Causality, FmuVariable, VariableTable
 
 RESERVED = ("response", "status", "strain_error_bound", "displacement_error_bound")
-"""Names that controls and parameters of a structure cannot have: its FMU has variables of that name."""
+"""Names of variables of the FMU, which controls and parameters of a structure cannot have."""
 MODE_COUNT = 6
-"""Number of modes of which frequency and damping ratio are outputs, if the model has as many."""
+"""Number of modes with outputs for frequency and damping ratio, if the model has as many."""
 TIP_DISPLACEMENT_LIMIT = 0.5
-"""Linear kinematics: half a metre at the tip of a wing of 1.8 m is already generous."""
+"""Limit of linear kinematics [m]: generous for the tip of a wing of 1.8 m."""
 
-_OF_THE_WING = {
+_TEXTS_OF_WING = {
     "load_factor": "Load factor of the turn, lift over weight",
     "tip_force": "Upward force at the load point near the tip",
     "young_modulus_factor": "Factor on Young's modulus of the skin (e)",
@@ -28,31 +29,57 @@ _OF_THE_WING = {
     "mass.pitot": "Mass of the pitot tube at the tip",
     "tip_displacement": "Displacement of the tip, positive upwards",
 }
+"""Descriptions of variables of the wing that differ from those of a structure."""
+_BOUND_TEXT = "Certified bound of the error of any static {} against the full finite element model"
 
 
-_CHOSEN: Mapping[str, tuple[str, Causality, str, str, str | None]] = {
-    "parameters": ("", "parameter", "Factor {} on the stiffness", "1", None),
-    "regions": ("health.", "input", "Stiffness that the region {} has lost, as a fraction", "1", "%"),
-    "masses": ("mass.", "parameter", "Mass of {}", "kg", "g"),
-    "controls": ("", "input", "Control {} of the loads", "", None),
-}
-"""Of what can be chosen: prefix of the variable, causality, text, unit (of a control its own), display."""
+class _ValueGroup(NamedTuple):
+    """Variables of the FMU for a group of values that can be chosen in the model.
+
+    Attributes
+    ----------
+    prefix : str
+        Prefix of the variable's name.
+    causality : str
+        Causality of FMI.
+    text : str
+        Description, with braces for the name in the model.
+    unit, display : str or None
+        Unit and display unit; the unit of a control is its own.
+    """
+
+    prefix: str
+    causality: Causality
+    text: str
+    unit: str | None = None
+    display: str | None = None
+
+
+_CONTROL = _ValueGroup("", "input", "Control {} of the loads")
+_PARAMETER = _ValueGroup("", "parameter", "Factor {} on the stiffness", "1")
+_REGION = _ValueGroup(
+    "health.", "input", "Stiffness that the region {} has lost, as a fraction", "1", "%"
+)
+_MASS = _ValueGroup("mass.", "parameter", "Mass of {}", "kg", "g")
 
 
 @dataclass(frozen=True)
-class Roles:
-    """Which variables of a table are what; the outputs of the model come first among the outputs.
+class StructureRoles:
+    """Roles of variables in the table; the outputs of the model come first among the outputs.
 
     Attributes
     ----------
     chosen : tuple of str
-        Names of all that can be chosen, in the order of the model: parameters, losses, masses, controls.
+        Names of all values that can be chosen, in the order of the model: parameters, losses,
+        masses, controls.
     displacement_bound : str or None
         The bound of the displacements, where it is an output.
     point_load : int
-        Index of the load that holds the structure aside before a release, and whose point may be an output.
+        Index of the load that holds the structure aside before a release, and whose point may be an
+        output.
     release, load_point : str or None
-        The parameter that says how far it is held aside, and the displacement of that point.
+        The parameter for the displacement of that point before a release, and the output of its
+        displacement.
     """
 
     chosen: tuple[str, ...]
@@ -63,19 +90,23 @@ class Roles:
 
 
 def is_wing(model: ReducedModel) -> bool:
-    """Return whether a model is that of a wing, and no structure that only bears its name."""
+    """Return whether a model is that of a wing, not of a structure that only has its name."""
     return model.name == WING_MODEL_NAME and len(model.followed_shapes) > 0
 
 
-def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tuple[FmuVariable, ...], Roles]:
-    """Return the table, inputs, parameters and outputs, and which of its rows is what.
+def structure_table(
+    model: ReducedModel, start: Mapping[str, float]
+) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
+    """Return the table of a structure's FMU, and the roles of its variables.
+
+    The order of the rows is fixed, since value references depend on it.
 
     Parameters
     ----------
     model : ReducedModel
         The reduced structure.
     start : mapping of str to float
-        Start values by variable name that take the place of the nominal ones.
+        Start values by variable name that replace the nominal ones.
 
     Raises
     ------
@@ -84,82 +115,189 @@ def structure_table(model: ReducedModel, start: Mapping[str, float]) -> tuple[tu
     """
     for name in (*model.controls, *model.parameters):
         if name in RESERVED:
-            raise ValueError(f"a structure with an FMU can have no control or parameter named {name!r}")
-    table, wing = Table(start), is_wing(model)
-    texts = _OF_THE_WING if wing else {}
-    nominal = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
-    control_unit = dict(zip(model.controls, model.control_units, strict=True))
-    variables: dict[str, str] = {}
+            raise ValueError(
+                f"a structure with an FMU can have no control or parameter named {name!r}"
+            )
+    if is_wing(model):
+        return _wing_table(model, start)
+    return _table_of_structure(model, start)
 
-    def add(group: str, part: slice = slice(None)) -> None:
-        prefix, causality, text, unit, display = _CHOSEN[group]
-        for name in getattr(model, group)[part]:
-            variable = f"{prefix}{name.removesuffix('_mass') if wing and group == 'masses' else name}"
-            table.add(
-                variable, causality, texts.get(variable, text.format(name)), display=display,
-                unit=unit or control_unit[name], box=model.validity[name], default=nominal[name],
-            )  # fmt: skip
-            variables[name] = variable
 
-    first = 1 if wing else len(model.controls)  # its value references are those that it always had
-    add("controls", slice(first))
-    add("regions")
-    add("controls", slice(first, None))
-    add("parameters")
-    if not wing:
-        add("masses")
-    for name, what, unit, value in zip(
-        ("alpha", "beta"), ("Mass", "Stiffness"), ("1/s", "s"), model.damping.tolist(), strict=True
-    ):
-        table.add(
-            f"damping.{name}", "parameter", f"{what}-proportional Rayleigh damping",
-            unit=unit, box=(0.0, None), default=value,
-        )  # fmt: skip
-    if wing:
-        add("masses")
-        table.add(
-            "initial_tip_displacement", "parameter",
-            "Transient only: displacement of the tip from its equilibrium, released at the start",
-            unit="m", display="mm", box=(-TIP_DISPLACEMENT_LIMIT, TIP_DISPLACEMENT_LIMIT),
-        )  # fmt: skip
+def _wing_table(
+    model: ReducedModel, start: Mapping[str, float]
+) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
+    """Return the table of the wing; see `structure_table`."""
+    table = _ModelTable(model, start, _TEXTS_OF_WING)
+    table.add_values(_CONTROL, model.controls[:1])
+    table.add_values(_REGION, model.regions)
+    table.add_values(_CONTROL, model.controls[1:])
+    table.add_values(_PARAMETER, model.parameters)
+    table.add_damping()
+    for name in model.masses:
+        table.add_value(_MASS, name, f"mass.{name.removesuffix('_mass')}")
     table.add(
-        "response", "parameter", "Quasi-static (1) or transient (2)", kind="Enumeration",
-        box=(QUASI_STATIC, TRANSIENT), default=QUASI_STATIC, enumeration="Response",
-    )  # fmt: skip
-    for number, name in enumerate(model.gauges, start=1):
-        shown, sense = (f"[{number}]", "under upward lift") if wing else (f".{name}", "in tension")
-        table.add(
-            f"strain{shown}", "output", f"Strain at gauge {number if wing else name}, positive {sense}",
-            unit="1", display="microstrain",
-        )  # fmt: skip
-    for name in model.displacements:
-        variable = "tip_displacement" if wing else f"displacement.{name}"
-        table.add(variable, "output", texts.get(variable, f"Displacement {name}"), unit="m", display="mm")
-    for name in model.accelerations:
-        table.add(
-            f"acceleration.{name}", "output", f"Acceleration {name}; zero where the response is quasi-static",
-            unit="m/s2",
-        )  # fmt: skip
-    bound = "Certified bound of the error of any static {} against the full finite element model"
-    table.add("strain_error_bound", "output", bound.format("strain"), unit="1", display="microstrain")
-
-    if wing:
-        table.add_status()
-        table.add(
-            "load_point_displacement", "output",
-            "Displacement of the point near the tip where tip_force acts, positive upwards",
-            unit="m", display="mm",
-        )  # fmt: skip
-    else:
-        table.add("displacement_error_bound", "output", bound.format("displacement"), unit="m", display="mm")
-    modes = range(1, min(MODE_COUNT, model.mode_count) + 1)
-    for mode in modes:
-        table.add(f"frequency[{mode}]", "output", f"Natural frequency of mode {mode}", unit="Hz")
-    for mode in modes:
-        table.add(f"damping_ratio[{mode}]", "output", f"Damping ratio of mode {mode}", unit="1", display="%")
-    chosen = tuple(variables[name] for name in model.input_names)
-    if wing:
-        names = ("initial_tip_displacement", "load_point_displacement")
-        return table.rows(), Roles(chosen, None, TIP_FORCE, *names)
+        "initial_tip_displacement",
+        "parameter",
+        "Transient only: displacement of the tip from its equilibrium, released at the start",
+        unit="m",
+        display="mm",
+        limits=(-TIP_DISPLACEMENT_LIMIT, TIP_DISPLACEMENT_LIMIT),
+    )
+    table.add_response()
+    for number in range(1, len(model.gauges) + 1):
+        text = f"Strain at gauge {number}, positive under upward lift"
+        table.add_strain(f"strain[{number}]", text)
+    for _ in model.displacements:
+        text = _TEXTS_OF_WING["tip_displacement"]
+        table.add("tip_displacement", "output", text, unit="m", display="mm")
+    table.add_accelerations()
+    table.add_strain("strain_error_bound", _BOUND_TEXT.format("strain"))
     table.add_status()
-    return table.rows(), Roles(chosen, "displacement_error_bound")
+    table.add(
+        "load_point_displacement",
+        "output",
+        "Displacement of the point near the tip where tip_force acts, positive upwards",
+        unit="m",
+        display="mm",
+    )
+    table.add_modes()
+    roles = StructureRoles(
+        table.chosen(),
+        point_load=TIP_FORCE,
+        release="initial_tip_displacement",
+        load_point="load_point_displacement",
+    )
+    return table.rows(), roles
+
+
+def _table_of_structure(
+    model: ReducedModel, start: Mapping[str, float]
+) -> tuple[tuple[FmuVariable, ...], StructureRoles]:
+    """Return the table of a structure that is no wing; see `structure_table`."""
+    table = _ModelTable(model, start, {})
+    table.add_values(_CONTROL, model.controls)
+    table.add_values(_REGION, model.regions)
+    table.add_values(_PARAMETER, model.parameters)
+    table.add_values(_MASS, model.masses)
+    table.add_damping()
+    table.add_response()
+    for name in model.gauges:
+        table.add_strain(f"strain.{name}", f"Strain at gauge {name}, positive in tension")
+    for name in model.displacements:
+        text = f"Displacement {name}"
+        table.add(f"displacement.{name}", "output", text, unit="m", display="mm")
+    table.add_accelerations()
+    table.add_strain("strain_error_bound", _BOUND_TEXT.format("strain"))
+    bound_text = _BOUND_TEXT.format("displacement")
+    table.add("displacement_error_bound", "output", bound_text, unit="m", display="mm")
+    table.add_modes()
+    table.add_status()
+    roles = StructureRoles(table.chosen(), displacement_bound="displacement_error_bound")
+    return table.rows(), roles
+
+
+class _ModelTable(VariableTable):
+    """A table with the rows that wings and other structures share.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The reduced structure.
+    start : mapping of str to float
+        Start values by variable name that replace the nominal ones.
+    texts : mapping of str to str
+        Descriptions by variable name that replace those of a structure.
+    """
+
+    def __init__(
+        self, model: ReducedModel, start: Mapping[str, float], texts: Mapping[str, str]
+    ) -> None:
+        super().__init__(start)
+        self._model = model
+        self._texts = texts
+        self._nominal = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
+        self._control_units = dict(zip(model.controls, model.control_units, strict=True))
+        self._variables: dict[str, str] = {}
+
+    def chosen(self) -> tuple[str, ...]:
+        """Return the variables of all values that can be chosen, in the order of the model."""
+        return tuple(self._variables[name] for name in self._model.input_names)
+
+    def add_values(self, group: _ValueGroup, names: Sequence[str]) -> None:
+        """Append values that can be chosen in the model, by their names there."""
+        for name in names:
+            self.add_value(group, name, f"{group.prefix}{name}")
+
+    def add_value(self, group: _ValueGroup, name: str, variable: str) -> None:
+        """Append a value that can be chosen in the model.
+
+        Parameters
+        ----------
+        group : _ValueGroup
+            Its group.
+        name, variable : str
+            Its name in the model and in the FMU.
+        """
+        self.add(
+            variable,
+            group.causality,
+            self._texts.get(variable, group.text.format(name)),
+            unit=group.unit or self._control_units[name],
+            display=group.display,
+            limits=self._model.validity[name],
+            default=self._nominal[name],
+        )
+        self._variables[name] = variable
+
+    def add_damping(self) -> None:
+        """Append the two parameters of Rayleigh damping."""
+        alpha, beta = self._model.damping.tolist()
+        text = "{}-proportional Rayleigh damping"
+        self.add(
+            "damping.alpha",
+            "parameter",
+            text.format("Mass"),
+            unit="1/s",
+            limits=(0.0, None),
+            default=alpha,
+        )
+        self.add(
+            "damping.beta",
+            "parameter",
+            text.format("Stiffness"),
+            unit="s",
+            limits=(0.0, None),
+            default=beta,
+        )
+
+    def add_response(self) -> None:
+        """Append the parameter that chooses a quasi-static or transient response."""
+        self.add(
+            "response",
+            "parameter",
+            "Quasi-static (1) or transient (2)",
+            kind="Enumeration",
+            limits=(QUASI_STATIC, TRANSIENT),
+            default=QUASI_STATIC,
+            enumeration="Response",
+        )
+
+    def add_strain(self, name: str, text: str) -> None:
+        """Append an output that is a strain."""
+        self.add(name, "output", text, unit="1", display="microstrain")
+
+    def add_accelerations(self) -> None:
+        """Append the accelerations of the model."""
+        for name in self._model.accelerations:
+            text = f"Acceleration {name}; zero where the response is quasi-static"
+            self.add(f"acceleration.{name}", "output", text, unit="m/s2")
+
+    def add_modes(self) -> None:
+        """Append the frequencies of the first modes, then their damping ratios."""
+        modes = range(1, min(MODE_COUNT, self._model.mode_count) + 1)
+        for mode in modes:
+            text = f"Natural frequency of mode {mode}"
+            self.add(f"frequency[{mode}]", "output", text, unit="Hz")
+        for mode in modes:
+            text = f"Damping ratio of mode {mode}"
+            self.add(f"damping_ratio[{mode}]", "output", text, unit="1", display="%")

@@ -1,4 +1,4 @@
-"""Rows of a table of variables, which model description, slave and documentation follow; enumerations.
+"""The table of an FMU's variables, from which model description, slave and documentation are made.
 
 Standard library only: the file is copied into the FMU.
 """
@@ -15,20 +15,34 @@ Causality = Literal["input", "parameter", "output", "local", "independent"]
 Variability = Literal["continuous", "discrete", "fixed", "tunable"]
 
 QUASI_STATIC = 1
-"""Value of `response`: the steady turn, inertia and damping left out."""
+"""Value of `response`: the steady turn, without inertia and damping."""
 TRANSIENT = 2
 """Value of `response`: the modes are integrated in time."""
 
 
 class Status(IntEnum):
-    """Values of `status`."""
+    """Values of `status`: how the last call went."""
 
-    OK, OUTSIDE_RANGE, NOT_FINITE, BAD_STEP, BAD_CALL, BAD_STATE, INTERNAL = range(7)
+    OK = 0
+    OUTSIDE_RANGE = 1
+    NOT_FINITE = 2
+    BAD_STEP = 3
+    BAD_CALL = 4
+    BAD_STATE = 5
+    INTERNAL = 6
 
 
 @dataclass(frozen=True)
 class EnumerationType:
-    """Names and values of an enumeration: `items` maps a name to its value and description."""
+    """An enumeration of FMI.
+
+    Attributes
+    ----------
+    name, description : str
+        Its name, and a line for people.
+    items : tuple of (str, int, str)
+        Name, value and description of each item.
+    """
 
     name: str
     description: str
@@ -40,19 +54,32 @@ ENUMERATIONS = (
         "Response",
         "How the structure answers its loads",
         (
-            ("quasi_static", QUASI_STATIC, "The steady turn: static equilibrium with the inputs of the step"),
+            (
+                "quasi_static",
+                QUASI_STATIC,
+                "The steady turn: static equilibrium with the inputs of the step",
+            ),
             ("transient", TRANSIENT, "The modes are integrated exactly, inputs held over the step"),
         ),
     ),
     EnumerationType(
         "Status",
-        "What became of the last call; other than ok, the call was refused and state and outputs stay",
+        "What became of the last call; "
+        "other than ok, the call was refused and state and outputs stay",
         (
             ("ok", Status.OK, "The outputs belong to the inputs of the last step"),
-            ("outside_range", Status.OUTSIDE_RANGE, "An input or parameter lies outside its min and max"),
+            (
+                "outside_range",
+                Status.OUTSIDE_RANGE,
+                "An input or parameter lies outside its min and max",
+            ),
             ("not_finite", Status.NOT_FINITE, "An input or parameter is NaN or infinite"),
             ("bad_step", Status.BAD_STEP, "Step size or communication point is not acceptable"),
-            ("bad_call", Status.BAD_CALL, "A call in the wrong phase, such as a step before initialisation"),
+            (
+                "bad_call",
+                Status.BAD_CALL,
+                "A call in the wrong phase, such as a step before initialisation",
+            ),
             ("bad_state", Status.BAD_STATE, "A restored state does not belong to this FMU"),
             ("internal", Status.INTERNAL, "The computation failed; the log says how"),
         ),
@@ -62,7 +89,7 @@ ENUMERATIONS = (
 
 @dataclass(frozen=True)
 class FmuVariable:
-    """One row of the table.
+    """A variable of an FMU, one row of the table.
 
     Attributes
     ----------
@@ -79,7 +106,7 @@ class FmuVariable:
     unit, display_unit : str or None
         In the spelling of FMI.
     minimum, maximum : float or None
-        The range that is enforced for inputs and parameters; None where there is none.
+        Range that is enforced for inputs and parameters; None where there is no limit.
     start : float or None
         Start value of inputs and parameters.
     enumeration : str or None
@@ -100,19 +127,20 @@ class FmuVariable:
     enumeration: str | None = None
 
 
-class Table:
-    """A table of variables that grows by rows.
+class VariableTable:
+    """A table of variables that is made row by row.
 
     Parameters
     ----------
     start : mapping of str to float
-        Start values by variable name that take the place of the defaults.
+        Start values by variable name that replace the defaults.
     first : int
         Value reference of the first row.
     """
 
     def __init__(self, start: Mapping[str, float], first: int = 0) -> None:
-        self._start, self._first = dict(start), first
+        self._start = dict(start)
+        self._first = first
         self._rows: list[FmuVariable] = []
 
     def add(
@@ -122,33 +150,49 @@ class Table:
         description: str,
         *,
         kind: Kind = "Real",
-        box: tuple[float | None, float | None] = (None, None),
+        unit: str | None = None,
+        display: str | None = None,
+        limits: tuple[float | None, float | None] = (None, None),
         default: float = 0.0,
         tunable: bool = False,
-        display: str | None = None,
-        **own: str | None,
+        enumeration: str | None = None,
     ) -> None:
-        """Append a row; `box` is the range, `default` the start value of an input or parameter.
+        """Append a row.
 
-        `own` are further fields of `FmuVariable`: its unit, its enumeration.
+        Parameters
+        ----------
+        name, causality, description, kind, unit, enumeration
+            As in `FmuVariable`.
+        display : str or None
+            Display unit.
+        limits : (float or None, float or None)
+            Range; None where it has no limit.
+        default : float
+            Start value of an input or parameter, unless the table was given another.
+        tunable : bool
+            Whether a parameter can change between steps.
         """
-        variability: Variability = "fixed" if causality == "parameter" else "continuous"
-        if tunable:
-            variability = "tunable"
-        elif kind != "Real" and causality != "parameter":
-            variability = "discrete"
-        start = None if causality == "output" else float(self._start.pop(name, default))
-        reference = self._first + len(self._rows)
+        low, high = limits
         row = FmuVariable(
-            name, reference, kind, causality, variability, description,
-            display_unit=display, minimum=box[0], maximum=box[1], start=start, **own,
-        )  # fmt: skip
+            name,
+            reference=self._first + len(self._rows),
+            kind=kind,
+            causality=causality,
+            variability=_variability(kind, causality, tunable=tunable),
+            description=description,
+            unit=unit,
+            display_unit=display,
+            minimum=low,
+            maximum=high,
+            start=None if causality == "output" else float(self._start.pop(name, default)),
+            enumeration=enumeration,
+        )
         self._rows.append(row)
 
     def add_status(self) -> None:
-        """Append the row that says what became of the last call."""
-        text = "What became of the last call"
-        self.add("status", "output", text, kind="Enumeration", enumeration="Status")
+        """Append the output that says how the last call went."""
+        description = "What became of the last call"
+        self.add("status", "output", description, kind="Enumeration", enumeration="Status")
 
     def rows(self) -> tuple[FmuVariable, ...]:
         """Return the table.
@@ -156,8 +200,18 @@ class Table:
         Raises
         ------
         ValueError
-            If a start value was given for something that is no input or parameter.
+            If a start value was given for a name that is no input or parameter.
         """
         if self._start:
-            raise ValueError(f"there is no input or parameter {sorted(self._start)[0]!r}")
+            unused = sorted(self._start)
+            raise ValueError(f"there is no input or parameter {unused[0]!r}")
         return tuple(self._rows)
+
+
+def _variability(kind: Kind, causality: Causality, *, tunable: bool) -> Variability:
+    """Return the variability of FMI: tunable or fixed parameters, other values by their kind."""
+    if tunable:
+        return "tunable"
+    if causality == "parameter":
+        return "fixed"
+    return "continuous" if kind == "Real" else "discrete"

@@ -6,13 +6,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from fmu_asset.client.experiment import default_experiment
+from fmu_asset.client.units import IDENTITY, between
 from fmu_asset.coupling.asset import Algorithm, CoupledAsset
 from fmu_asset.coupling.schedule import loop_sentence
 from fmu_asset.coupling.structure import Connector, Endpoint, SystemStructure
 from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.experiment import default_experiment
-from fmu_asset.door.units import IDENTITY, between
 from fmu_asset.errors import FmuError, SspError
 from fmu_asset.folders import scratch_folder
 from reporting.words import comma_list

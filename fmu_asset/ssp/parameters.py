@@ -8,8 +8,8 @@ from lxml import etree
 from lxml.etree import _Element as XmlElement
 
 from fmu_asset.archive.declared import UnitInfo
+from fmu_asset.client.units import IDENTITY, Conversion
 from fmu_asset.coupling.structure import ComponentSetting, SettingValue
-from fmu_asset.door.units import IDENTITY, Conversion
 from fmu_asset.errors import SspError
 from reporting.units import BASE_UNITS
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from lxml import etree
 from lxml.etree import _Element as XmlElement
 
+from fmu_asset.client.units import IDENTITY, Conversion
 from fmu_asset.coupling.structure import (
     CONNECTOR_KINDS,
     Component,
@@ -25,7 +26,6 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
     two_sources_sentence,
 )
-from fmu_asset.door.units import IDENTITY, Conversion
 from reporting.files import atomic_write_bytes
 
 from .experiment import base_step_of, time_of

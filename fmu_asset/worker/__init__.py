@@ -1,1 +1,1 @@
-"""A process of its own for every FMU: what it crashes, blocks or prints is not the twin's."""
+"""A process of its own for every FMU, so that it cannot crash, block or deceive the twin."""

@@ -1,4 +1,4 @@
-"""The twin's side: the calls of an instance, answered by a worker process."""
+"""The twin's side of a worker: an instance whose calls are answered by a worker process."""
 
 import contextlib
 import os
@@ -7,43 +7,68 @@ import select
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field
 
 from fmu_asset import errors
-from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError, said
+from fmu_asset.errors import FmuError, FmuMemoryError, FmuTimeoutError, FmuWorkerError
 from fmu_asset.folders import remove_folder
-from fmu_asset.instances.plan import REPORT_PERIOD, Instance, Plan, Settings
+from fmu_asset.instances.plan import REPORT_PERIOD, InitialValues, Instance, Plan
 from reporting.arrays import Float
 from reporting.toml_file import Positive, Section
 
 from .process import CLOSE_LIMIT, WorkerProcess
-from .protocol import HEADER, LARGEST_MESSAGE, Answer, Question, look, send, separated
+from .protocol import (
+    HEADER,
+    LARGEST_MESSAGE,
+    Answer,
+    Question,
+    poll_for_message,
+    send,
+    separated,
+)
 from .sandbox import Grants
 
 _MEBIBYTE = 1024**2
-_GLANCE = 0.05
+_MEMORY_CHECK_PERIOD = 0.05
 """Seconds between two looks at the memory of a worker that is at work."""
-_CALLS = {
-    "open": ("load_time", "loading and instantiation"),
-    "initialise": ("load_time", "initialisation"),
-    "reset": ("load_time", "reset"),
-    "step": ("step_time", "the step"),
-    "run": ("step_time", "a step"),
-    "read": ("step_time", "reading the outputs"),
-    "save": ("step_time", "saving the state"),
-    "restore": ("step_time", "restoring the state"),
-    "take_log": ("step_time", "reading the log"),
-    "close": ("step_time", "the end"),
+
+
+class _CallKind(NamedTuple):
+    """A call of a worker.
+
+    Attributes
+    ----------
+    limit : str
+        Attribute of `WorkerLimits` with its limit of time.
+    action : str
+        Its name in a sentence.
+    """
+
+    limit: Literal["load_time", "step_time"]
+    action: str
+
+
+_CALL_KINDS = {
+    "open": _CallKind("load_time", "loading and instantiation"),
+    "initialise": _CallKind("load_time", "initialisation"),
+    "reset": _CallKind("load_time", "reset"),
+    "step": _CallKind("step_time", "the step"),
+    "run": _CallKind("step_time", "a step"),
+    "read": _CallKind("step_time", "reading the outputs"),
+    "save": _CallKind("step_time", "saving the state"),
+    "restore": _CallKind("step_time", "restoring the state"),
+    "take_log": _CallKind("step_time", "reading the log"),
+    "close": _CallKind("step_time", "the end"),
 }
-"""Which limit holds for a call, and what it is in a sentence."""
 
 _Paths = Annotated[tuple[Annotated[str, Field(min_length=1)], ...], Field(strict=False)]
+_Ports = Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(strict=False)]
 
 
 class WorkerLimits(Section):
-    """The table `[limits]` of a binding: what the FMU's worker may take.
+    """The table `[limits]` of a binding: limits and grants of the FMU's worker.
 
     Attributes
     ----------
@@ -56,7 +81,7 @@ class WorkerLimits(Section):
     sandbox : bool
         Whether the system keeps the FMU from the user's files, from programs and from the network.
     read, write, ports, programs
-        What it may touch all the same; see `Grants`.
+        What the sandbox grants all the same; see `Grants`.
     """
 
     step_time: Positive = 60.0
@@ -65,17 +90,26 @@ class WorkerLimits(Section):
     sandbox: bool = True
     read: _Paths = ()
     write: _Paths = ()
-    ports: Annotated[tuple[Annotated[int, Field(ge=1, le=65535)], ...], Field(strict=False)] = ()
+    ports: _Ports = ()
     programs: bool = False
 
     @property
     def grants(self) -> Grants | None:
-        """What it may touch beyond what every FMU may; None for all that its user may."""
-        return Grants(self.read, self.write, self.ports, self.programs) if self.sandbox else None
+        """Grants of the sandbox; None if there is no sandbox."""
+        if not self.sandbox:
+            return None
+        return Grants(self.read, self.write, self.ports, self.programs)
+
+
+class _AnswerHead(NamedTuple):
+    """Kind and length [bytes] of an answer."""
+
+    kind: int
+    length: int
 
 
 class WorkerInstance(Instance):
-    """The same calls as `FmuInstance`, answered by a worker process.
+    """An instance in a worker process, with the calls of `FmuInstance`.
 
     Parameters
     ----------
@@ -84,15 +118,15 @@ class WorkerInstance(Instance):
     scratch : Path
         Folder of the worker alone; it is removed when the worker ends.
     limits : WorkerLimits
-        What it may take.
+        Limits and grants of the worker.
 
     Attributes
     ----------
     process_id : int
         Process number of the worker.
     lost : bool
-        Also from a question until its answer: an exception between the two, such as an interruption, leaves
-        them out of step.
+        Whether it cannot be used any more. It is also True from a question until its answer: after
+        an exception between the two, such as an interruption, they no longer belong together.
 
     Raises
     ------
@@ -104,56 +138,65 @@ class WorkerInstance(Instance):
 
     def __init__(self, plan: Plan, scratch: Path, *, limits: WorkerLimits) -> None:
         super().__init__(plan)
-        self._plan, self._folder, self._limits = plan, scratch, limits
+        self._plan = plan
+        self._folder = scratch
+        self._limits = limits
         self._request = memoryview(self.request).cast("B")
         self._reply = memoryview(self.reply).cast("B")
         self._header = memoryview(bytearray(HEADER.size))
-        self._number, self._logged = 0, False
+        self._question_number = 0
+        self._call_kind = _CALL_KINDS["open"]
+        self._has_log = False
         self._process = WorkerProcess(scratch, plan.folder, limits.grants)
         self.process_id = self._process.number
-        self._out, self._in = self._process.outgoing, self._process.incoming
-        # The worker may leave it at half an answer.
-        os.set_blocking(self._in, False)
-        self._next_glance = 0.0
+        self._outgoing = self._process.outgoing
+        self._incoming = self._process.incoming
+        # so that a read returns if the worker stops in the middle of an answer
+        os.set_blocking(self._incoming, False)
+        self._next_memory_check = 0.0
         self._poll = select.poll()
-        self._poll.register(self._in, select.POLLIN | select.POLLHUP)
+        self._poll.register(self._incoming, select.POLLIN | select.POLLHUP)
         try:
             self.renew()
         except BaseException:
             self.close()
             raise
 
-    def initialise(self, start_time: float, parameters: Settings, with_inputs: bool) -> None:
+    def initialise(self, start_time: float, parameters: InitialValues, with_inputs: bool) -> None:
         """Set parameters and inputs and initialise."""
         self._call("initialise", start_time, parameters, with_inputs)
 
     def step(self) -> None:
         """Make the step that the request block describes."""
         self._ask(Question.STEP, "step", self._request)
-        length = self._await(len(self._reply))[1]
-        if length != len(self._reply):
-            raise self._died()
-        self._fill(self._reply)
+        head = self._wait_for_answer(len(self._reply))
+        if head.length != len(self._reply):
+            raise self._death_error()
+        self._read_into(self._reply)
         self.lost = False
 
     def run(self, requests: Float, replies: Float, report: Callable[[int], object]) -> None:
         """Make many steps; each may take the time of a step."""
         self._ask(Question.CALL, "run", self._pickled("run", requests))
-        target, size, filled, more = replies.data.cast("B"), replies[0].nbytes, 0, True
-        while more:
-            kind, length = self._await(len(target) - filled, part=True)
-            if length % size:
-                raise self._died()
-            self._fill(target[filled : filled + length])
-            filled += length
-            self.lost = more = kind == Answer.PART
-            report(filled // size)
+        target = replies.data.cast("B")
+        bytes_per_step = replies[0].nbytes
+        filled = 0
+        has_more = True
+        while has_more:
+            head = self._wait_for_answer(len(target) - filled, may_be_part=True)
+            if head.length % bytes_per_step:
+                raise self._death_error()
+            self._read_into(target[filled : filled + head.length])
+            filled += head.length
+            has_more = head.kind == Answer.PART
+            self.lost = has_more
+            report(filled // bytes_per_step)
 
     def read(self) -> None:
         """Read the outputs of this moment."""
         answer = self._call("read")
         if len(answer) != len(self._reply):
-            raise self._died()
+            raise self._death_error()
         self._reply[:] = answer
 
     def save(self) -> bytes:
@@ -174,131 +217,195 @@ class WorkerInstance(Instance):
 
     def take_log(self) -> list[tuple[int, str]]:
         """Return and forget the messages that the FMU has logged: status and text."""
-        if not self._logged or self.lost:
+        if not self._has_log or self.lost:
             return []
-        self._logged = False
+        self._has_log = False
         content = self._call("take_log")
-        texts = [entry.partition(" ") for entry in separated(content)] if content else []
-        try:
-            return [(int(status), text) for status, _, text in texts]
-        except ValueError:
-            raise self._died() from None
+        if not content:
+            return []
+        messages = []
+        for entry in separated(content):
+            status, _, text = entry.partition(" ")
+            try:
+                messages.append((int(status), text))
+            except ValueError:
+                raise self._death_error() from None
+        return messages
 
     @property
     def memory(self) -> int:
         """Resident memory of the worker [bytes]; 0 if it is gone, or if the system does not say.
 
-        The limit of memory is of resident memory, and the twin keeps it: it looks at the worker while it
-        waits for a long call, and now and then between short ones. `RLIMIT_AS` would refuse FMUs that reserve
-        address space and never use it (Java, .NET, CUDA, the stacks of threads); under a resource limit an
-        allocation fails inside the FMU, which then crashes, and nobody could say why.
+        The twin itself limits the resident memory: it looks at the worker while it waits for a long
+        call, and now and then between short ones. `RLIMIT_AS` would refuse FMUs that reserve
+        address space and never use it (Java, .NET, CUDA, the stacks of threads). Under a resource
+        limit an allocation fails inside the FMU, which then crashes, and nobody could say why.
         """
         try:
             with open(f"/proc/{self.process_id}/statm", "rb") as file:  # noqa: PTH123 - half the time
-                return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+                resident_pages = int(file.read().split()[1])
         except (OSError, IndexError, ValueError):
             return 0
+        return resident_pages * os.sysconf("SC_PAGE_SIZE")
 
     def close(self) -> None:
-        """End the worker, kindly at first, and remove its folder."""
+        """Ask the worker to end, end it if it does not, and remove its folder."""
         if self._process.closed:
             return
-        kindly = not self.lost
-        if kindly:
+        can_be_asked = not self.lost
+        if can_be_asked:
             with contextlib.suppress(FmuWorkerError):
                 self._ask(Question.CALL, "close", self._pickled("close"))
         self.lost = True
-        self._process.end(CLOSE_LIMIT if kindly else 0.0)
+        self._process.end(CLOSE_LIMIT if can_be_asked else 0.0)
         remove_folder(self._folder)
 
     # ------------------------------------------------------------------ questions and answers
 
     def _pickled(self, name: str, *arguments: object) -> bytes:
+        """Return a call with the request block as bytes."""
         return pickle.dumps((name, bytes(self._request), arguments))
 
-    def _ask(self, kind: int, name: str, content: bytes | memoryview) -> None:
+    def _ask(self, kind: Question, name: str, content: bytes | memoryview) -> None:
+        """Send a question to the worker.
+
+        Parameters
+        ----------
+        kind : Question
+            Kind of the message.
+        name : str
+            Name of the call in `_CALL_KINDS`.
+        content : bytes-like
+            Payload.
+        """
         if self.lost:
-            raise FmuWorkerError("The FMU's worker is gone or was interrupted; reset the asset to go on.")
-        self.lost, (self._limit, self._what) = True, _CALLS[name]
-        self._number = (self._number + 1) % 2**32
+            raise FmuWorkerError(
+                "The FMU's worker is gone or was interrupted; reset the asset to go on."
+            )
+        self.lost = True
+        self._call_kind = _CALL_KINDS[name]
+        self._question_number = (self._question_number + 1) % 2**32
+        header = HEADER.pack(kind, 0, self._question_number, len(content))
         try:
-            send(self._out, HEADER.pack(kind, 0, self._number, len(content)), content)
+            send(self._outgoing, header, content)
         except BrokenPipeError:
-            raise self._died() from None
+            raise self._death_error() from None
 
     def _call(self, name: str, *arguments: object) -> bytes:
-        """Call a method of the instance; only what the twin says is pickled, and never what comes back."""
+        """Call a method of the instance in the worker and return its answer.
+
+        Only what the twin says is pickled, and never what comes back.
+        """
         self._ask(Question.CALL, name, self._pickled(name, *arguments))
-        largest = int(self._limits.memory * _MEBIBYTE) if name == "save" else LARGEST_MESSAGE
-        answer = bytearray(self._await(largest)[1])
-        self._next_glance = 0.0
-        self._fill(memoryview(answer))
+        largest = LARGEST_MESSAGE
+        if name == "save":
+            largest = int(self._limits.memory * _MEBIBYTE)
+        head = self._wait_for_answer(largest)
+        answer = bytearray(head.length)
+        self._next_memory_check = 0.0
+        self._read_into(memoryview(answer))
         self.lost = False
         return bytes(answer)
 
-    def _await(self, largest: int, *, part: bool = False) -> tuple[int, int]:
-        """Return kind and length of the answer; a failure is raised."""
-        look(self._poll)
-        self._fill(self._header, REPORT_PERIOD * part)
-        kind, logged, number, length = HEADER.unpack(self._header)
-        last = Answer.PART if part else Answer.RESULT
-        known = kind in (Answer.RESULT, Answer.FAILURE, last) and number == self._number
-        if not known or length > (LARGEST_MESSAGE if kind == Answer.FAILURE else largest):
-            raise self._died()
-        self._logged = self._logged or logged != 0
+    def _wait_for_answer(self, largest: int, *, may_be_part: bool = False) -> _AnswerHead:
+        """Return the head of the answer to the last question; the error of a failure is raised.
+
+        Parameters
+        ----------
+        largest : int
+            Largest length that can be right [bytes].
+        may_be_part : bool
+            Whether the answer may come in parts.
+        """
+        poll_for_message(self._poll)
+        self._read_into(self._header, grace=REPORT_PERIOD if may_be_part else 0.0)
+        kind, has_log, number, length = HEADER.unpack(self._header)
+        is_known = kind in (Answer.RESULT, Answer.FAILURE) or (may_be_part and kind == Answer.PART)
+        longest = LARGEST_MESSAGE if kind == Answer.FAILURE else largest
+        if not is_known or number != self._question_number or length > longest:
+            raise self._death_error()
+        self._has_log = self._has_log or has_log != 0
         if kind == Answer.FAILURE:
-            self._fail(length)
-        return kind, length
+            self._raise_failure(length)
+        return _AnswerHead(kind, length)
 
-    def _fail(self, length: int) -> None:
-        """Raise the error that the worker tells."""
+    def _raise_failure(self, length: int) -> None:
+        """Raise the error in the payload of a failure, which has a length [bytes]."""
         content = bytearray(length)
-        self._fill(memoryview(content))
+        self._read_into(memoryview(content))
         try:
-            name, lost, ended, sentence, *messages = separated(content)
-            moment = float(ended) if ended else None
+            name, lost, end_time, sentence, *messages = separated(content)
+            time_of_end = float(end_time) if end_time else None
         except ValueError:
-            raise self._died() from None
-        self.lost, self._logged = bool(lost), False
-        kind = getattr(errors, name, FmuWorkerError)
-        known = isinstance(kind, type) and issubclass(kind, FmuError)
-        raise (kind if known else FmuWorkerError)(sentence, messages, moment)
+            raise self._death_error() from None
+        self.lost = bool(lost)
+        self._has_log = False
+        error_class = getattr(errors, name, FmuWorkerError)
+        if not (isinstance(error_class, type) and issubclass(error_class, FmuError)):
+            error_class = FmuWorkerError
+        raise error_class(sentence, messages, time_of_end)
 
-    def _fill(self, target: memoryview, grace: float = 0.0) -> None:
-        """Read what comes, as long as the call may take and a grace [s]; look at the memory meanwhile."""
-        filled, deadline = 0, 0.0
+    def _read_into(self, target: memoryview, grace: float = 0.0) -> None:
+        """Fill a buffer from the worker, within the limits of the present call.
+
+        Parameters
+        ----------
+        target : memoryview of bytes
+            The buffer.
+        grace : float
+            Time added to the limit of the call [s].
+        """
+        filled = 0
+        deadline = 0.0
         while filled < len(target):
             try:
-                count = os.readv(self._in, [target[filled:]])
+                count = os.readv(self._incoming, [target[filled:]])
             except BlockingIOError:
-                deadline = deadline or time.monotonic() + getattr(self._limits, self._limit) + grace
-                self._wait(deadline)
+                if not deadline:
+                    deadline = time.monotonic() + self._time_limit() + grace
+                self._wait_until(deadline)
                 continue
             if count == 0:
-                raise self._died()
+                raise self._death_error()
             filled += count
-        if time.monotonic() > self._next_glance:
+        if time.monotonic() > self._next_memory_check:
             self._check_memory()
 
-    def _wait(self, deadline: float) -> None:
-        """Wait a moment for something to read."""
-        left = deadline - time.monotonic()
-        if self._poll.poll(1000.0 * max(min(left, _GLANCE), 0.0)):
+    def _time_limit(self) -> float:
+        """Return the limit of the present call [s]."""
+        limit: float = getattr(self._limits, self._call_kind.limit)
+        return limit
+
+    def _wait_until(self, deadline: float) -> None:
+        """Wait a moment for something to read; kill the worker if the deadline has passed."""
+        remaining = deadline - time.monotonic()
+        timeout = 1000.0 * max(min(remaining, _MEMORY_CHECK_PERIOD), 0.0)
+        if self._poll.poll(timeout):
             return
         self._check_memory()
-        if left <= 0.0:
+        if remaining <= 0.0:
             self._process.kill()
-            most = getattr(self._limits, self._limit)
-            raise FmuTimeoutError(said("running.timeout", most=most, what=self._what, limit=self._limit))
+            raise FmuTimeoutError(
+                f"The FMU took longer than {self._time_limit():g} s for {self._call_kind.action}; "
+                "its worker was stopped. If it is only slow, give it more "
+                f"`{self._call_kind.limit}` in the table [limits] of its binding; otherwise it "
+                "hangs."
+            )
 
     def _check_memory(self) -> None:
-        self._next_glance = time.monotonic() + 5.0 * _GLANCE
-        used, limit = self.memory, self._limits.memory * _MEBIBYTE
-        if used > limit:
+        """Kill a worker that has taken more memory than its limit."""
+        self._next_memory_check = time.monotonic() + 5.0 * _MEMORY_CHECK_PERIOD
+        used = self.memory
+        if used > self._limits.memory * _MEBIBYTE:
             self._process.kill()
-            taken, most = used / _MEBIBYTE, self._limits.memory
-            raise FmuMemoryError(said("running.memory", used=taken, what=self._what, most=most))
+            raise FmuMemoryError(
+                f"The FMU took {used / _MEBIBYTE:.0f} MiB of memory during "
+                f"{self._call_kind.action}, more than the limit of {self._limits.memory:g} MiB; "
+                "its worker was stopped. If it needs that much, give it more `memory` in the table "
+                "[limits] of its binding; otherwise it leaks."
+            )
 
-    def _died(self) -> FmuWorkerError:
+    def _death_error(self) -> FmuWorkerError:
+        """Give the worker up, and return the error that says how it died."""
         self.lost = True
-        return self._process.death(self._what)
+        return self._process.death_error(self._call_kind.action)

@@ -1,4 +1,4 @@
-"""A worker process as the twin starts, watches and ends it."""
+"""The worker process of an FMU, as the twin starts, watches and ends it."""
 
 import contextlib
 import json
@@ -12,13 +12,17 @@ from pathlib import Path
 from fmu_asset.errors import FmuWorkerError
 from fmu_asset.folders import end_processes
 
-from .protocol import WORKER_NUMBER, Exit, ended, receive
+from .protocol import WORKER_NUMBER, Exit, has_ended, receive
 from .refusals import report_descriptor
 from .sandbox import Grants, landlock_version
 
 CLOSE_LIMIT = 2.0
 """Seconds that a worker has to end by itself."""
 _KILL_LIMIT = 10.0
+"""Seconds after which a supervisor that was asked to end its worker is killed."""
+_LOG_BYTES = 4000
+"""Length of the end of the log in which the last words are looked for."""
+_LAST_LINES = 5
 
 _MEANINGS = {
     "SIGSEGV": "the FMU's code touched memory that is not its own",
@@ -31,90 +35,107 @@ _MEANINGS = {
 }
 _REMEDY = "Reset the asset, or resume the run, to go on; if it happens again, the FMU is at fault"
 _CONFINED = ", or needs what its sandbox does not grant ([limits] of its binding)"
+_PROGRAM = (
+    "import sys; sys.path.append(sys.argv[1]); "
+    "from fmu_asset.worker.supervisor import supervise; supervise(*sys.argv[2:])"
+)
 
 
 class WorkerProcess:
-    """The process, its keeper and its two pipes.
+    """A worker process, its supervisor and its two pipes.
 
     Parameters
     ----------
     folder : Path
-        Scratch folder: the working directory, and where its output goes.
+        Scratch folder: its working directory, and where its output goes.
     shared : str
         Folder of the extracted FMU.
     grants : Grants or None
-        What it may touch beyond what every FMU may; None for no sandbox.
+        What the sandbox grants beyond what every FMU has; None for no sandbox.
 
     Attributes
     ----------
     number : int
         Process number of the worker.
     outgoing, incoming : int
-        The twin's ends of the pipes.
+        File descriptors of the twin's ends of the pipes.
 
     Raises
     ------
     FmuWorkerError
-        If it cannot be started.
+        If the worker cannot be started.
     """
 
     def __init__(self, folder: Path, shared: str, grants: Grants | None) -> None:
         self._folder = folder
-        self._remark = _CONFINED if grants is not None and landlock_version() else ""
+        self._remark = ""
+        if grants is not None and landlock_version():
+            self._remark = _CONFINED
+        # the process of the supervisor, which starts that of the worker
+        self._process = self._start(shared, grants)
+        pipes = (self._process.stdin, self._process.stdout)
+        self._pipes = [pipe for pipe in pipes if pipe is not None]
+        self.outgoing, self.incoming = (pipe.fileno() for pipe in self._pipes)
+        self._end_event = os.pidfd_open(self._process.pid)
+        first_message = bytearray(WORKER_NUMBER.size)
+        if not receive(self.incoming, memoryview(first_message)):
+            self.end(CLOSE_LIMIT)
+            raise FmuWorkerError("The worker process ended before it began.", self._last_words())
+        (number,) = WORKER_NUMBER.unpack(first_message)
+        self.number: int = number
+
+    def _start(self, shared: str, grants: Grants | None) -> "subprocess.Popen[bytes]":
+        """Return the process of the supervisor; arguments as for the class."""
         root = str(Path(__file__).parents[2])
-        program = (
-            "import sys; sys.path.append(sys.argv[1]); from fmu_asset.worker.keeper import keep; "
-            "keep(*sys.argv[2:])"
-        )
-        # One thread: the matrices are small, and results do not depend on the number of cores.
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-        environment |= {"PYTHONDONTWRITEBYTECODE": "1", "TMPDIR": str(folder)}
-        confined = "" if grants is None else json.dumps(asdict(grants))
+        environment = {
+            **os.environ,
+            # one thread: matrices are small, and results do not depend on the number of cores
+            "OMP_NUM_THREADS": "1",
+            "OPENBLAS_NUM_THREADS": "1",
+            "PYTHONDONTWRITEBYTECODE": "1",
+            "TMPDIR": str(self._folder),
+        }
+        grants_text = "" if grants is None else json.dumps(asdict(grants))
         report = report_descriptor()
-        watched = "" if report is None else str(report)
+        report_text = "" if report is None else str(report)
+        arguments = [root, str(self._folder), shared, grants_text, report_text]
         try:
-            with (folder / "worker.log").open("wb") as log:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-P", "-c", program, root, str(folder), shared, confined, watched],
+            with (self._folder / "worker.log").open("wb") as log:
+                return subprocess.Popen(
+                    [sys.executable, "-P", "-c", _PROGRAM, *arguments],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
                     stderr=log,
                     bufsize=0,
                     pass_fds=() if report is None else (report,),
-                    cwd=folder,
+                    cwd=self._folder,
                     env=environment,
-                    # What the terminal sends is for the twin alone.
+                    # signals of the terminal are for the twin alone
                     start_new_session=True,
                 )
         except OSError as error:
             raise FmuWorkerError(f"The worker process could not be started ({error}).") from error
-        self._pipes = [pipe for pipe in (self._process.stdin, self._process.stdout) if pipe is not None]
-        self.outgoing, self.incoming = (pipe.fileno() for pipe in self._pipes)
-        self._ended = os.pidfd_open(self._process.pid)
-        first = bytearray(WORKER_NUMBER.size)
-        if not receive(self.incoming, memoryview(first)):
-            self.end(CLOSE_LIMIT)
-            raise FmuWorkerError("The worker process ended before it began.", self._last_words())
-        self.number: int = WORKER_NUMBER.unpack(first)[0]
 
     def kill(self) -> None:
-        """End it, and whatever the FMU has started, at once."""
-        if self._process.returncode is None:
-            self._process.terminate()
-            try:
-                self._process.wait(_KILL_LIMIT)
-            except subprocess.TimeoutExpired:  # the worker dies with its keeper
-                self._process.kill()
-                self._process.wait()
-            os.close(self._ended)
-            if self._process.returncode == -signal.SIGKILL:  # of the worker, or of the keeper before its work
-                end_processes(self._folder)
+        """End the worker, and whatever the FMU has started, at once."""
+        if self._process.returncode is not None:
+            return
+        self._process.terminate()
+        try:
+            self._process.wait(_KILL_LIMIT)
+        except subprocess.TimeoutExpired:
+            self._process.kill()  # the worker dies with its supervisor
+            self._process.wait()
+        os.close(self._end_event)
+        # either the worker was killed, or the supervisor before it could clear up
+        if self._process.returncode == -signal.SIGKILL:
+            end_processes(self._folder)
 
     def end(self, limit: float) -> None:
-        """Close the pipes, which tells a worker that it is needed no more, wait, and kill what is left."""
+        """Close the pipes, on which a worker ends, wait at most `limit` [s], and kill it then."""
         for pipe in self._pipes:
             pipe.close()
-        self._await_end(limit)
+        self._wait_for_end(limit)
         self.kill()
 
     @property
@@ -122,39 +143,61 @@ class WorkerProcess:
         """Whether the pipes are closed."""
         return self._pipes[0].closed
 
-    def death(self, what: str) -> FmuWorkerError:
-        """Return the error that says how it died."""
-        alive = not self._await_end(CLOSE_LIMIT)
+    def death_error(self, action: str) -> FmuWorkerError:
+        """End the worker if it lives, and return the error that says how it died.
+
+        Parameters
+        ----------
+        action : str
+            What the worker was doing, such as "a step".
+        """
+        is_alive = not self._wait_for_end(CLOSE_LIMIT)
         self.kill()
-        code = self._process.returncode
-        if alive:
-            how = "closed its pipe, or wrote something else into it"
-        elif code < 0:
-            name = {item.value: item.name for item in signal.Signals}.get(-code, "a real-time signal")
-            meaning = f": {_MEANINGS[name]}" if name in _MEANINGS else ""
-            how = f"was ended by signal {-code} ({name}){meaning}"
-        elif code == Exit.PIPES_GONE:
-            how = "could not answer: the FMU's code closed files that are not its own"
-        elif code == Exit.OWN_FAILURE:
-            how = "failed outside the FMU"
-        else:
-            how = f"ended with exit status {code}: the FMU's code ended its own process"
+        cause = self._cause_of_death(is_alive, self._process.returncode)
         return FmuWorkerError(
-            f"During {what} the worker process of the FMU {how}. {_REMEDY}{self._remark}.", self._last_words()
+            f"During {action} the worker process of the FMU {cause}. {_REMEDY}{self._remark}.",
+            self._last_words(),
         )
 
-    def _await_end(self, limit: float) -> bool:
-        """Return whether it ended in time; it is not reaped yet."""
-        return self._process.returncode is not None or ended(self._ended, limit)
+    @staticmethod
+    def _cause_of_death(is_alive: bool, code: int) -> str:
+        """Return the end of the sentence on a worker that died.
+
+        Parameters
+        ----------
+        is_alive : bool
+            Whether it had not ended by itself.
+        code : int
+            Exit code of its process, negative for a signal.
+        """
+        if is_alive:
+            return "closed its pipe, or wrote something else into it"
+        if code < 0:
+            names = {number.value: number.name for number in signal.Signals}
+            name = names.get(-code, "a real-time signal")
+            meaning = f": {_MEANINGS[name]}" if name in _MEANINGS else ""
+            return f"was ended by signal {-code} ({name}){meaning}"
+        if code == Exit.PIPES_GONE:
+            return "could not answer: the FMU's code closed files that are not its own"
+        if code == Exit.OWN_FAILURE:
+            return "failed outside the FMU"
+        return f"ended with exit status {code}: the FMU's code ended its own process"
+
+    def _wait_for_end(self, limit: float) -> bool:
+        """Return whether the process ended within a limit [s]; it is not reaped yet."""
+        return self._process.returncode is not None or has_ended(self._end_event, limit)
 
     def _last_words(self) -> list[str]:
-        """Return the last lines of its output; of a crash of Python's, not the trace of our own code."""
+        """Return the last lines of the worker's output, without our own trace of a Python crash."""
         with contextlib.suppress(OSError):
-            # The FMU may have put a link or a pipe there.
-            log = os.open(self._folder / "worker.log", os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            # the FMU may have put a link or a pipe in the place of the log
+            flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
+            log = os.open(self._folder / "worker.log", flags)
             with os.fdopen(log, "rb") as file:
-                file.seek(max(file.seek(0, os.SEEK_END) - 4000, 0))
+                length = file.seek(0, os.SEEK_END)
+                file.seek(max(length - _LOG_BYTES, 0))
                 text = file.read().decode("utf-8", "replace")
             text = text.partition("Fatal Python error")[0]
-            return [line for line in text.splitlines() if line.strip()][-5:]
+            lines = [line for line in text.splitlines() if line.strip()]
+            return lines[-_LAST_LINES:]
         return []

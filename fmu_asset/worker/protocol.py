@@ -1,12 +1,14 @@
-"""What twin and worker say to each other.
+"""Messages between the twin and the worker process of an FMU.
 
-Two pipes carry binary messages: a header (kind, whether there are log messages, number of the request,
-length), then the payload. A reply bears the number of its request: an FMU that has made a copy of the
-worker's process, which answers too, cannot shift the replies. A step is the request block of an instance one
-way and the reply block the other, without copies. Any other call is a pickle of its name, the request block
-and the arguments; what comes back is never one: bytes, or texts separated by zeros, which are not JSON, of
-which an FMU in Python may have changed the module. The reply blocks of many steps come back in parts while
-these go on, so that the twin sees how far they are and can stop one that takes too long.
+Two pipes carry binary messages: a header (kind, whether there are log messages, number of the
+request, length), then the payload. A reply bears the number of its request: an FMU that has copied
+the worker's process, so that the copy answers too, cannot shift the replies.
+
+A step is the request block of an instance one way and the reply block the other, without copies.
+Any other call is a pickle of its name, the request block and the arguments. What comes back is
+never a pickle: bytes, or texts separated by zeros (not JSON, since an FMU in Python may have
+changed that module). The reply blocks of many steps come back in parts while the steps go on, so
+that the twin sees how far they are, and can stop one that takes too long.
 """
 
 import os
@@ -17,33 +19,52 @@ from enum import IntEnum
 
 HEADER = struct.Struct("<HHIQ")
 WORKER_NUMBER = struct.Struct("<q")
-"""First of all, the process number of the worker."""
+"""Process number of the worker, which is sent first of all."""
 LARGEST_MESSAGE = 2**23
-"""Bytes of an answer in words; a header that announces more does not come from the other side's program."""
+"""Largest answer in words [bytes]; a header that announces more is not from our program."""
 
 
 class Question(IntEnum):
     """Kinds of messages to a worker."""
 
-    STEP, CALL = 1, 2
+    STEP = 1
+    CALL = 2
 
 
 class Answer(IntEnum):
     """Kinds of messages from a worker."""
 
-    RESULT, FAILURE, PART = 1, 2, 3
+    RESULT = 1
+    FAILURE = 2
+    PART = 3
 
 
 class Exit(IntEnum):
-    """Exit statuses of a worker: its own program failed, the FMU closed its pipes, the twin is gone."""
+    """Exit statuses of a worker.
 
-    OWN_FAILURE, PIPES_GONE, DESERTED = 70, 71, 72
+    Its own program failed, the FMU closed its pipes, or the twin is gone.
+    """
+
+    OWN_FAILURE = 70
+    PIPES_GONE = 71
+    DESERTED = 72
 
 
-# Waking a process that sleeps on a pipe costs as much as a whole step. Whoever awaits the other side of a
-# step therefore looks again for a moment before it sleeps, if there is a processor for each of the two.
-_LOOK_AGAIN = 2.5e-4
-_PROCESSORS = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+_POLLING_TIME = 2.5e-4
+"""Seconds for which a message is awaited by polling.
+
+To wake a process that sleeps on a pipe costs as much as a whole step. If twin and worker have a
+processor each, both therefore look again and again for a moment before they sleep.
+"""
+
+
+def _processor_count() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+_PROCESSOR_COUNT = _processor_count()
 
 
 def joined(*texts: str) -> bytes:
@@ -57,7 +78,15 @@ def separated(message: bytes | bytearray) -> list[str]:
 
 
 def receive(descriptor: int, target: memoryview) -> bool:
-    """Fill `target`; return False if the other side is gone."""
+    """Fill a buffer from a pipe; return False if the other side is gone.
+
+    Parameters
+    ----------
+    descriptor : int
+        File descriptor of the pipe.
+    target : memoryview of bytes
+        The buffer.
+    """
     filled = 0
     while filled < len(target):
         count = os.readv(descriptor, [target[filled:]])
@@ -68,7 +97,14 @@ def receive(descriptor: int, target: memoryview) -> bool:
 
 
 def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
-    """Write all parts.
+    """Write a message of several parts to a pipe.
+
+    Parameters
+    ----------
+    descriptor : int
+        File descriptor of the pipe.
+    *parts : bytes-like
+        The parts, one after the other.
 
     Raises
     ------
@@ -77,21 +113,31 @@ def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
     """
     sent = os.writev(descriptor, parts)
     if sent < sum(len(part) for part in parts):
-        rest = memoryview(b"".join(parts))[sent:]
-        while rest:
-            rest = rest[os.write(descriptor, rest) :]
+        # only then are the parts copied
+        remaining = memoryview(b"".join(parts))[sent:]
+        while remaining:
+            count = os.write(descriptor, remaining)
+            remaining = remaining[count:]
 
 
-def ended(process: int, limit: float) -> bool:
-    """Return whether the process of a file descriptor has ended, or ends within a limit [s]."""
+def has_ended(process: int, limit: float) -> bool:
+    """Return whether a process has ended, or ends within a limit.
+
+    Parameters
+    ----------
+    process : int
+        File descriptor of the process (`os.pidfd_open`).
+    limit : float
+        Longest wait [s].
+    """
     poll = select.poll()
     poll.register(process, select.POLLIN)
     return bool(poll.poll(1000.0 * limit))
 
 
-def look(poll: select.poll) -> None:
-    """Return as soon as there is something to read, or after a moment without."""
-    if _PROCESSORS > 1:
-        end = time.monotonic() + _LOOK_AGAIN
+def poll_for_message(poll: select.poll) -> None:
+    """Return as soon as there is something to read, or after a moment; see `_POLLING_TIME`."""
+    if _PROCESSOR_COUNT > 1:
+        end = time.monotonic() + _POLLING_TIME
         while not poll.poll(0) and time.monotonic() < end:
             pass

@@ -1,4 +1,7 @@
-"""The worker's side: it imports fmpy, and of the project `errors`, `instances` and this folder only."""
+"""The worker's side: it makes the calls that the twin asks for, and answers.
+
+Of the project it imports `errors`, `instances` and this package only.
+"""
 
 import ctypes
 import errno
@@ -10,48 +13,69 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
 from fmu_asset.errors import FmuError, FmuWorkerError
 from fmu_asset.instances.base import FmuInstance
-from fmu_asset.instances.co_simulation import open_instance
+from fmu_asset.instances.opening import open_instance
 from reporting.arrays import Float
 
-from .protocol import HEADER, Answer, Exit, Question, joined, look, receive, send
+from .protocol import HEADER, Answer, Exit, Question, joined, poll_for_message, receive, send
 
 LARGEST_FILE = 2 * 1024**3
 """Bytes that an FMU may write to one file, such as an endless log."""
-_NOT_GRANTED = (
-    " The system refused it something (Permission denied{}), as its sandbox does: what it needs can be "
-    "granted by `read`, `write`, `ports` or `programs` in the table [limits] of its binding."
-)
-_REACHES = ("open", "os.", "shutil.", "socket.", "subprocess.", "urllib.")
-_last_reach: list[tuple[str, tuple[object, ...]]] = []
-"""What Python code has tried last beyond this process, if it has: the event of auditing and its arguments."""
-
-
-def _notice(event: str, arguments: tuple[object, ...]) -> None:
-    if event.startswith(_REACHES) and event != "os.chdir":  # which is free, and which we do ourselves
-        _last_reach[:] = [(event, arguments)]
-
-
-def _refusal() -> str:
-    """Return the sentence on what the sandbox has refused, with its name if Python knows it."""
-    tried = ""
-    for event, arguments in _last_reach:
-        what = ", ".join(repr(value) for value in arguments if isinstance(value, str | bytes | list | tuple))
-        tried = f"; the last that its Python code tried was {event}({what})"
-    return _NOT_GRANTED.format(tried)
-
 
 _locate_errno = ctypes.CDLL(None).__errno_location
 _locate_errno.restype = ctypes.c_void_p
 
 
+# ---------------------------------------------------------------------- refusals of the sandbox
+
+
+class _AuditEvent(NamedTuple):
+    """An event of Python's auditing: its name and arguments."""
+
+    name: str
+    arguments: tuple[object, ...]
+
+
+_REACHES = ("open", "os.", "shutil.", "socket.", "subprocess.", "urllib.")
+"""Beginnings of the names of events by which Python code reaches beyond its process."""
+_last_reaches: list[_AuditEvent] = []
+"""The last such event since the last question, if there was one."""
+
+
+def _record_reach(event: str, arguments: tuple[object, ...]) -> None:
+    """Record an event by which Python code reaches beyond its process (a hook of auditing)."""
+    # os.chdir is free, and our own code calls it
+    if event.startswith(_REACHES) and event != "os.chdir":
+        _last_reaches[:] = [_AuditEvent(event, arguments)]
+
+
+def _sandbox_hint() -> str:
+    """Return the sentence on what the sandbox has refused, with its name if Python knows it."""
+    attempt = ""
+    for event in _last_reaches:
+        listed = []
+        for argument in event.arguments:
+            if isinstance(argument, str | bytes | list | tuple):
+                listed.append(repr(argument))
+        call = f"{event.name}({', '.join(listed)})"
+        attempt = f"; the last that its Python code tried was {call}"
+    return (
+        f" The system refused it something (Permission denied{attempt}), as its sandbox does: what "
+        "it needs can be granted by `read`, `write`, `ports` or `programs` in the table [limits] "
+        "of its binding."
+    )
+
+
+# ---------------------------------------------------------------------- life of the worker
+
+
 def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
-    """Answer requests until the pipe closes, and end.
+    """Answer questions until the twin asks for the end or its pipe closes, and end this process.
 
     Parameters
     ----------
@@ -63,12 +87,13 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
     # The twin decides what an interruption means; the worker ends when its pipe closes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
-    _restrict()
-    asked = False
+    _limit_file_size()
+    was_asked_to_end = False
     try:
-        asked, instance = _answer_requests(incoming, outgoing, confined=confined)
-        if instance is not None:
-            instance.close()
+        server = _Server(incoming, outgoing, confined=confined)
+        was_asked_to_end = server.answer_questions()
+        if server.instance is not None:
+            server.instance.close()
     except BrokenPipeError:
         pass  # the twin is gone, or this is a copy of the worker without one
     except OSError as error:
@@ -77,100 +102,164 @@ def serve(incoming: int, outgoing: int, *, confined: bool) -> NoReturn:
         traceback.print_exc()
         sys.stderr.flush()
         os._exit(Exit.OWN_FAILURE)
-    # Without the interpreter's shutdown, which third-party libraries may not survive.
-    os._exit(0 if asked else Exit.DESERTED)
+    # Without the interpreter's shutdown, which some libraries do not survive.
+    os._exit(0 if was_asked_to_end else Exit.DESERTED)
 
 
-def _restrict() -> None:
-    """End an FMU that fills the disk."""
+def _limit_file_size() -> None:
+    """Let the system end an FMU that fills the disk."""
     import resource
 
-    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    limit = LARGEST_FILE if hard == resource.RLIM_INFINITY else min(LARGEST_FILE, hard)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    _, hard_limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    limit = LARGEST_FILE
+    if hard_limit != resource.RLIM_INFINITY:
+        limit = min(LARGEST_FILE, hard_limit)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard_limit))
     # Python ignores this signal, and the FMU would see a write that fails again and again.
     signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
 
 
-def _answer_requests(incoming: int, outgoing: int, *, confined: bool) -> tuple[bool, FmuInstance | None]:
-    """Answer requests; return whether the end was asked for, and the instance that is still open."""
-    if confined:
-        sys.addaudithook(_notice)
-    instance: FmuInstance | None = None
-    header = memoryview(bytearray(HEADER.size))
-    reply_header = bytearray(HEADER.size)
-    system_error = ctypes.c_int.from_address(_locate_errno())  # what a call of the FMU leaves in `errno`
-    request = reply = memoryview(b"")
-    own_number, poll = os.getpid(), select.poll()
-    poll.register(incoming, select.POLLIN | select.POLLHUP)
+class _Call(NamedTuple):
+    """A call that the twin asks for.
 
-    def answer(kind: int, payload: bytes | memoryview) -> None:
-        if os.getpid() != own_number:
-            os._exit(0)  # a copy that the FMU has made of this process
-        logged = kind != Answer.FAILURE and instance is not None and len(instance.messages) > 0
-        HEADER.pack_into(reply_header, 0, kind, logged, number, len(payload))
-        send(outgoing, reply_header, payload)
+    Attributes
+    ----------
+    name : str
+        Name of the method.
+    request : bytes
+        The request block.
+    arguments : tuple
+        Arguments of the method.
+    """
 
-    while receive(incoming, header):
-        kind, _, number, length = HEADER.unpack(header)
-        try:
-            if kind == Question.STEP:
-                if not receive(incoming, request) or instance is None:
-                    break
-                instance.step()
-                payload: bytes | memoryview = reply
-            else:
-                content = bytearray(length)
-                if not receive(incoming, memoryview(content)):
-                    break
-                name, block, arguments = pickle.loads(content)
-                system_error.value = 0
-                _last_reach.clear()
-                if name == "close":
-                    return True, instance
-                if name == "open":
-                    if instance is not None:
-                        instance.close()
-                    instance = open_instance(*arguments)
-                    request = memoryview(instance.request).cast("B")
-                    reply = memoryview(instance.reply).cast("B")
-                elif instance is None:
-                    raise FmuWorkerError("The worker was asked before it had an FMU.")
-                request[:] = block
-                payload = _called(instance, name, arguments, answer) or (reply if name == "read" else b"")
-            answer(Answer.RESULT, payload)
-        except FmuError as error:
-            refused = system_error.value == errno.EACCES or "ermission denied" in str(error)
-            sentence = error.sentence + (_refusal() if confined and refused else "")
-            lost = instance is None or instance.lost
-            time = "" if error.time is None else repr(error.time)
-            answer(
-                Answer.FAILURE, joined(type(error).__name__, "lost" * lost, time, sentence, *error.messages)
-            )
-        look(poll)
-    return False, instance
+    name: str
+    request: bytes
+    arguments: tuple[Any, ...]
 
 
-def _called(
-    instance: FmuInstance, name: str, arguments: tuple[Any, ...], answer: Callable[[int, bytes], None]
-) -> bytes:
-    """Call a method of the instance and return what it answers as bytes."""
-    if name == "run":
-        _run(instance, arguments[0], answer)
-    elif name == "take_log":
-        return joined(*(f"{status} {text}" for status, text in instance.take_log()))
-    elif name != "open":
-        return getattr(instance, name)(*arguments) or b""
-    return b""
+class _Server:
+    """Answers the questions of the twin.
 
+    Parameters
+    ----------
+    incoming, outgoing : int
+        File descriptors of the pipes.
+    confined : bool
+        Whether this process is in a sandbox.
 
-def _run(instance: FmuInstance, requests: Float, answer: Callable[[int, bytes], None]) -> None:
-    """Make many steps, and send the replies in parts."""
-    replies, sent = np.empty((len(requests), len(instance.reply))), 0
+    Attributes
+    ----------
+    instance : FmuInstance or None
+        The instance, once it has been opened.
+    """
 
-    def report(done: int) -> None:
-        nonlocal sent
-        answer(Answer.PART, replies[sent:done].tobytes())
-        sent = done
+    def __init__(self, incoming: int, outgoing: int, *, confined: bool) -> None:
+        self._incoming = incoming
+        self._outgoing = outgoing
+        self._confined = confined
+        if confined:
+            sys.addaudithook(_record_reach)
+        self.instance: FmuInstance | None = None
+        self._request = memoryview(b"")
+        self._reply = memoryview(b"")
+        self._question_number = 0
+        self._answer_header = bytearray(HEADER.size)
+        self._process = os.getpid()
+        # the C variable `errno`, in which a call of the FMU leaves its error
+        self._errno = ctypes.c_int.from_address(_locate_errno())
 
-    instance.run(requests, replies, report)
+    def answer_questions(self) -> bool:
+        """Answer questions; return whether the twin asked for the end, or its pipe just closed."""
+        header = memoryview(bytearray(HEADER.size))
+        poll = select.poll()
+        poll.register(self._incoming, select.POLLIN | select.POLLHUP)
+        while receive(self._incoming, header):
+            kind, _, self._question_number, length = HEADER.unpack(header)
+            try:
+                if kind == Question.STEP:
+                    if not receive(self._incoming, self._request) or self.instance is None:
+                        return False
+                    self.instance.step()
+                    self._answer(Answer.RESULT, self._reply)
+                else:
+                    content = bytearray(length)
+                    if not receive(self._incoming, memoryview(content)):
+                        return False
+                    call = _Call(*pickle.loads(content))
+                    if call.name == "close":
+                        return True
+                    self._answer(Answer.RESULT, self._result_of(call))
+            except FmuError as error:
+                self._answer_failure(error)
+            poll_for_message(poll)
+        return False
+
+    def _answer(self, kind: Answer, payload: bytes | memoryview) -> None:
+        """Send an answer to the present question."""
+        if os.getpid() != self._process:
+            os._exit(0)  # this is a copy of the worker that the FMU has made
+        has_log = False
+        if kind != Answer.FAILURE and self.instance is not None:
+            has_log = len(self.instance.messages) > 0
+        HEADER.pack_into(self._answer_header, 0, kind, has_log, self._question_number, len(payload))
+        send(self._outgoing, self._answer_header, payload)
+
+    def _answer_failure(self, error: FmuError) -> None:
+        """Send an error as the answer to the present question."""
+        sentence = error.sentence
+        is_refused = self._errno.value == errno.EACCES or "ermission denied" in str(error)
+        if self._confined and is_refused:
+            sentence += _sandbox_hint()
+        is_lost = self.instance is None or self.instance.lost
+        payload = joined(
+            type(error).__name__,
+            "lost" if is_lost else "",
+            "" if error.time is None else repr(error.time),
+            sentence,
+            *error.messages,
+        )
+        self._answer(Answer.FAILURE, payload)
+
+    def _result_of(self, call: _Call) -> bytes | memoryview:
+        """Make a call and return its result as bytes."""
+        self._errno.value = 0
+        _last_reaches.clear()
+        if call.name == "open":
+            self._open(*call.arguments)
+        instance = self.instance
+        if instance is None:
+            raise FmuWorkerError("The worker was asked before it had an FMU.")
+        self._request[:] = call.request
+        if call.name == "open":
+            return b""
+        if call.name == "run":
+            (requests,) = call.arguments
+            self._run(instance, requests)
+            return b""
+        if call.name == "take_log":
+            return joined(*(f"{status} {text}" for status, text in instance.take_log()))
+        method: Callable[..., bytes | None] = getattr(instance, call.name)
+        result = method(*call.arguments)
+        if call.name == "read":
+            return self._reply
+        return result or b""
+
+    def _open(self, *arguments: Any) -> None:
+        """Free the instance, if there is one, and make another as `open_instance` does."""
+        if self.instance is not None:
+            self.instance.close()
+        self.instance = open_instance(*arguments)
+        self._request = memoryview(self.instance.request).cast("B")
+        self._reply = memoryview(self.instance.reply).cast("B")
+
+    def _run(self, instance: FmuInstance, requests: Float) -> None:
+        """Make many steps, and send the replies in parts."""
+        replies = np.empty((len(requests), len(instance.reply)))
+        sent = 0
+
+        def report(done: int) -> None:
+            nonlocal sent
+            self._answer(Answer.PART, replies[sent:done].tobytes())
+            sent = done
+
+        instance.run(requests, replies, report)

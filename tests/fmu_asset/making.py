@@ -14,8 +14,8 @@ import fmpy
 import pytest
 
 from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.client.binding import Binding, parse_binding
 from fmu_asset.coupling.structure import Component, Connection, Connector, SystemStructure, expand_connection
-from fmu_asset.door.binding import Binding, parse_binding
 from tests.kept import packed
 
 ROOT = Path(__file__).parents[2]

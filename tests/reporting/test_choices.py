@@ -12,9 +12,9 @@ import xarray
 import uav_twin
 from calibration.dynamics.modal_identification import identify_modes
 from calibration.wing.lab_data import read_lab_folder
+from fmu_asset.client.binding import Binding
 from fmu_asset.compiled.compiler import compile_library
 from fmu_asset.compiled.package import compiled_binaries, fmi_headers
-from fmu_asset.door.binding import Binding
 from reporting.choices import require_one_of
 from reporting.errors import InvalidChoiceError
 

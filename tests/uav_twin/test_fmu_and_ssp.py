@@ -12,9 +12,10 @@ import pytest
 import xarray as xr
 
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import load_binding, parse_binding
-from fmu_asset.door.experiment import default_experiment, read_histories
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import load_binding, parse_binding
+from fmu_asset.client.experiment import default_experiment
+from fmu_asset.client.history_files import read_histories
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import BindingError, FmuFileError, FmuInputError
 from scenarios import binding_files
 from tests.command_line import command, refused, said

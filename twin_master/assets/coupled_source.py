@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 from pydantic import Field
 
 from fe.wing.design import load_design
+from fmu_asset.client.binding import Binding
+from fmu_asset.client.bound_variables import expand
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.coupling.structure import (
     Component,
@@ -15,7 +17,6 @@ from fmu_asset.coupling.structure import (
     SystemStructure,
     expand_connection,
 )
-from fmu_asset.door.binding import Binding, expand
 from reporting.files import atomic_write_bytes, hash_file
 from reporting.progress import Progress
 from reporting.toml_file import Fault, Number, Positive

@@ -13,7 +13,7 @@ import numpy as np
 from fe.runtime.state import wing_input_names
 from fe.structure.tables import StructureDesign
 from fe.wing.design import WingDesign, load_design, wing_structure
-from fmu_asset.door.binding import Binding
+from fmu_asset.client.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress
 from twin_master.assets.asset_source import (
@@ -300,7 +300,7 @@ class DesignSource(_Wing, ReducedModelSource):
         if patch is None or not patch.effects:
             return super().observation_table(draws, model)
         from fmu_asset.packing.structure_fmu import needed_patch_arrays
-        from fmu_asset.slaves.base import UnacceptableValuesError
+        from fmu_asset.slaves.contents import UnacceptableValuesError
 
         scenario, where = self._scenario, str(self.patch_path)
         ask = strains_with_effects(self.wing, patch, needed_patch_arrays(self.wing_design, patch))
@@ -319,13 +319,13 @@ def strains_with_effects(
     It is asked with the factor of Young's modulus, the tip force [N], the control, and the losses by region.
     """
     from fmu_asset.slaves.behaviour import StructureBehaviour
-    from fmu_asset.slaves.effects import Effects, effect_rows, switch_of
+    from fmu_asset.slaves.effects import SwitchableEffects, effect_rows, switch_name
     from fmu_asset.slaves.table import structure_table
 
     effects = patch.plain
     rows, roles = structure_table(wing, {})
-    behaviour = StructureBehaviour(wing, rows, roles, Effects(effects, len(wing.gauges), arrays))
-    on = {switch_of(effect): 1.0 for effect in effects}
+    behaviour = StructureBehaviour(wing, rows, roles, SwitchableEffects(effects, len(wing.gauges), arrays))
+    on = {switch_name(effect): 1.0 for effect in effects}
     behaviour.tune({row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, on)}, 0.0)
     nominal = {row.name: row.start or 0.0 for row in rows}
     inputs = [row.name for row in rows if row.causality == "input"]

@@ -8,8 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from fmu_asset.archive.fmu_file import packed_design_hash
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import FmuInputError
 from fmu_asset.folders import scratch_folder
 from reporting.arrays import Float
@@ -122,7 +122,7 @@ class FmuAsset(Asset):
     Parameters
     ----------
     session : FmiAsset or CoupledAsset
-        The door, at its start.
+        The asset, at its start.
     observation : slice
         Where the observed quantity stands among the observations of the binding.
     load : mapping of str to float

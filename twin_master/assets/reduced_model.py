@@ -9,7 +9,7 @@ import numpy as np
 
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.structure.tables import StructureDesign, StructureSettings
-from fmu_asset.door.binding import Binding
+from fmu_asset.client.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
 from typing import ClassVar, Literal
 
-from fmu_asset.door.binding import Binding
+from fmu_asset.client.binding import Binding
 from reporting.files import atomic_write_text, hash_file
 from reporting.progress import Progress
 from twin_master.assets.asset_source import (

@@ -7,6 +7,9 @@ from pathlib import Path
 
 from fe.wing.design import load_design
 from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.client.binding import INPUT_ROLES, Binding, load_binding
+from fmu_asset.client.bound_variables import ParameterBinding
+from fmu_asset.client.exchange import Exchange
 from fmu_asset.coupling.structure import (
     Component,
     ComponentSetting,
@@ -17,9 +20,8 @@ from fmu_asset.coupling.structure import (
 )
 from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.binding import INPUT_ROLES, Binding, Parameter, load_binding
-from fmu_asset.door.exchange import Exchange
 from fmu_asset.folders import scratch_folder
+from fmu_asset.instances.plan import InitialValue
 from fmu_asset.packing.structure_fmu import pack_wing
 from fmu_asset.ssp.writer import write_ssp
 from reporting.progress import reporter
@@ -109,7 +111,7 @@ def _with_own_names(binding: Binding, fmu: Path, parameters: Mapping[str, float]
     """Return a binding that also has the parameters which go by their own names in the FMU."""
     description = read_fmu(fmu)
     added = {
-        name: Parameter(variable=name, unit=variable.unit or "1")
+        name: ParameterBinding(variable=name, unit=variable.unit or "1")
         for name in parameters
         if name not in binding.parameter and (variable := description.variable(name)) is not None
     }
@@ -125,7 +127,9 @@ def _with_values(
     settings = exchange.settings(parameters)
     for name, value in load.items():
         slot = exchange.slot("load", name)
-        settings.append((slot.variable.kind, slot.variable.reference, slot.numbers(value).tolist()))
+        settings.append(
+            InitialValue(slot.variable.kind, slot.variable.reference, slot.numbers(value).tolist())
+        )
     given: dict[str, dict[str, ComponentSetting]] = {
         name: {key: ComponentSetting(number) for key, number in values.items()}
         for name, values in system.settings_of_components(settings).items()

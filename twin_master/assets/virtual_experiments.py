@@ -13,9 +13,9 @@ from calibration.virtual_wing import (
 )
 from fe.runtime.state import DigitalState, losses_of
 from fmu_asset.archive.fmu_file import read_fmu
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.experiment import from_here
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.experiment import simulate_from_now
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.slaves.variables import QUASI_STATIC, TRANSIENT
 from scenarios import binding_files
 
@@ -73,7 +73,7 @@ class FmuTestBench(ExitStack):
         release = {"response": float(TRANSIENT), "initial_tip_displacement": initial_tip_displacement}
         with self._session(binding, release) as session:
             session.reset(control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0})
-            recorded = from_here(session, time.size - 1, {})
+            recorded = simulate_from_now(session, time.size - 1, {})
         return time, SENSITIVITY * recorded.values[:, RECORDED_GAUGE - 1]
 
     def _session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:

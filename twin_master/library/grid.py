@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuInputError, FmuOutputError
 from reporting.arrays import Float
 from reporting.progress import reporter

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from fmu_asset.door.binding import Binding, load_binding
-from fmu_asset.door.placement import say_sandbox
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.instance_host import warn_without_sandbox
+from fmu_asset.client.session import FmiAsset
 from reporting.arrays import Float
 from reporting.files import atomic_write_bytes, atomic_write_text, explained_write_errors, hash_file
 from reporting.folders import closing_lock, lock_folder
@@ -174,7 +174,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
         if any(b <= a for a, b in itertools.pairwise(levels)):
             raise MissionInputError(f"the levels of {name} must increase, and {levels} came.")
     fmu = FmiAsset(grid.fmu, binding)
-    say_sandbox(grid.fmu, binding.limits.grants)
+    warn_without_sandbox(grid.fmu, binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
     count: int = sensors.stop - sensors.start
     check_fits(

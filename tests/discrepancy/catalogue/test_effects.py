@@ -283,7 +283,7 @@ def test_a_chain_is_offered_what_it_can_carry_and_its_records_can_show():
     setting = setting_of(example_campaign(model, "laboratory", 1, plan), model)
     reasons = {effect.identifier: effect.unavailable(setting) for effect in library()}
     absent = {name for name, reason in reasons.items() if reason is not None}
-    assert absent == WITHOUT_STATION | OF_STORES | WARM | {"logger_clock"}
+    assert absent == WITHOUT_STATION | OF_STORES | WARM | {"logger_clock", "sensor_lag"}
     assert all(reasons[name].endswith(".") for name in absent)
 
 

@@ -148,6 +148,34 @@ def test_a_saturating_sensor_shows_the_formula_and_its_derivative():
     assert np.array_equal(late, np.where(TIME[:, np.newaxis] < 1.0, VALUES, values))
 
 
+def test_a_lagging_channel_shows_a_cubic_course_exactly_later():
+    course, rate = np.polynomial.Polynomial([1.0, -2.0, 3.0, 0.5]), np.polynomial.Polynomial([-2.0, 6.0, 1.5])
+    record = replace(FORCED, settled=False)
+    values, rates = applied(
+        ModelPatch((patch.SensorLag("tip", 0.0137),)),
+        record,
+        np.tile(course(TIME)[:, np.newaxis], 3),
+        np.tile(rate(TIME)[:, np.newaxis], 3),
+    )
+    later = TIME >= 0.0137
+    assert values[later, 0] == pytest.approx(course(TIME[later] - 0.0137), rel=1e-12)
+    assert rates[later, 0] == pytest.approx(rate(TIME[later] - 0.0137), rel=1e-11)
+    assert values[~later, 0] == pytest.approx(1.0 - 2.0 * (TIME[~later] - 0.0137))
+    assert np.array_equal(values[:, 1], course(TIME))
+
+
+def test_a_lagging_channel_of_a_settled_record_stood_still_before():
+    values, rates = shown(patch.SensorLag("g0", 0.0137), record=FORCED)
+    assert np.array_equal(values[:2, 1], VALUES[[0, 0], 1])
+    assert np.array_equal(rates[:2, 1], [0.0, 0.0])
+
+
+def test_a_channel_ahead_of_its_record_goes_on_with_its_last_rate():
+    values, _ = shown(patch.SensorLag("tip", -0.015), record=FORCED)
+    assert values[:-2, 0] == pytest.approx(np.cos(3 * (TIME[:-2] + 0.015)), abs=1e-8)
+    assert values[-1, 0] == pytest.approx(VALUES[-1, 0] + 0.015 * RATES[-1, 0])
+
+
 def test_drift_by_kind_of_trial_and_exponent():
     drifted = shown(SensorDrift("tip", 1.0, 50.0), record=replace(STATIC, time=100.0 * TIME))[0][:, 0]
     assert drifted == pytest.approx(VALUES[:, 0] + 2.0 * TIME)

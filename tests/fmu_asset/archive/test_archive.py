@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import extract_fmu, inspect_fmu, read_fmu
-from fmu_asset.check import FmuCheck, check_file, check_fmu
-from fmu_asset.door.draft import draft_binding
-from fmu_asset.door.session import FmiAsset
-from tests.fmu_asset.door.kinds import HOSTILE, WING_BINDING
+from fmu_asset.checks.file_checks import check_file
+from fmu_asset.checks.fmu_check import FmuCheck, check_fmu
+from fmu_asset.client.draft import draft_binding
+from fmu_asset.client.session import FmiAsset
+from tests.fmu_asset.client.kinds import HOSTILE, WING_BINDING
 from tests.fmu_asset.making import DESCRIPTION, MODELS, archive_of, bound, edited, members, tables
 
 REFUSED = tables(__file__)["refused"]
@@ -232,10 +233,11 @@ def test_eighty_instances_in_one_process(foreign_fmu) -> None:
 def test_step_sizes_and_units_that_contradict(foreign_fmu) -> None:
     for number, (model, options, changes, check, sentence) in enumerate(FAULTS["told"]):
         path = foreign_fmu.changed(model, f"told{number}", *changes)
-        of_file = " ".join(text for name, _, text in check_file(inspect_fmu(path)[0]) if name == check)
+        findings = check_file(inspect_fmu(path)[0])
+        of_file = " ".join(finding.text for finding in findings if finding.check == check)
         assert sentence in (of_file or texts(check_fmu(path, **options), check))
     broken = foreign_fmu.changed("fixed2", "schema", ('<Real start="0"/>', "<Real/>"))
-    assert any("start value" in text for _, _, text in check_file(inspect_fmu(broken)[0]))
+    assert any("start value" in finding.text for finding in check_file(inspect_fmu(broken)[0]))
 
 
 def test_a_range_that_the_fmu_does_not_keep(foreign_fmu) -> None:

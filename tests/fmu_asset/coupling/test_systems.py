@@ -25,8 +25,8 @@ from fmu_asset.coupling.structure import (
 )
 from fmu_asset.coupling.structure import expand_connection as expand
 from fmu_asset.coupling.wiring import Wiring
+from tests.fmu_asset.client.kinds import BINDINGS
 from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
-from tests.fmu_asset.door.kinds import BINDINGS
 from tests.fmu_asset.making import bound, changed, system, tables, watch
 from tests.fmu_asset.ours import OurFmus
 from tests.refusals import refused as in_one_sentence

@@ -19,13 +19,13 @@ from fe.high_pass import filtered_record
 from fe.runtime.patch import STRUCTURE, ModelPatch, SensorRotation
 from fe.runtime.sensors import SensorRecord, apply_sensors
 from fe.runtime.state import DigitalState
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import FmuCallError, FmuInputError, PatchFileError
 from fmu_asset.packing.patch_file import parse_patch
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.effects import output_channels
 from tests.command_line import command, refused, said
-from tests.fmu_asset.door.kinds import BINDINGS, KINDS
+from tests.fmu_asset.client.kinds import BINDINGS, KINDS
 from tests.fmu_asset.making import tables
 from tests.fmu_asset.ours import wing_arrays
 from tests.refusals import refused as no_line_end
@@ -116,7 +116,7 @@ def test_effects_of_sensors_are_those_of_whole_records(fmu, sensing, patched, mo
     time, kind = 0.05 * np.arange(first, len(rows) + 1), "ringdown" if moving else "flight"
     more = {"release": 0.03} if moving else {}
     record = SensorRecord(CHANNELS, kind, time, 2.0 * moving, np.zeros(len(time)), **more)
-    wanted, _ = apply_sensors(whole, record, plain, filtered=filtered_record)
+    wanted, _ = apply_sensors(whole, record, plain, high_pass=filtered_record)
     scale = np.abs(wanted).max(axis=0) if moving else np.abs(wanted)
     assert (np.abs(shown - wanted) <= (1e-12 if moving else 1e-13) * scale).all()
     assert not np.allclose(shown, plain)
@@ -215,7 +215,7 @@ def test_records_are_those_of_the_naming_side(kind, name, flying, naming_side) -
         arrays, damage = wing_arrays(), np.array([[0.1, 0.0]])
         chosen = chosen | {"response": 2.0, "release": 0.03}
         state = np.array([1.0, *damage[0], *STATE[1:3], 1.0, 0.0])
-        shape = naming_side.wing.at(state, patch.of(*STRUCTURE)).static(arrays.load_tip)
+        shape = naming_side.wing.structure_at(state, patch.of(*STRUCTURE)).static(arrays.load_tip)
         acting = {"release": Release(0.03 * float(arrays.load_tip @ shape) / float(arrays.tip_row @ shape))}
     elif kind == TrialKind.STATIC:
         warm = 5.0 * time / len(FORCES)
@@ -258,7 +258,7 @@ def test_modal_outputs_are_those_of_the_patched_wing(patched, naming_side) -> No
         seen, off = (asset.step(load={"root": root}).extra["frequency[1]"] for root in (1.0, 0.0))
     healthy = np.array([1.0, 0.0, 0.0, 0.169, 0.134, 1.0, 0.0])
     assert seen == pytest.approx(
-        naming_side.wing.at(healthy, patch_of("point_mass", "root")).modes.frequency[0]
+        naming_side.wing.structure_at(healthy, patch_of("point_mass", "root")).modes.frequency[0]
     )
     assert off > seen
 

@@ -19,15 +19,16 @@ from fe.runtime.reduced import ReducedModel
 from fe.runtime.state import WING_MODEL_NAME, DigitalState
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import inspect_fmu, read_fmu
-from fmu_asset.check import check_file, check_fmu
+from fmu_asset.checks.file_checks import check_file
+from fmu_asset.checks.fmu_check import check_fmu
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.compiled.compiler import compile_library, find_compiler
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts
-from tests.fmu_asset.door.kinds import BINDINGS, WING_BINDING
+from tests.fmu_asset.client.kinds import BINDINGS, WING_BINDING
 from tests.fmu_asset.making import DESCRIPTION, archive_of, members, run_python, tables
 from tests.fmu_asset.ours import STRUCTURES
 
@@ -59,8 +60,8 @@ def test_a_packed_fmu_is_sound(ours, name) -> None:
         binding = BINDINGS["uav_wing_fmi3"] if name == "fmi3" else None
         check = check_fmu(ours(name), binding, cycles=5 if name != "python" else 0)
         assert {finding.verdict for finding in check.findings} == {"ok"}
-    assert "problem" not in {verdict for _, verdict, _ in found}
-    checks = {check for check, verdict, _ in found if verdict == "ok"}
+    assert "problem" not in {finding.verdict for finding in found}
+    checks = {finding.check for finding in found if finding.verdict == "ok"}
     assert "fmpy validate" in checks
     assert name not in STRUCTURES or "content" in checks
 
@@ -133,7 +134,8 @@ def test_a_changed_part_is_noticed(ours, kind, tmp_path) -> None:
         name = next(name for name in contents if name.endswith(entry))
         content = contents[name].replace(old, new) if old else contents[name] + new
         changed = archive_of(tmp_path / "changed.fmu", contents | {name: content})
-        (said,) = (text for check, _, text in check_file(inspect_fmu(changed)[0]) if check == "content")
+        findings = check_file(inspect_fmu(changed)[0])
+        (said,) = (finding.text for finding in findings if finding.check == "content")
         assert said.endswith("the file was changed after its build."), entry
 
 
@@ -199,7 +201,7 @@ def test_a_structure_of_the_wings_name_is_no_wing(ours) -> None:
 def test_a_note_and_a_further_file(model, fmu, tmp_path) -> None:
     note, content = 'Calibrated for "Wing <7> & é".', b'{"asset": "Wing <7>"}\n'
     path = build_fmu(model, tmp_path / "a.fmu", note=note, resources={"calibration.json": content}).path
-    assert {verdict for _, verdict, _ in check_file(inspect_fmu(path)[0])} == {"ok"}
+    assert {finding.verdict for finding in check_file(inspect_fmu(path)[0])} == {"ok"}
     described, inside = read_model_description(str(path)), members(path)
     assert described.description.endswith(note)
     assert described.guid != read_model_description(str(fmu)).guid

@@ -10,7 +10,7 @@ from fmpy.fmi1 import FMICallException
 
 from fmu_asset.archive.declared import FLOAT_KINDS, VariableInfo
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
-from fmu_asset.instances.co_simulation import open_instance
+from fmu_asset.instances.opening import open_instance
 from fmu_asset.instances.plan import Plan
 
 OK, DISCARD, ERROR = 0, 2, 3

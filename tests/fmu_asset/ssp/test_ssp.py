@@ -16,6 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fmu_asset.archive.declared import UnitInfo
+from fmu_asset.client.experiment import default_experiment
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
     Component,
@@ -28,14 +30,12 @@ from fmu_asset.coupling.structure import (
 )
 from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
-from fmu_asset.door.experiment import default_experiment
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.errors import CouplingError, SspError
 from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
 from fmu_asset.ssp.reader import read_ssp
 from fmu_asset.ssp.writer import write_ssp
+from tests.fmu_asset.client.kinds import BINDINGS
 from tests.fmu_asset.coupling.reference import PARTS, of_ours
-from tests.fmu_asset.door.kinds import BINDINGS
 from tests.fmu_asset.making import archive_of, bound, members, tables, watch
 from tests.fmu_asset.ours import OurFmus
 

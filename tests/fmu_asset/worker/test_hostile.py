@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 
 from fmu_asset import errors
-from fmu_asset.door.binding import Binding
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.client.binding import Binding
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.worker.client import WorkerInstance
 from fmu_asset.worker.protocol import HEADER, Question
-from tests.fmu_asset.door.kinds import HOSTILE, SPRING_BINDING, WING_BINDING
+from tests.fmu_asset.client.kinds import HOSTILE, SPRING_BINDING, WING_BINDING
 from tests.fmu_asset.making import ROOT, archive_of, changed, members, run_python, tables
 
 MISBEHAVIOURS = tables(__file__, "misbehaviours")
@@ -128,7 +128,7 @@ def test_what_goes_wrong_at_the_end_leaves_nothing(hostile, scratch, what) -> No
     with hostile(*what) as asset:
         assert [asset.step().values[0] for _ in range(4)] == [1.0, 2.0, 3.0, 4.0]
         if "START_PROCESS_ELSEWHERE" in what:
-            assert len(processes(scratch)) == 3  # the keeper, the worker, and what the FMU has started
+            assert len(processes(scratch)) == 3  # the supervisor, the worker, and what the FMU has started
     await_nothing(scratch)
 
 
@@ -171,10 +171,10 @@ def test_an_answer_to_another_request_is_not_taken(hostile) -> None:
     """A reply that is whole but bears another number, as one that comes late."""
     with hostile() as asset:
         asset.step()
-        instance = asset._housing.instance
+        instance = asset._host.instance
         assert isinstance(instance, WorkerInstance)
         question = instance._pickled("read")
-        os.write(instance._out, HEADER.pack(Question.CALL, 0, 77, len(question)) + question)
+        os.write(instance._outgoing, HEADER.pack(Question.CALL, 0, 77, len(question)) + question)
         with pytest.raises(errors.FmuWorkerError, match="wrote something else into it"):
             asset.step()
 
@@ -187,8 +187,8 @@ def twin(fmu: Path, binding: Binding, *lines: str) -> Iterator[subprocess.Popen[
     """A twin in another process that carries out these lines with its asset, and is killed in the end."""
     program = (
         "import json, sys\n"
-        "from fmu_asset.door.binding import parse_binding\n"
-        "from fmu_asset.door.session import FmiAsset\n"
+        "from fmu_asset.client.binding import parse_binding\n"
+        "from fmu_asset.client.session import FmiAsset\n"
         "asset = FmiAsset(sys.argv[1], parse_binding(json.loads(sys.argv[2])))\n"
     )
     told = json.dumps(binding.model_dump(exclude_none=True, mode="json"))
@@ -200,28 +200,28 @@ def twin(fmu: Path, binding: Binding, *lines: str) -> Iterator[subprocess.Popen[
             process.kill()
 
 
-def state_and_keeper(worker: int | None) -> tuple[str, int]:
+def state_and_supervisor(worker: int | None) -> tuple[str, int]:
     _, _, state, parent, *_ = Path(f"/proc/{worker}/stat").read_text().split()
     return state, int(parent)
 
 
-def kill_keeper(worker: int | None) -> None:
-    os.kill(state_and_keeper(worker)[1], signal.SIGKILL)
+def kill_supervisor(worker: int | None) -> None:
+    os.kill(state_and_supervisor(worker)[1], signal.SIGKILL)
 
 
 @pytest.mark.parametrize("end", ["(void)0", "hang()", "kill(getppid(),SIGKILL)"])
-def test_nothing_is_left_when_the_keeper_is_killed(hostile, scratch, end) -> None:
+def test_nothing_is_left_when_the_supervisor_is_killed(hostile, scratch, end) -> None:
     """The worker has cleared its parent-death signal, and what it has started is in a session of its own."""
     with hostile(f"ESCAPE={end}", binding=FREE, step_timeout=NEVER_ANSWERED) as asset:
         asset.step(), asset.step()
         if end == "hang()":
-            threading.Timer(0.3, kill_keeper, [asset.worker_process_id]).start()
+            threading.Timer(0.3, kill_supervisor, [asset.worker_process_id]).start()
             with pytest.raises(errors.FmuTimeoutError, match=r"longer than 5 s"):
                 asset.step()
         else:
             asset.step()
             if end == "(void)0":
-                kill_keeper(asset.worker_process_id)
+                kill_supervisor(asset.worker_process_id)
             assert asset.step().values[0] == 4.0
             await_processes(scratch, 1, 2)  # the worker, and mostly the process that has left it
     await_nothing(scratch)
@@ -230,22 +230,22 @@ def test_nothing_is_left_when_the_keeper_is_killed(hostile, scratch, end) -> Non
 ASKED = "asset.step(), asset.step()", "print(asset.worker_process_id, flush=True)"
 
 
-def test_nothing_is_left_when_twin_and_worker_end_before_the_keeper_looks(foreign_fmu, scratch) -> None:
+def test_nothing_is_left_when_twin_and_worker_end_before_the_supervisor_looks(foreign_fmu, scratch) -> None:
     with twin(foreign_fmu("hostile2"), HOSTILE, *ASKED, "sys.stdin.read()") as process:
         worker = int(process.stdout.readline())
-        _, keeper = state_and_keeper(worker)
-        os.kill(keeper, signal.SIGSTOP)
-    wait_until(lambda: state_and_keeper(worker)[0] == "Z")
-    os.kill(keeper, signal.SIGCONT)
+        _, supervisor = state_and_supervisor(worker)
+        os.kill(supervisor, signal.SIGSTOP)
+    wait_until(lambda: state_and_supervisor(worker)[0] == "Z")
+    os.kill(supervisor, signal.SIGCONT)
     await_nothing(scratch)
 
 
-def test_what_a_dead_twin_without_a_keeper_left_is_removed_by_the_next(foreign_fmu, scratch) -> None:
+def test_what_a_dead_twin_without_a_supervisor_left_is_removed_by_the_next(foreign_fmu, scratch) -> None:
     with twin(foreign_fmu("hostile2", "ESCAPE=hang()"), HOSTILE, *ASKED, "asset.step()") as process:
         worker = int(process.stdout.readline())
         await_processes(scratch, 3)
         os.kill(process.pid, signal.SIGSTOP)
-        kill_keeper(worker)
+        kill_supervisor(worker)
     await_processes(scratch, 2)
     (scratch / "somebody-else").mkdir()
     run_python("from fmu_asset.folders import plain_folder, remove_folder; remove_folder(plain_folder())")
@@ -260,7 +260,7 @@ def test_nothing_is_left_when_the_twin_is_killed_during_a_step(foreign_fmu, scra
         assert int(process.stdout.readline())
         if what == "START_PROCESS":
             assert process.stdout.readline() == b"fourth\n"
-            assert len(processes(scratch)) == 3  # with the keeper
+            assert len(processes(scratch)) == 3  # with the supervisor
     await_nothing(scratch)
 
 
@@ -303,7 +303,7 @@ def test_an_interruption_leaves_no_stale_answer(spring_mass, monkeypatch) -> Non
     with FmiAsset(spring_mass, SPRING_BINDING) as asset:
         expected = asset.step(PUSHED).values
         with monkeypatch.context() as patch:
-            patch.setattr("fmu_asset.worker.client.WorkerInstance._await", interrupt)
+            patch.setattr("fmu_asset.worker.client.WorkerInstance._wait_for_answer", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 asset.step({"push": 2.0})
         with pytest.raises(errors.FmuWorkerError, match="interrupted; reset the asset"):

@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 
-from fmu_asset.check import FmuCheck, check_fmu
-from fmu_asset.door.session import FmiAsset
+from fmu_asset.checks.fmu_check import FmuCheck, check_fmu
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.errors import FmuError
-from fmu_asset.worker.refusals import RefusalReport, RefusalTracer, watch_for_refusals
+from fmu_asset.worker.refusal_tracer import RefusalTracer
+from fmu_asset.worker.refusals import RefusalReport, watch_for_refusals
 from fmu_asset.worker.sandbox import landlock_version
-from tests.fmu_asset.door.kinds import HOSTILE, SPRING_BINDING
+from tests.fmu_asset.client.kinds import HOSTILE, SPRING_BINDING
 from tests.fmu_asset.making import changed
 from tests.fmu_asset.worker.test_hostile import ASKED, await_nothing, twin
 

@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 
 from fmu_asset import errors
+from fmu_asset.client import instance_host
+from fmu_asset.client.session import FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import Component
-from fmu_asset.door import placement
-from fmu_asset.door.session import FmiAsset
 from fmu_asset.folders import remove_folder
 from fmu_asset.worker.sandbox import landlock_version
-from tests.fmu_asset.door.kinds import BINDINGS_FOLDER, HOSTILE, SPRING_BINDING
+from tests.fmu_asset.client.kinds import BINDINGS_FOLDER, HOSTILE, SPRING_BINDING
 from tests.fmu_asset.making import ROOT, bound, changed, run_python, system
 from tests.fmu_asset.worker.test_hostile import MISBEHAVIOURS
 from twin_master.library.grid import SamplingGrid
@@ -194,7 +194,7 @@ def test_what_is_not_confined_is_said_once(foreign_fmu, caplog, monkeypatch) -> 
             with caplog.at_level(logging.WARNING), FmiAsset(fmu, binding):
                 pass
         said += caplog.messages
-        monkeypatch.setattr(placement, "landlock_version", lambda: 0)
+        monkeypatch.setattr(instance_host, "landlock_version", lambda: 0)
     assert said[0] == f"{fmu}: its binding turns the sandbox off, so that it has all rights of its user."
     assert said[1].startswith("This kernel has no Landlock (Linux 5.13 or later)")
     assert len(said) == 2

@@ -1,0 +1,1 @@
+"""Checks of an FMU: its file, and its behaviour when it runs."""

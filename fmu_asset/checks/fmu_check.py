@@ -1,0 +1,125 @@
+"""The check of an FMU: rules of the standard, rules of ours, and its behaviour."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.archive.fmu_file import read_fmu
+from fmu_asset.client.binding import Binding, load_binding
+from fmu_asset.client.experiment import whole_binding
+from fmu_asset.errors import BindingError, FmuError, visible
+from reporting.progress import Progress, reporter
+
+from .file_checks import check_file
+from .finding import Finding
+from .run_checks import RUN_STEPS, RunChecks
+
+
+@dataclass(frozen=True)
+class FmuCheck:
+    """All checks of one FMU.
+
+    Attributes
+    ----------
+    path : Path
+        The FMU.
+    findings : tuple of Finding
+        Findings in the order in which they were made.
+    """
+
+    path: Path
+    findings: tuple[Finding, ...]
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """One sentence for each problem; empty if nothing is wrong."""
+        return tuple(finding.text for finding in self.findings if finding.verdict == "problem")
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.problems
+
+
+def check_fmu(
+    path: str | os.PathLike[str],
+    binding: Binding | str | os.PathLike[str] | None = None,
+    *,
+    cycles: int = 0,
+    step_size: float | None = None,
+    step_timeout: float | None = None,
+    memory_limit: float | None = None,
+    progress: Progress | None = None,
+) -> FmuCheck:
+    """Check an FMU: its file, `fmpy validate`, its units, and its behaviour in workers.
+
+    Parameters
+    ----------
+    path : path-like
+        Any FMU.
+    binding : Binding or path-like, optional
+        How it is run; drafted from the model description if absent.
+    cycles : int
+        Number of instances that are made and freed one after the other in one process; 0 skips
+        that check.
+    step_size : float, optional
+        Communication step size of a drafted binding [s].
+    step_timeout, memory_limit : float, optional
+        Limits of the workers, as in `FmiAsset`.
+    progress : Progress, optional
+        Where progress is shown.
+
+    Raises
+    ------
+    FmuFileError, FmuUnsupportedError
+        If there is no FMU to check.
+    BindingError
+        If the binding file cannot be read.
+    """
+    if binding is not None and not isinstance(binding, Binding):
+        binding = load_binding(binding)
+    description = read_fmu(path, None if binding is None else binding.binding.interface)
+    findings = list(check_file(description))
+    try:
+        used_binding = binding or drafted_binding(description, step_size)
+        runs = RunChecks(description, used_binding, step_timeout, memory_limit)
+    except FmuError as error:
+        text = error.sentence
+        if binding is None and isinstance(error, BindingError):
+            text = f"No binding can be drafted for it: {text}"
+        findings.append(Finding("binding", "problem", text))
+    else:
+        text = "Drafted; give --binding to check your own."
+        if binding is not None:
+            text = f"{binding.name} fits."
+        findings.append(Finding("binding", "ok", text))
+        findings += runs.findings(cycles, reporter(progress))
+    # names of an FMU may hold control characters
+    printable = tuple(
+        Finding(entry.check, entry.verdict, visible(entry.text)) for entry in findings
+    )
+    return FmuCheck(description.path, printable)
+
+
+def drafted_binding(description: FmuDescription, step_size: float | None) -> Binding:
+    """Return a binding of the whole FMU, with the FMU's end unless the checks run beyond it.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    step_size : float or None
+        Communication step size [s]; the FMU's own if None.
+
+    Raises
+    ------
+    BindingError
+        If the FMU has no number to observe.
+    """
+    binding = whole_binding(description, step_size=step_size)
+    end = description.stop_time
+    end_of_checks = binding.binding.start_time + RUN_STEPS * binding.interval
+    if end is None or end < end_of_checks:
+        return binding
+    return binding.with_header(stop_time=end)

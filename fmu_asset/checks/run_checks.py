@@ -1,0 +1,336 @@
+"""Checks of an FMU's behaviour: it runs repeatedly, resumed, at other steps, and at the edges."""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+
+import numpy as np
+
+from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.client.binding import INPUT_ROLES, Binding
+from fmu_asset.client.bound_variables import InputBinding
+from fmu_asset.client.layout import VariableElements, find_variable
+from fmu_asset.client.saved_state import partial_state_sentence
+from fmu_asset.client.session import FmiAsset
+from fmu_asset.client.values import Value
+from fmu_asset.errors import FmuCallError, FmuError
+from fmu_asset.worker.refusals import watch_for_refusals
+from fmu_asset.worker.sandbox import landlock_version
+from reporting.arrays import Float
+from reporting.progress import Progress
+
+from .finding import CheckResult, Finding, one_line
+
+RUN_STEPS = 6
+"""Steps of a run."""
+_STEPS_BEFORE_SAVING = 2
+_EQUAL = 1e-9
+"""Change of the outputs with half the step, as a share of the largest, that counts as none."""
+_CLOSE = 0.02
+"""Change above which a smaller step is advised."""
+_FAR = 0.5
+"""Change above which the FMU probably counts steps instead of time."""
+_LARGEST_TRIED_LIMIT = 1e9
+"""Limits of ranges are tried if they are smaller."""
+_KIBIBYTE = 1024
+_SMALL_GROWTH = 1.0
+"""Growth of memory by an instance that is no leak [KiB]; allocators keep some memory."""
+_LARGE_GROWTH = 16.0
+"""Growth of memory by an instance that is a leak [KiB]."""
+_MEMORY_NOISE = 1024 * _KIBIBYTE
+"""Growth of memory in all that is no leak [bytes]."""
+
+RunInputs = dict[str, dict[str, Value]]
+"""Inputs by role and name."""
+
+
+class RunChecks:
+    """Checks of an FMU that run it with one binding, each run in a worker of its own.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    binding : Binding
+        The binding.
+    step_timeout, memory_limit : float or None
+        Limits of the workers, as in `FmiAsset`.
+
+    Raises
+    ------
+    FmuError
+        If the binding does not fit the FMU.
+    """
+
+    def __init__(
+        self,
+        description: FmuDescription,
+        binding: Binding,
+        step_timeout: float | None,
+        memory_limit: float | None,
+    ) -> None:
+        self._path = description.path
+        self._binding = binding
+        self._step_timeout = step_timeout
+        self._memory_limit = memory_limit
+        # fails if the binding does not fit, before anything is started
+        self._description = self._asset(binding).description
+        self._base_inputs = self._inputs_without_start_values()
+
+    def findings(self, cycles: int, progress: Progress) -> Iterator[Finding]:
+        """Yield all findings; without a successful first run the other checks are skipped.
+
+        Parameters
+        ----------
+        cycles : int
+            Number of instances that are made one after the other; 0 skips that check.
+        progress : Progress
+            Where progress is shown.
+        """
+        checks: dict[str, Callable[[], CheckResult]] = {
+            "determinism": self._check_determinism,
+            "state": self._check_state,
+            "step size": self._check_step_size,
+            "range edges": self._check_range_edges,
+            "reset": self._check_reset,
+        }
+        try:
+            self._first_outputs = self._run()
+        except FmuError as error:
+            yield Finding("first flight", "problem", one_line(error))
+            yield self._check_sandbox().named("sandbox")
+            for name in [*checks, "instances"]:
+                yield Finding(name, "skipped", "It does not fly.")
+            return
+        count = self._first_outputs.shape[1]
+        text = f"{RUN_STEPS} steps of {self._binding.interval:g} s, {count} finite outputs."
+        yield Finding("first flight", "ok", text)
+        yield self._check_sandbox().named("sandbox")
+        for name, check in checks.items():
+            with progress.stage(f"Checking {name}"):
+                try:
+                    yield check().named(name)
+                except FmuError as error:
+                    yield Finding(name, "problem", one_line(error))
+        if cycles:
+            yield self._check_instances(cycles, progress).named("instances")
+
+    # ------------------------------------------------------------------ runs
+
+    def _asset(self, binding: Binding | None = None) -> FmiAsset:
+        """Return a new asset of the FMU; with the binding of the checks if none is given."""
+        return FmiAsset(
+            self._path,
+            self._binding if binding is None else binding,
+            step_timeout=self._step_timeout,
+            memory_limit=self._memory_limit,
+        )
+
+    def _inputs_without_start_values(self) -> RunInputs:
+        """Return zeros for arrays that were resized and have no start values that fit."""
+        base: RunInputs = {role: {} for role in INPUT_ROLES}
+        if not self._binding.binding.structural_parameters:
+            return base
+        for role in INPUT_ROLES:
+            for name, input_binding in self._binding.inputs(role).items():
+                selection = self._find_input(role, name, input_binding)
+                start_count = len((selection.variable.start or "0").split())
+                if start_count not in (1, selection.variable.size):
+                    base[role][name] = [0.0] * len(selection.elements)
+        return base
+
+    def _find_input(self, role: str, name: str, input_binding: InputBinding) -> VariableElements:
+        return find_variable(self._description, input_binding.variable, f"{role}.{name}", "input")
+
+    def _run(self) -> Float:
+        """Return the outputs (N, n) of a run in a new worker, from start values."""
+        with closing(self._asset()) as asset:
+            return self._run_from_start(asset)
+
+    def _run_from_start(self, asset: FmiAsset) -> Float:
+        """Return the outputs (N, n) of an asset after a reset to its start values."""
+        asset.reset(**self._base_inputs)
+        return _outputs_of_steps(asset, RUN_STEPS)
+
+    # ------------------------------------------------------------------ checks
+
+    def _check_sandbox(self) -> CheckResult:
+        """Run once more, and count what the sandbox refuses until the run ends or fails."""
+        if not (self._binding.limits.sandbox and landlock_version()):
+            text = "There is no sandbox: the binding turns it off, or the kernel has none."
+            return CheckResult("skipped", text)
+        with watch_for_refusals() as report:
+            with suppress(FmuError):
+                self._run()
+            return CheckResult(report.verdict(), report.sentence())
+
+    def _check_determinism(self) -> CheckResult:
+        """Compare two runs in two processes."""
+        outputs = self._run()
+        if outputs.tobytes() == self._first_outputs.tobytes():
+            return CheckResult("ok", "Two flights in two processes are equal to the bit.")
+        difference = _first_difference(self._first_outputs, outputs)
+        text = (
+            f"Two flights with the same inputs differ ({difference}): runs of it are not "
+            "reproducible, and a state cannot be replayed."
+        )
+        return CheckResult("problem", text)
+
+    def _check_state(self) -> CheckResult:
+        """Compare a run with one that goes on from a saved state in a new process."""
+        steps_after = RUN_STEPS - _STEPS_BEFORE_SAVING
+        with closing(self._asset()) as asset:
+            asset.reset(**self._base_inputs)
+            _outputs_of_steps(asset, _STEPS_BEFORE_SAVING)
+            state = asset.save_state()
+            method = asset.state_method
+            expected = _outputs_of_steps(asset, steps_after)
+        with closing(self._asset()) as other:
+            other.restore_state(state)
+            resumed = _outputs_of_steps(other, steps_after)
+        if resumed.tobytes() != expected.tobytes():
+            cause = "its outputs are not a function of its inputs"
+            if method == "serialised":
+                cause = partial_state_sentence("keeps part of its state elsewhere")
+            text = (
+                "A flight that goes on from a saved state in a new process differs from the one "
+                f"that was not interrupted ({_first_difference(expected, resumed)}): {cause}."
+            )
+            return CheckResult("problem", text)
+        if method == "serialised":
+            text = f"Saved ({len(state)} bytes), restored in a new process, equal to the bit."
+            return CheckResult("ok", text)
+        text = (
+            "Its state cannot be serialised; a mission is resumed by replaying the inputs, which "
+            "is equal to the bit here."
+        )
+        return CheckResult("warning", text)
+
+    def _check_step_size(self) -> CheckResult:
+        """Compare a run with one of half the step size."""
+        header = self._binding.binding
+        half = header.step_size / 2.0
+        binding = self._binding.with_header(step_size=half, decimation=2 * header.decimation)
+        with closing(self._asset(binding)) as asset:
+            try:
+                outputs = self._run_from_start(asset)
+            except FmuCallError as error:
+                return self._refused_step(half, error)
+        largest = max(float(np.abs(self._first_outputs).max(initial=0.0)), 1e-300)
+        change = float(np.abs(outputs - self._first_outputs).max(initial=0.0)) / largest
+        if change <= _EQUAL:
+            return CheckResult("ok", "Half the step size gives the same outputs.")
+        advice = ""
+        if change > _FAR:
+            advice = "; it counts steps rather than time, or the step is far too large"
+        elif change > _CLOSE:
+            advice = "; choose a smaller one"
+        text = (
+            f"Half the step size changes the outputs by {100.0 * change:.2g} % of the "
+            f"largest{advice}."
+        )
+        return CheckResult("warning" if advice else "ok", text)
+
+    def _refused_step(self, step: float, error: FmuCallError) -> CheckResult:
+        """Return the result for an FMU that refuses a step size [s] with an error."""
+        if self._description.can_vary_step:
+            text = f"It declares that it takes any step size, but not {step:g} s: {one_line(error)}"
+            return CheckResult("problem", text)
+        text = (
+            f"It takes {self._binding.binding.step_size:g} s only; `decimation` observes every "
+            "n-th step."
+        )
+        return CheckResult("warning", text)
+
+    def _check_range_edges(self) -> CheckResult:
+        """Make one step at each limit of the range of each input."""
+        tried = 0
+        failures = []
+        with closing(self._asset()) as asset:
+            for role in INPUT_ROLES:
+                for name, input_binding in self._binding.inputs(role).items():
+                    if len(self._find_input(role, name, input_binding).elements) != 1:
+                        continue
+                    for value in asset.input_range(role, name):
+                        if abs(value) >= _LARGEST_TRIED_LIMIT:
+                            continue
+                        tried += 1
+                        try:
+                            self._step_with(asset, role, name, value)
+                        except FmuError as error:
+                            limit = f"{input_binding.variable} = {value:g} {input_binding.unit}"
+                            failures.append(f"{limit}: {one_line(error)}")
+        if failures:
+            text = f"{len(failures)} of {tried} ends of ranges fail, such as {failures[0]}"
+            return CheckResult("warning", text)
+        if tried:
+            return CheckResult("ok", f"{tried} ends of ranges give finite outputs.")
+        return CheckResult("skipped", "No input has a range.")
+
+    def _step_with(self, asset: FmiAsset, role: str, name: str, value: float) -> None:
+        """Make the first step with a value of one input."""
+        inputs = self._base_inputs | {role: self._base_inputs[role] | {name: value}}
+        asset.reset(**self._base_inputs)
+        asset.step(**inputs)
+
+    def _check_reset(self) -> CheckResult:
+        """Compare a run with one after a reset."""
+        with closing(self._asset()) as asset:
+            outputs = self._run_from_start(asset)
+            outputs_again = self._run_from_start(asset)
+            trial = asset.reset_trial
+        if not np.array_equal(outputs, outputs_again):
+            difference = _first_difference(outputs, outputs_again)
+            return CheckResult("problem", f"Started again it is not as new ({difference}).")
+        if trial.works is False:
+            return CheckResult("problem" if trial.lies else "warning", trial.fault)
+        return CheckResult("ok", "After a reset it is as new.")
+
+    def _check_instances(self, cycles: int, progress: Progress) -> CheckResult:
+        """Make, step and free instances in one process, and look at its memory."""
+        half_way = cycles // 2
+        number = 0
+        memory_half_way = 0
+        try:
+            asset = self._asset()
+            stage_of_progress = progress.stage("Making instances", cycles, "instances")
+            with closing(asset), stage_of_progress as stage:
+                asset.reset(**self._base_inputs)
+                for number in range(cycles):
+                    if number == half_way:
+                        memory_half_way = asset.worker_memory or 0
+                    asset.renew(**self._base_inputs)
+                    asset.step()
+                    stage.advance()
+                memory_at_end = asset.worker_memory or 0
+        except FmuError as error:
+            text = f"Instance {number + 1} of {cycles} in one process: {one_line(error)}"
+            return CheckResult("problem", text)
+        # the second half only: the first may fill caches
+        growth = memory_at_end - memory_half_way
+        growth_of_each = growth / _KIBIBYTE / max(cycles - half_way, 1)
+        text = (
+            f"{cycles} made and freed in one process; it grows by {max(growth_of_each, 0.0):.2g} "
+            "KiB with each"
+        )
+        if growth < _MEMORY_NOISE or growth_of_each <= _SMALL_GROWTH:
+            return CheckResult("ok", f"{text}.")
+        if growth_of_each > _LARGE_GROWTH:
+            return CheckResult("problem", f"{text}: it leaks.")
+        return CheckResult("warning", f"{text}: it leaks a little.")
+
+
+def _outputs_of_steps(asset: FmiAsset, steps: int) -> Float:
+    """Return the outputs (N, n) of steps with the inputs as they are."""
+    rows = []
+    for _ in range(steps):
+        observation = asset.step()
+        rows.append([*observation.values.tolist(), *observation.extra.values()])
+    return np.array(rows)
+
+
+def _first_difference(first: Float, second: Float) -> str:
+    """Return the values where two arrays differ first, in words."""
+    # by their bits: 0.0 and -0.0 are equal numbers
+    differs = first.ravel().view(np.uint64) != second.ravel().view(np.uint64)
+    position = np.flatnonzero(differs)[0]
+    return f"first ({float(first.flat[position])!r}), then ({float(second.flat[position])!r})"

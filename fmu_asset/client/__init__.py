@@ -1,0 +1,1 @@
+"""The client of any FMU: `FmiAsset`, bindings, units, runs and states."""

@@ -1,0 +1,328 @@
+"""Binding files: the role of each variable of an FMU, and the unit in which the caller states it.
+
+A binding knows roles, not wings. It is TOML:
+
+```toml
+[binding]
+name = "uav_wing"
+step_size = 1.0            # s
+
+[control.load_factor]      # what a policy chooses
+variable = "load_factor"
+unit = "1"
+
+[observation.strain]       # what is measured; a list, or a pattern
+variables = "strain[{1..24}]"
+unit = "1"
+```
+
+The other roles are `health` (the state of damage), `load` (other inputs), `parameter` (set before
+the first step, optionally with a `value` here), `monitor` (further scalars to be recorded) and
+`port` (force, displacement and velocity where another FMU can be coupled). `[record]` names
+variables to be recorded in the FMU's own units, and `[limits]` says what the FMU's worker may take.
+"""
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field
+
+from fmu_asset.errors import BindingError
+from fmu_asset.instances.plan import Interface
+from fmu_asset.worker.client import WorkerLimits
+from reporting.choices import require_one_of
+from reporting.toml_file import Fault, Number, Positive, Section, read_toml, validate
+from reporting.words import comma_list
+
+from .bound_variables import (
+    InputBinding,
+    ParameterBinding,
+    PortBinding,
+    RecordBinding,
+    ScalarBinding,
+    VectorBinding,
+)
+
+INPUT_ROLES = ("control", "health", "load")
+"""Roles of inputs that are sent at every step, in this order; ports follow."""
+
+StandardVersion = Literal["1.0", "2.0", "3.0"]
+"""Version of FMI that a binding asks for."""
+
+StateChoice = Literal["auto", "serialised", "replay"]
+"""How `save_state` keeps the state; auto trusts what the FMU declares."""
+
+Interpolation = Literal["zero-order", "linear"]
+"""Course of inputs between communication points."""
+
+_Text = Annotated[str, Field(min_length=1)]
+
+_HEADER_WORDS: Mapping[str, tuple[str | None, ...]] = {
+    "fmi_version": (*get_args(StandardVersion), None),
+    "interface": (*get_args(Interface), None),
+    "interpolation": get_args(Interpolation),
+    "state": get_args(StateChoice),
+}
+"""Words that the table `[binding]` may hold, by key."""
+
+
+class BindingHeader(Section):
+    """The table `[binding]`.
+
+    Attributes
+    ----------
+    name : str
+        Name of the binding.
+    step_size : float
+        Communication step of the FMU [s].
+    decimation : int
+        Communication steps between two observations; the inputs are held meanwhile.
+    start_time : float
+        Start of the FMU [s].
+    stop_time : float, optional
+        End of the experiment that the FMU is told at its start [s]; some do not start without one.
+        The asset itself does not stop there.
+    fmi_version : {"1.0", "2.0", "3.0"}, optional
+        Version of FMI that the FMU must have; any if absent.
+    interface : {"co-simulation", "model-exchange"}, optional
+        Interface by which it is run; co-simulation if it offers that.
+    tolerance : float, optional
+        Relative tolerance of the FMU's solver, and of ours in model exchange; if absent, the one
+        that the FMU declares for its default experiment (ours is never looser than 1e-6 then).
+    interpolation : {"zero-order", "linear"}
+        Course of inputs between communication points: held, or, where the FMU can follow and both
+        ends are continuous, in a straight line to the value given for a step, which they reach at
+        its end.
+    structural_parameters : dict of str to float
+        Structural parameters (FMI 3) by their names in the FMU; arrays have the sizes that follow.
+    state : {"auto", "serialised", "replay"}
+        How `save_state` keeps the state; auto trusts what the FMU declares.
+    description : str
+        A line for people.
+    """
+
+    name: _Text
+    step_size: Positive
+    decimation: int = Field(default=1, ge=1, le=10_000_000)
+    start_time: Number = 0.0
+    stop_time: Number | None = None
+    fmi_version: StandardVersion | None = None
+    interface: Interface | None = None
+    tolerance: Positive | None = None
+    interpolation: Interpolation = "zero-order"
+    structural_parameters: dict[str, Number] = Field(default_factory=dict)
+    state: StateChoice = "auto"
+    description: str = ""
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield an end that does not come after the start."""
+        if self.stop_time is not None:
+            sentence = (
+                f"stop_time {self.stop_time:g} s must come after start_time {self.start_time:g} s"
+            )
+            yield self.stop_time <= self.start_time, sentence
+
+
+class Binding(Section):
+    """A whole binding file.
+
+    Attributes
+    ----------
+    binding : BindingHeader
+        Name, FMI version, step size.
+    control, health, load : dict of str to InputBinding
+        Inputs by role and by the caller's name.
+    observation : dict of str to VectorBinding
+        What is measured, in order.
+    parameter : dict of str to ParameterBinding
+        Parameters by the caller's name.
+    monitor : dict of str to ScalarBinding
+        Further scalars to be recorded.
+    port : dict of str to PortBinding
+        Where other FMUs can be coupled.
+    record : RecordBinding
+        Further variables to be recorded, in the FMU's units.
+    limits : WorkerLimits
+        What the worker may take.
+    """
+
+    binding: BindingHeader
+    control: dict[str, InputBinding] = Field(default_factory=dict)
+    health: dict[str, InputBinding] = Field(default_factory=dict)
+    load: dict[str, InputBinding] = Field(default_factory=dict)
+    observation: dict[str, VectorBinding] = Field(default_factory=dict)
+    parameter: dict[str, ParameterBinding] = Field(default_factory=dict)
+    monitor: dict[str, ScalarBinding] = Field(default_factory=dict)
+    port: dict[str, PortBinding] = Field(default_factory=dict)
+    record: RecordBinding = Field(default_factory=RecordBinding)
+    limits: WorkerLimits = Field(default_factory=WorkerLimits)
+
+    @property
+    def name(self) -> str:
+        """Name of the binding."""
+        return self.binding.name
+
+    @property
+    def step_size(self) -> float:
+        """Communication step size [s]."""
+        return self.binding.step_size
+
+    @property
+    def interval(self) -> float:
+        """Time between two observations [s]."""
+        return self.binding.step_size * self.binding.decimation
+
+    def inputs(self, role: str) -> Mapping[str, InputBinding]:
+        """Return the variables of one of `INPUT_ROLES` by the caller's names."""
+        table: Mapping[str, InputBinding] = getattr(self, role)
+        return table
+
+    @property
+    def observation_variables(self) -> tuple[str, ...]:
+        """FMU variables of all observations, in the order of `Observation.values`."""
+        return tuple(name for vector in self.observation.values() for name in vector.variables)
+
+    def observation_slice(self, name: str) -> slice:
+        """Return the positions of an observation in `Observation.values`.
+
+        Parameters
+        ----------
+        name : str
+            Name of the observation in the binding.
+
+        Raises
+        ------
+        BindingError
+            If the binding has no such observation.
+        """
+        begin = 0
+        for key, vector in self.observation.items():
+            end = begin + len(vector.variables)
+            if key == name:
+                return slice(begin, end)
+            begin = end
+        raise BindingError(
+            f"The binding {self.name} has no observation {name!r}; it has "
+            f"{comma_list(self.observation)}."
+        )
+
+    def with_header(self, **changes: object) -> "Binding":
+        """Return the binding with other values in its table `[binding]`; only words are checked.
+
+        Parameters
+        ----------
+        **changes : object
+            New values by key.
+
+        Raises
+        ------
+        InvalidChoiceError
+            If a word is none of those that the table may hold.
+        """
+        for name, allowed in _HEADER_WORDS.items():
+            if name in changes:
+                require_one_of(changes[name], allowed, name)
+        header = self.binding.model_copy(update=changes)
+        return self.model_copy(update={"binding": header})
+
+    def with_regions(self, regions: Sequence[str]) -> "Binding":
+        """Return the binding for a wing with these damage regions: their health inputs, no others.
+
+        An input that the binding has for a region stays as it is; the others are called as their
+        regions.
+
+        Parameters
+        ----------
+        regions : sequence of str
+            Names of the regions.
+        """
+        names_in_binding = {entry.variable: name for name, entry in self.health.items()}
+        health = {}
+        for region in regions:
+            variable = f"health.{region}"
+            name = names_in_binding.get(variable)
+            if name is None:
+                health[region] = InputBinding(variable=variable, unit="1")
+            else:
+                health[name] = self.health[name]
+        return self.model_copy(update={"health": health})
+
+    def with_arrays(self, elements: Callable[[str], Sequence[str]]) -> "Binding":
+        """Return the binding with every observed or recorded array replaced by its elements.
+
+        Parameters
+        ----------
+        elements : callable
+            Returns the names of the elements of a variable; the name itself for a scalar.
+        """
+        monitor = {}
+        for key, scalar in self.monitor.items():
+            names = elements(scalar.variable)
+            for number, name in enumerate(names, 1):
+                label = key if len(names) == 1 else f"{key}[{number}]"
+                monitor[label] = scalar.model_copy(update={"variable": name})
+        recorded: list[str] = []
+        for name in self.record.variables:
+            recorded += elements(name)
+        observation = {key: vector.by_element(elements) for key, vector in self.observation.items()}
+        return self.model_copy(
+            update={
+                "observation": observation,
+                "monitor": monitor,
+                "port": {key: port.by_element(elements) for key, port in self.port.items()},
+                "record": self.record.model_copy(update={"variables": tuple(recorded)}),
+            }
+        )
+
+
+def load_binding(path: str | os.PathLike[str]) -> Binding:
+    """Read and check a binding file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Raises
+    ------
+    BindingError
+        If the file is missing, not TOML, has an unknown or missing key or a wrong type, or maps one
+        FMU variable to two inputs.
+    """
+    content = read_toml(os.fspath(path), BindingError, what="binding file")
+    return parse_binding(content, where=str(path))
+
+
+def parse_binding(content: Mapping[str, object], *, where: str = "the binding") -> Binding:
+    """Return the binding in the content of a TOML file, checked.
+
+    Parameters
+    ----------
+    content : mapping of str to object
+        The content.
+    where : str
+        Where it comes from, for messages.
+
+    Raises
+    ------
+    BindingError
+        As `load_binding`.
+    """
+    binding = validate(Binding, dict(content), where, BindingError, what="a binding")
+    if not binding.observation:
+        raise BindingError(
+            f"In {where}, there is no [observation.<name>] table; say what is measured."
+        )
+    user_of_variable: dict[str, str] = {}
+    for role in (*INPUT_ROLES, "parameter"):
+        table: Mapping[str, ScalarBinding] = getattr(binding, role)
+        for key, scalar in table.items():
+            label = f"{role}.{key}"
+            if scalar.variable in user_of_variable:
+                raise BindingError(
+                    f"In {where}, the FMU variable {scalar.variable!r} is set by both "
+                    f"{user_of_variable[scalar.variable]} and {label}; keep one."
+                )
+            user_of_variable[scalar.variable] = label
+    return binding

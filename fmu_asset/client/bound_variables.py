@@ -1,0 +1,207 @@
+"""Tables of a binding that name variables of an FMU: inputs, parameters, vectors and ports."""
+
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, Self
+
+from pydantic import BeforeValidator, Field
+
+from reporting.toml_file import Fault, Number, Section
+
+from .units import same_dimension
+
+PORT_QUANTITIES = {
+    "force": ("N", "N.m"),
+    "displacement": ("m", "rad"),
+    "velocity": ("m/s", "rad/s"),
+}
+"""Quantities of a mechanical port, with their units for translation and for rotation."""
+
+_RANGE = re.compile(r"\{(\d+)\.\.(\d+)\}")
+_LARGEST_PATTERN = 100_000
+
+_Text = Annotated[str, Field(min_length=1)]
+_Texts = Annotated[tuple[_Text, ...], Field(strict=False)]
+
+
+def _with_expanded_patterns(names: object) -> object:
+    """Return the names in a text or in a list of texts, with patterns expanded.
+
+    Anything else is returned as it is, for pydantic to refuse.
+    """
+    if isinstance(names, str):
+        return expand(names)
+    if not isinstance(names, list):
+        return names
+    expanded: list[object] = []
+    for name in names:
+        if isinstance(name, str):
+            expanded += expand(name)
+        else:
+            expanded.append(name)
+    return tuple(expanded)
+
+
+def expand(pattern: str) -> tuple[str, ...]:
+    """Return the names for which a pattern stands: `a[{1..3}]` is a[1], a[2], a[3].
+
+    Parameters
+    ----------
+    pattern : str
+        A name, with at most one range in braces.
+
+    Raises
+    ------
+    ValueError
+        If a range is empty or too long, or there is more than one.
+    """
+    ranges = _RANGE.findall(pattern)
+    if not ranges:
+        return (pattern,)
+    if len(ranges) > 1:
+        raise ValueError(f"the pattern {pattern!r} has more than one range")
+    first_text, last_text = ranges[0]
+    first = int(first_text)
+    last = int(last_text)
+    if not first <= last or last - first >= _LARGEST_PATTERN:
+        raise ValueError(f"the range of {pattern!r} is empty or longer than {_LARGEST_PATTERN}")
+    return tuple(_RANGE.sub(str(number), pattern) for number in range(first, last + 1))
+
+
+_Names = Annotated[tuple[_Text, ...], BeforeValidator(_with_expanded_patterns)]
+
+
+class ScalarBinding(Section):
+    """One variable: its name in the FMU, and the unit in which the caller gives or takes it.
+
+    The name is that of a scalar, of one element of an FMI 3 array (`p[3]`, `a[2,1]`; from 1), or of
+    a whole array, which takes as many values.
+    """
+
+    variable: _Text
+    unit: _Text
+
+
+class InputBinding(ScalarBinding):
+    """An input with a range of its own, in `unit`, within that of the FMU."""
+
+    minimum: Number | None = None
+    maximum: Number | None = None
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield a minimum above the maximum."""
+        if self.minimum is not None and self.maximum is not None:
+            sentence = f"minimum {self.minimum:g} is larger than maximum {self.maximum:g}"
+            yield self.minimum > self.maximum, sentence
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """The range in `unit`, infinite where no limit is stated."""
+        low = -math.inf if self.minimum is None else self.minimum
+        high = math.inf if self.maximum is None else self.maximum
+        return low, high
+
+
+class ParameterBinding(InputBinding):
+    """A parameter; `value`, in `unit`, is set at every reset unless the caller gives another.
+
+    The value is a text for a text parameter (of the unit "1"), and may be the name of an item of an
+    enumeration.
+    """
+
+    value: Number | str | None = None
+
+
+class VectorBinding(Section):
+    """Several variables in order; a text with `{a..b}` stands for all numbers from a to b.
+
+    `unit` is one for all variables, or one for each.
+    """
+
+    variables: Annotated[_Names, Field(min_length=1)]
+    unit: _Text | _Texts
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each variable."""
+        if isinstance(self.unit, str):
+            return (self.unit,) * len(self.variables)
+        return self.unit
+
+    def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
+        """Return the vector with each array replaced by its elements.
+
+        Parameters
+        ----------
+        elements : callable
+            Returns the names of the elements of a variable; the name itself for a scalar.
+        """
+        names: list[str] = []
+        units: list[str] = []
+        for name, unit in zip(self.variables, self.units, strict=True):
+            element_names = elements(name)
+            names += element_names
+            units += [unit] * len(element_names)
+        unit_of_vector = self.unit if isinstance(self.unit, str) else tuple(units)
+        return self.model_copy(update={"variables": tuple(names), "unit": unit_of_vector})
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield units that are neither one nor as many as variables."""
+        count = len(self.variables)
+        unit_count = len(self.units)
+        yield (
+            unit_count != count,
+            f"`unit` must be one text, or one for each of the {count} variables, and {unit_count} "
+            "came",
+        )
+
+
+class PortBinding(Section):
+    """A mechanical port, where another FMU can be coupled.
+
+    Force and motion go opposite ways: an FMU takes the force and gives displacement or velocity, or
+    the other way round. Inputs are given to `FmiAsset.step` as `port={"<name>.force": ...}`,
+    outputs are in `Observation.extra` under the same names.
+    """
+
+    force: VectorBinding
+    displacement: VectorBinding | None = None
+    velocity: VectorBinding | None = None
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield a port without motion, and units that it cannot have."""
+        has_motion = self.displacement is not None or self.velocity is not None
+        yield not has_motion, "a port needs a displacement or a velocity beside its force"
+        for name, vector in self.quantities.items():
+            unit = vector.unit
+            if isinstance(unit, tuple):
+                yield True, f"{name} must have one unit, and {len(unit)} came"
+                continue
+            units = PORT_QUANTITIES[name]
+            # a unit that is not understood (None) is accepted
+            is_wrong = all(same_dimension(unit, allowed) is False for allowed in units)
+            yield is_wrong, f"{name} is in {unit!r}, but must be in {' or '.join(units)}"
+
+    @property
+    def quantities(self) -> dict[str, VectorBinding]:
+        """The quantities that the port has, in the order of `PORT_QUANTITIES`."""
+        vectors = {
+            "force": self.force,
+            "displacement": self.displacement,
+            "velocity": self.velocity,
+        }
+        return {name: vector for name, vector in vectors.items() if vector is not None}
+
+    def by_element(self, elements: Callable[[str], Sequence[str]]) -> Self:
+        """Return the port with each array replaced by its elements; see `VectorBinding`."""
+        changed = {}
+        for name, vector in self.quantities.items():
+            changed[name] = vector.by_element(elements)
+        return self.model_copy(update=changed)
+
+
+class RecordBinding(Section):
+    """The table `[record]`: further variables to be recorded, in the FMU's own units."""
+
+    variables: _Names = ()

@@ -1,0 +1,260 @@
+"""A first binding for an FMU without one: roles guessed from causality, names and units."""
+
+import re
+import tomllib
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+from fmu_asset.archive.declared import FLOAT_KINDS, FmuDescription, VariableInfo
+from fmu_asset.description import rendered
+from fmu_asset.errors import BindingError
+
+from .binding import parse_binding
+from .bound_variables import PORT_QUANTITIES
+from .exchange import Exchange
+from .units import same_dimension
+
+_HEALTH = re.compile(r"health|damage|wear|foul|crack|degrad|fault|stiffness_?loss", re.IGNORECASE)
+_LOAD = re.compile(
+    r"load(?!_?factor)|force|torque|moment|press|ambient|outside|disturb|wind|gust|weight",
+    re.IGNORECASE,
+)
+_LOAD_UNITS = ("N", "N.m", "Pa", "N/m")
+_AUXILIARY = re.compile(r"status|error|bound|count|iteration|frequency|ratio", re.IGNORECASE)
+_PORT = re.compile(
+    r"(?P<stem>.*?)[._ ]?(?P<quantity>force|displacement|velocity)(?P<index>\[\d+\])?",
+    re.IGNORECASE,
+)
+_NUMBERED = re.compile(r"(?P<stem>.*\D|)(?P<number>\d{1,9})(?P<tail>\D*)", re.DOTALL)
+_INTERNAL = ("local", "calculatedParameter", "none")
+_PATTERN = re.compile(r"\{\d+\.\.\d+\}")
+
+PortVariables = dict[str, VariableInfo]
+"""Variables of a port by quantity."""
+
+
+def draft_binding(description: FmuDescription, *, step_size: float | None = None) -> str:
+    """Return a binding file for an FMU, to be corrected by somebody who knows its model.
+
+    Inputs are controls, unless their name or unit indicates health or load. Real outputs are
+    observations, numbered ones together; other outputs are recorded beside them. A force input with
+    a displacement or velocity output of the same stem becomes a port. The text is checked against
+    the FMU before it is returned.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    step_size : float, optional
+        Communication step size [s]; that of the FMU's default experiment, or 1.
+
+    Raises
+    ------
+    BindingError
+        If the FMU has no number to observe.
+    """
+    usable = [variable for variable in description.variables if bindable(variable)]
+    observed = _variables_to_observe(description, usable)
+    ports = _ports([v for v in usable if v.causality in ("input", "output")])
+    port_names = {variable.name for port in ports.values() for variable in port.values()}
+    inputs = [v for v in usable if v.causality == "input" and v.name not in port_names]
+    parameters = [v for v in usable if v.causality == "parameter" and v.variability != "constant"]
+    observed_names = {variable.name for variable in observed}
+    recorded = [v for v in usable if v.causality == "output" and v.name not in observed_names]
+    usable_names = {variable.name for variable in usable}
+    keys = _TableKeys()
+    text = rendered(
+        "draft.toml",
+        fmu=description,
+        name=keys.key("binding", description.model_name),
+        step_size=description.step_of(step_size),
+        inputs=[(_role(v), keys.key(_role(v), v.name), v) for v in inputs],
+        observed=[(keys.key("observation", _stem(group)), group) for group in _groups(observed)],
+        parameters=[(keys.key("parameter", v.name), v) for v in parameters],
+        ports=[(keys.key("port", stem or "port"), port) for stem, port in ports.items()],
+        recorded=_groups(recorded),
+        others=[v.name for v in usable if v.causality in _INTERNAL],
+        left_out=[
+            v.name
+            for v in description.variables
+            if v.name not in usable_names and v.causality != "local"
+        ],
+        float_kinds=FLOAT_KINDS,
+        pattern=_pattern,
+        comment=_comment,
+    ).decode()
+    text = text.rstrip() + "\n"
+    # fails if the draft does not fit the FMU
+    Exchange(description, parse_binding(tomllib.loads(text), where="the draft"))
+    return text
+
+
+def bindable(variable: VariableInfo) -> bool:
+    """Return whether a binding can name a variable.
+
+    It must be a number without a clock, and its name must not look like a pattern of ours, which
+    would be expanded.
+    """
+    is_number = variable.numeric and not variable.clocked and variable.size > 0
+    return is_number and not _PATTERN.search(variable.name)
+
+
+def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> list[VariableInfo]:
+    """Return the outputs of an FMU; if it has none, one local variable.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    usable : sequence of VariableInfo
+        Variables that a binding can name.
+
+    Raises
+    ------
+    BindingError
+        If there is neither.
+    """
+    outputs = [v for v in usable if v.causality == "output"]
+    internal = [v for v in usable if v.causality in _INTERNAL and v.kind in FLOAT_KINDS]
+    if not outputs and not internal:
+        raise BindingError(f"{description.label} has no number that could be observed.")
+    return outputs or internal[:1]
+
+
+def _variables_to_observe(
+    description: FmuDescription, usable: Sequence[VariableInfo]
+) -> list[VariableInfo]:
+    """Return the outputs to observe: real numbers with a name that is not auxiliary, if any."""
+    candidates = observable(description, usable)
+    reals = [v for v in candidates if v.kind in FLOAT_KINDS]
+    main = [v for v in reals if not _AUXILIARY.search(v.name)]
+    return main or reals or candidates
+
+
+class _TableKeys:
+    """Keys of the tables of a binding, unique within their role."""
+
+    def __init__(self) -> None:
+        self._uses: Counter[tuple[str, str]] = Counter()
+
+    def key(self, role: str, name: str) -> str:
+        """Return a key made of a name, with a number behind it where that key is taken."""
+        plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "x"
+        key = plain
+        while self._uses[role, key]:
+            self._uses[role, plain] += 1
+            key = f"{plain}_{self._uses[role, plain]}"
+        self._uses[role, key] += 1
+        return key
+
+
+def _role(variable: VariableInfo) -> str:
+    """Return the role of an input, guessed from its name and unit."""
+    if _HEALTH.search(variable.name):
+        return "health"
+    unit = variable.unit or ""
+    if _LOAD.search(variable.name) or any(same_dimension(unit, load) for load in _LOAD_UNITS):
+        return "load"
+    return "control"
+
+
+def _ports(variables: Sequence[VariableInfo]) -> dict[str, PortVariables]:
+    """Return the mechanical ports among inputs and outputs, by the stem of their names.
+
+    A port has a force on one side of the FMU, and displacement or velocity on the other.
+    """
+    candidates: dict[str, PortVariables] = {}
+    for variable in sorted(variables, key=lambda variable: variable.causality):
+        match = _PORT.fullmatch(variable.name)
+        if match is None:
+            continue
+        quantity = match["quantity"].lower()
+        units = PORT_QUANTITIES[quantity]
+        if any(same_dimension(variable.unit or "", unit) for unit in units):
+            stem = match["stem"] + (match["index"] or "")
+            candidates.setdefault(stem, {})[quantity] = variable
+    ports = {}
+    for stem, port in candidates.items():
+        if _is_port(port):
+            ports[stem] = {name: port[name] for name in PORT_QUANTITIES if name in port}
+    return ports
+
+
+def _is_port(variables: PortVariables) -> bool:
+    """Return whether the force stands alone on its side of the FMU."""
+    if len(variables) < 2 or "force" not in variables:
+        return False
+    sides = [variable.causality for variable in variables.values()]
+    return sides.count(variables["force"].causality) == 1
+
+
+class _NumberedName(NamedTuple):
+    """The name of a variable with a number in it, and its unit.
+
+    Attributes
+    ----------
+    stem, number, tail : str
+        Parts of the name: before the last number, the number, and after it.
+    unit : str or None
+        Unit of the variable.
+    """
+
+    stem: str
+    number: str
+    tail: str
+    unit: str | None
+
+    def next(self) -> "_NumberedName | None":
+        """Return the name with the next number; None if the number has leading zeros."""
+        number = int(self.number)
+        if str(number) != self.number:
+            return None
+        return self._replace(number=str(number + 1))
+
+
+def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
+    """Return the parts of the name of a scalar with a number in its name; None for another."""
+    if variable.shape:
+        return None
+    match = _NUMBERED.fullmatch(variable.name)
+    if match is None:
+        return None
+    return _NumberedName(match["stem"], match["number"], match["tail"], variable.unit)
+
+
+def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:
+    """Put variables together that are numbered one after the other and have the same unit."""
+    groups: list[list[VariableInfo]] = []
+    expected: _NumberedName | None = None
+    for variable in variables:
+        name = _numbered_name(variable)
+        if name is not None and name == expected:
+            groups[-1].append(variable)
+        else:
+            groups.append([variable])
+        expected = None if name is None else name.next()
+    return groups
+
+
+def _pattern(group: Sequence[VariableInfo]) -> str:
+    """Return the name of a variable, or the pattern of a group."""
+    first = _NUMBERED.fullmatch(group[0].name)
+    last = _NUMBERED.fullmatch(group[-1].name)
+    if len(group) == 1 or first is None or last is None:
+        return group[0].name
+    return f"{first['stem']}{{{first['number']}..{last['number']}}}{first['tail']}"
+
+
+def _stem(group: Sequence[VariableInfo]) -> str:
+    """Return the name of a variable, or what the names of a group have in common."""
+    name = group[0].name
+    match = _NUMBERED.fullmatch(name) if len(group) > 1 else None
+    if match is None:
+        return name
+    return match["stem"].rstrip("[._ ") or "values"
+
+
+def _comment(text: str) -> str:
+    """Return a text as a short comment: one line without control characters."""
+    return " ".join(re.sub(r"[\x00-\x1f\x7f]", " ", text).split())[:120]

@@ -1,0 +1,206 @@
+"""Histories of a simulation in files: inputs from CSV, outputs to CSV or NetCDF."""
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from fmu_asset.errors import FmuInputError
+from reporting.arrays import Float
+from reporting.files import atomic_write_bytes, atomic_write_text
+from reporting.table_file import TableErrors, read_table, table_text
+from reporting.words import comma_list
+
+from .binding import INPUT_ROLES, Binding
+from .observations import ObservationHistory
+from .session import FmiAsset
+
+InputHistories = dict[str, dict[str, Float]]
+"""Inputs of N steps for `FmiAsset.simulate`, by role and name: (N,), or (N, n) for an array."""
+
+_ELEMENT = re.compile(r"(?P<name>.+)\[(?P<number>\d+)\]", re.DOTALL)
+_TIME = "time"
+_TIME_TOLERANCE = 1e-6
+"""Error of a time that a spreadsheet rounded, as a share of the interval between observations."""
+_WHOLE = 0
+"""Number of the column of an input that is not given by elements; these count from 1."""
+
+
+class _InputName(NamedTuple):
+    """Role and name of an input in a binding."""
+
+    role: str
+    name: str
+
+    @property
+    def full(self) -> str:
+        """The name with its role."""
+        return f"{self.role}.{self.name}"
+
+
+def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
+    """Return the number of steps in a CSV file, and the inputs of each step.
+
+    The first line names the columns: `time` [s], which begins at the binding's start time and goes
+    on by its interval, and inputs as `control.load_factor`, or `load_factor` where no other role
+    has that name; the elements of an array are `u[1]`, `u[2]`, .... The values of a line hold over
+    the step that begins at its time.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    binding : Binding
+        The binding, with the names and units of the inputs.
+
+    Raises
+    ------
+    FmuInputError
+        If the file is missing or no CSV, a column is missing, unknown or there twice, a cell is no
+        finite number, or time is uneven.
+    """
+    table = read_table(path, TableErrors(FmuInputError, FmuInputError))
+    time = table.numbers(_TIME, "a simulation")
+    _check_times(time, path, binding)
+    known_names = _names_of_columns(binding)
+    columns: dict[_InputName, dict[int, Float]] = {}
+    for column in table.columns:
+        if column == _TIME:
+            continue
+        input_name, number = _column_meaning(column, known_names)
+        if input_name is None:
+            known = [name.full for name in dict.fromkeys(known_names.values())]
+            raise FmuInputError(
+                f"The column {column!r} of {path} is no input of the binding {binding.name}; it "
+                f"has {comma_list(known)}."
+            )
+        elements = columns.setdefault(input_name, {})
+        mixes_forms = bool(elements) and (number == _WHOLE or _WHOLE in elements)
+        if number in elements or mixes_forms:
+            raise FmuInputError(
+                f"{path} gives {input_name.full} in more than one column; keep one."
+            )
+        elements[number] = table.numbers(column, "a simulation")
+    histories: InputHistories = {}
+    for input_name, elements in columns.items():
+        history = _joined_elements(input_name, elements, path)
+        histories.setdefault(input_name.role, {})[input_name.name] = history
+    return len(time), histories
+
+
+def _check_times(time: Float, path: Path, binding: Binding) -> None:
+    """Refuse times that are not those of the steps of a binding."""
+    expected = binding.binding.start_time + binding.interval * np.arange(len(time))
+    wrong = np.flatnonzero(np.abs(time - expected) > _TIME_TOLERANCE * binding.interval)
+    if len(wrong):
+        step = int(wrong[0])
+        raise FmuInputError(
+            f"{path} has the time {time[step]:.12g} s where step {step} begins at "
+            f"{expected[step]:.12g} s: the binding {binding.name} starts at "
+            f"{binding.binding.start_time:g} s and goes on by {binding.interval:g} s. Resample the "
+            "inputs, or change `step_size` or `start_time` in the binding."
+        )
+
+
+def _names_of_columns(binding: Binding) -> dict[str, _InputName]:
+    """Return the inputs of a binding by the names that columns may have.
+
+    A column may have the name alone where only one role has an input of that name.
+    """
+    inputs = [_InputName(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
+    for port_name, port in binding.port.items():
+        inputs += [_InputName("port", f"{port_name}.{quantity}") for quantity in port.quantities]
+    uses = Counter(entry.name for entry in inputs)
+    short_names = {entry.name: entry for entry in inputs if uses[entry.name] == 1}
+    full_names = {entry.full: entry for entry in inputs}
+    return short_names | full_names
+
+
+def _column_meaning(
+    column: str, known_names: dict[str, _InputName]
+) -> tuple[_InputName | None, int]:
+    """Return the input of a column, None if there is none, and the element of it or `_WHOLE`."""
+    if column in known_names:
+        return known_names[column], _WHOLE
+    match = _ELEMENT.fullmatch(column)
+    if match is None:
+        return None, _WHOLE
+    return known_names.get(match["name"]), int(match["number"])
+
+
+def _joined_elements(input_name: _InputName, elements: dict[int, Float], path: Path) -> Float:
+    """Return the history of an input: (N,) of a whole one, or (N, n) from its elements."""
+    if _WHOLE in elements:
+        return elements[_WHOLE]
+    missing = {*range(1, len(elements) + 1)} - elements.keys()
+    if missing:
+        raise FmuInputError(
+            f"{path} lacks the column {input_name.full}[{min(missing)}]; count from 1."
+        )
+    return np.column_stack([elements[number] for number in sorted(elements)])
+
+
+def write_history(
+    path: Path, asset: FmiAsset, source: tuple[str, str], history: ObservationHistory
+) -> None:
+    """Write the outputs of a simulation: NetCDF if the name ends with .nc, else CSV.
+
+    The file is written whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    asset : FmiAsset
+        The asset that was simulated.
+    source : (str, str)
+        Name and SHA-256 of its FMU file.
+    history : ObservationHistory
+        The outputs.
+
+    Raises
+    ------
+    reporting.errors.FileNotWrittenError
+        If the file cannot be written.
+    """
+    if path.suffix == ".nc":
+        atomic_write_bytes(path, _netcdf(asset, source, history))
+        return
+    names = asset.binding.observation_variables
+    observed = dict(zip(names, history.values.T, strict=True))
+    observed[_TIME] = history.time
+    # time first, then observations, then extras of other names
+    columns = {_TIME: history.time, **observed, **(history.extra | observed)}
+    atomic_write_text(path, table_text(columns))
+
+
+def _netcdf(asset: FmiAsset, source: tuple[str, str], history: ObservationHistory) -> bytes:
+    """Return the NetCDF file of a history; see `write_history`."""
+    import xarray as xr
+
+    binding = asset.binding
+    observation_units = [unit for vector in binding.observation.values() for unit in vector.units]
+    extra_names = [*history.extra]
+    extra_units = [asset.recorded_units[name] for name in extra_names]
+    extra = np.empty((len(history.time), 0))
+    if extra_names:
+        extra = np.column_stack([*history.extra.values()])
+    observation_names = np.array(binding.observation_variables, dtype=str)
+    file_name, file_hash = source
+    data = xr.Dataset(
+        {
+            "observation": (("time", "observation_name"), history.values),
+            "observation_unit": ("observation_name", np.array(observation_units, dtype=str)),
+            "extra": (("time", "extra_name"), extra),
+            "extra_unit": ("extra_name", np.array(extra_units, dtype=str)),
+        },
+        coords={
+            "time": ("time", history.time, {"units": "s", "long_name": "end of the step"}),
+            "observation_name": ("observation_name", observation_names),
+            "extra_name": ("extra_name", np.array(extra_names, dtype=str)),
+        },
+        attrs={"fmu": file_name, "fmu_sha256": file_hash, "binding": binding.name},
+    )
+    return bytes(data.to_netcdf(engine="h5netcdf"))

@@ -1,0 +1,351 @@
+"""The life of an FMU's instance: the extracted files, the worker process, and starts anew."""
+
+import logging
+import weakref
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fmu_asset.archive.declared import FmuDescription
+from fmu_asset.archive.fmu_file import extract_fmu
+from fmu_asset.errors import FmuCallError, FmuError, FmuInputError
+from fmu_asset.folders import plain_folder, remove_folder
+from fmu_asset.instances.base import FmuInstance
+from fmu_asset.instances.opening import open_instance
+from fmu_asset.instances.plan import Instance, Plan
+from fmu_asset.instances.python_modules import forget_modules
+from fmu_asset.worker.client import WorkerInstance, WorkerLimits
+from fmu_asset.worker.sandbox import Grants, landlock_version, missing_path
+from reporting.arrays import Float
+from reporting.toml_file import validate
+
+from .binding import Binding
+from .reset_trial import FirstStep, InstanceStart, ResetTrial, RestartMethod
+
+_logger = logging.getLogger(__name__)
+_logged_warnings: set[str] = set()
+
+
+class ExtractedFmu:
+    """The folder of an extracted FMU; it is removed when nothing refers to this any more.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder.
+    users : int
+        Number of instances that run from it.
+
+    Raises
+    ------
+    FmuFileError
+        If the FMU cannot be extracted.
+    """
+
+    def __init__(self, description: FmuDescription) -> None:
+        self.folder: Path = extract_fmu(description)
+        self.users = 0
+        weakref.finalize(self, remove_folder, self.folder)
+
+
+class InstanceHost:
+    """The one instance of an asset: made, brought to its start again and again, and freed.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU.
+    plan : Plan
+        What is exchanged; its folder is still empty.
+    limits : WorkerLimits
+        Limits of the worker.
+    isolated : bool
+        Whether the instance runs in a worker process.
+
+    Attributes
+    ----------
+    instance : FmuInstance, WorkerInstance or None
+        The instance, while there is one.
+    reset_trial : ResetTrial
+        Findings about the restart of the FMU.
+    """
+
+    def __init__(
+        self, description: FmuDescription, plan: Plan, limits: WorkerLimits, *, isolated: bool
+    ) -> None:
+        self._description = description
+        self._plan = plan
+        self._limits = limits
+        self._isolated = isolated
+        self._extracted: ExtractedFmu | None = None
+        self._release: Callable[[], object] = lambda: None
+        self.instance: Instance | None = None
+        # Where a process can make one instance only, there is nothing to compare a reset with.
+        can_make_another = isolated or not description.once_per_process
+        self.reset_trial = ResetTrial(comparable=can_make_another)
+        self._method = RestartMethod.LOADING
+        self._start: InstanceStart | None = None
+
+    def sibling(self) -> "InstanceHost":
+        """Return a host of another instance of the same extracted FMU.
+
+        The folder stays until every sibling is closed or collected, used or not.
+        """
+        other = InstanceHost(self._description, self._plan, self._limits, isolated=self._isolated)
+        other._extracted = self._extracted
+        other.reset_trial = self.reset_trial
+        return other
+
+    def start(self, start: InstanceStart, *, renewed: bool = False) -> Instance:
+        """Return the instance at its start; never one that was lost to a fatal error.
+
+        Parameters
+        ----------
+        start : InstanceStart
+            The start.
+        renewed : bool
+            Whether the instance has just been made by `renew`.
+
+        Raises
+        ------
+        FmuError
+            If the FMU cannot be extracted, loaded, instantiated or initialised.
+        """
+        instance = self.instance
+        if instance is None or instance.lost:
+            instance = self._make_instance()
+            self._method = RestartMethod.LOADING
+        elif renewed:
+            self._method = RestartMethod.RENEWAL
+        else:
+            instance = self._restarted_instance()
+        self._start = start
+        start.initialise(instance)
+        return instance
+
+    def replace_if_contradicted(self, request: bytes, reply: Float) -> Instance | None:
+        """Return another instance at its start if the first step shows that this one was not.
+
+        The first step of the first instance is recorded; None is returned if all is well.
+
+        Parameters
+        ----------
+        request : bytes
+            Request block of the first step after a start.
+        reply : (n,) ndarray
+            Outputs after it.
+
+        Raises
+        ------
+        FmuError
+            If the other instance cannot be started.
+        """
+        trial = self.reset_trial
+        start = self._start
+        if start is None or not trial.comparable:
+            return None
+        first_step = trial.first_step
+        if first_step is None:
+            trial.first_step = FirstStep(start, request, np.array(reply))
+            return None
+        if start != first_step.start or request != first_step.request:
+            return None
+        if trial.accepts(self._description.label, self._method, first_step, reply):
+            return None
+        return self.start(start)
+
+    def renew(self) -> Instance:
+        """Free the instance and return another one, in the same process.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails.
+        """
+        if isinstance(self.instance, WorkerInstance) and not self.instance.lost:
+            self.instance.renew()
+            return self.instance
+        return self._make_instance()
+
+    def close(self) -> None:
+        """Free the instance, end the worker and remove files that no other asset uses."""
+        self.instance = None
+        self._extracted = None
+        self._release()
+
+    # ------------------------------------------------------------------ restarts
+
+    def _restarted_instance(self) -> Instance:
+        """Return an instance as after its instantiation, by the fastest method that works."""
+        methods: list[tuple[RestartMethod, Callable[[], Instance]]] = [
+            (RestartMethod.RESET, self._reset_instance)
+        ]
+        if self._isolated and not self._description.once_per_process:
+            methods.append((RestartMethod.RENEWAL, self.renew))
+        for method, restart in methods:
+            self._method = method
+            if not self._is_worth_trying(method):
+                continue
+            # a worker that does not survive it is replaced
+            with suppress(FmuError):
+                instance = self._instance_restarted_by(restart)
+                if instance is not None:
+                    return instance
+        self._method = RestartMethod.LOADING
+        return self._make_instance()
+
+    def _is_worth_trying(self, method: RestartMethod) -> bool:
+        """Return whether a method has shown no fault, and can be compared with the first step."""
+        trial = self.reset_trial
+        is_unproved = (
+            method == RestartMethod.RESET and trial.first_step is None and trial.comparable
+        )
+        return method >= trial.method and not is_unproved
+
+    def _instance_restarted_by(self, restart: Callable[[], Instance]) -> Instance | None:
+        """Return an instance restarted by a method; None if its first step shows a difference."""
+        instance = restart()
+        first_step = self.reset_trial.first_step
+        if first_step is None:
+            return instance
+        reply = first_step.repeat(instance)
+        label = self._description.label
+        if self.reset_trial.accepts(label, self._method, first_step, reply):
+            # the comparison has made a step
+            return restart()
+        return None
+
+    def _reset_instance(self) -> Instance:
+        assert self.instance is not None
+        try:
+            self.instance.reset()
+        except FmuCallError:
+            self.reset_trial.record_refused_reset()
+            raise
+        return self.instance
+
+    # ------------------------------------------------------------------ making an instance
+
+    def _make_instance(self) -> Instance:
+        """Return an instance made from the file, in a worker of its own if there are workers."""
+        extracted = self._extracted
+        # after a crash the files of the FMU are not trusted either
+        has_crashed = self.instance is not None and self.instance.lost
+        self.close()
+        if extracted is None or has_crashed or not extracted.folder.is_dir():
+            extracted = ExtractedFmu(self._description)
+        try:
+            instance = self._open(replace(self._plan, folder=str(extracted.folder)))
+        except BaseException:
+            del extracted  # so that its folder is removed now, and not with the traceback
+            raise
+        extracted.users += 1
+        self.instance = instance
+        self._extracted = extracted
+        # also at the end of the interpreter, or when the asset is forgotten without being closed
+        self._release = weakref.finalize(self, _release, instance, extracted)
+        return instance
+
+    def _open(self, plan: Plan) -> Instance:
+        """Return an instance of a plan, in a worker if this host has workers."""
+        if not self._isolated:
+            return open_instance(plan)
+        grants = self._limits.grants
+        if grants is not None:
+            _check_grants(grants, plan.folder)
+        warn_without_sandbox(self._description.label, grants)
+        scratch = plain_folder()
+        try:
+            return WorkerInstance(plan, scratch, limits=self._limits)
+        except BaseException:
+            remove_folder(scratch)
+            raise
+
+
+def _release(instance: Instance, extracted: ExtractedFmu) -> None:
+    """Free an instance; after the last one, forget the modules of an FMU in Python."""
+    instance.close()
+    extracted.users -= 1
+    # others may still import what they need
+    if isinstance(instance, FmuInstance) and not extracted.users:
+        forget_modules(str(extracted.folder))
+
+
+def _check_grants(grants: Grants, folder: str) -> None:
+    """Refuse grants of the sandbox that name a missing file or folder."""
+    missing = missing_path(grants, folder)
+    if missing:
+        raise FmuInputError(
+            f"The table [limits] of the binding grants {missing!r}, which does not exist; correct "
+            "it."
+        )
+
+
+def warn_without_sandbox(label: str, grants: Grants | None) -> None:
+    """Warn once if FMUs, or one of them, can reach all files of the user.
+
+    Parameters
+    ----------
+    label : str
+        Name of the FMU.
+    grants : Grants or None
+        Grants of its sandbox; None if its binding turns the sandbox off.
+    """
+    if grants is None:
+        warning = (
+            f"{label}: its binding turns the sandbox off, so that it has all rights of its user."
+        )
+    elif not landlock_version():
+        warning = (
+            "This kernel has no Landlock (Linux 5.13 or later), so that FMUs have all rights of "
+            "their user; fly what is not trusted in a container."
+        )
+    else:
+        return
+    if warning not in _logged_warnings:
+        _logged_warnings.add(warning)
+        _logger.warning(warning)
+
+
+def worker_limits(
+    binding: Binding,
+    step_timeout: float | None,
+    load_timeout: float | None,
+    memory_limit: float | None,
+) -> WorkerLimits:
+    """Return the limits of a worker: those of the caller, else of the binding, else the defaults.
+
+    Parameters
+    ----------
+    binding : Binding
+        The binding.
+    step_timeout, load_timeout : float or None
+        Wall-clock limits of the caller [s].
+    memory_limit : float or None
+        Memory limit of the caller [MiB].
+
+    Raises
+    ------
+    FmuInputError
+        If one is not positive.
+    """
+    limits = binding.limits.model_dump()
+    of_caller = {
+        "step_time": step_timeout,
+        "load_time": load_timeout,
+        "memory": memory_limit,
+    }
+    for key, value in of_caller.items():
+        if value is not None:
+            limits[key] = value
+    return validate(
+        WorkerLimits, limits, "the limits of the worker", FmuInputError, what="the limits"
+    )

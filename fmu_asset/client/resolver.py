@@ -1,0 +1,193 @@
+"""The names of a binding, selection in the FMU: variables, units, ranges and mechanical ports."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from fmu_asset.archive.declared import FmuDescription, VariableInfo
+from fmu_asset.errors import BindingError
+
+from .binding import Binding
+from .bound_variables import InputBinding, VectorBinding
+from .layout import VariableElements, find_variable
+from .slots import InputSlot
+from .units import conversion
+
+
+class PortQuantity(NamedTuple):
+    """A quantity of a mechanical port, resolved against an FMU.
+
+    Attributes
+    ----------
+    name : str
+        Port and quantity, such as `tip.force`.
+    vector : VectorBinding
+        Its variables.
+    is_read : bool
+        Whether it is an output of the FMU: of force and motion one is, and the other is not.
+    """
+
+    name: str
+    vector: VectorBinding
+    is_read: bool
+
+    @property
+    def label(self) -> str:
+        """Place in the binding, for messages."""
+        return f"port.{self.name}"
+
+
+class BindingResolver:
+    """Finds the variables of an FMU that a binding names.
+
+    Parameters
+    ----------
+    description : FmuDescription
+        The FMU, with the array sizes of the binding.
+    binding : Binding
+        The binding.
+    """
+
+    def __init__(self, description: FmuDescription, binding: Binding) -> None:
+        self.description = description
+        self.binding = binding
+
+    def place_in_binding(self, label: str) -> str:
+        """Return the name of a place in the binding, for messages."""
+        return f"{label} of the binding {self.binding.name}"
+
+    def find(self, name: str, label: str, causality: str) -> VariableElements:
+        """Return the variable, or element of an array, that the binding names at a place.
+
+        Parameters
+        ----------
+        name : str
+            Name in the FMU.
+        label : str
+            Place in the binding.
+        causality : str
+            Role of the variable, see `find_variable`.
+
+        Raises
+        ------
+        BindingError
+            If there is no such variable, or it is of another causality or type.
+        """
+        return find_variable(self.description, name, self.place_in_binding(label), causality)
+
+    def variable_or_array(self, name: str) -> VariableInfo | None:
+        """Return the variable of a name, or the array whose element it names, if there is one."""
+        array_name = name.rpartition("[")[0]
+        return self.description.variable(name) or self.description.variable(array_name)
+
+    def is_set_at_start(self, name: str) -> bool:
+        """Return whether a variable can be set before the initialisation only."""
+        variable = self.variable_or_array(name)
+        if variable is None:
+            return False
+        is_tunable = (
+            variable.variability == "tunable" and self.description.interface == "co-simulation"
+        )
+        return variable.startable or (variable.causality == "parameter" and not is_tunable)
+
+    def slot(
+        self,
+        label: str,
+        input_binding: InputBinding,
+        variable: VariableInfo,
+        positions: Sequence[int],
+    ) -> InputSlot:
+        """Return how values of an input are checked, converted and placed.
+
+        Parameters
+        ----------
+        label : str
+            Place in the binding.
+        input_binding : InputBinding
+            Unit and range of the input.
+        variable : VariableInfo
+            Its variable.
+        positions : sequence of int
+            Positions of its values.
+
+        Raises
+        ------
+        BindingError
+            If the unit cannot be converted, or the range lies outside that of the FMU.
+        """
+        definitions = self.description.units_of(variable)
+        unit_conversion = conversion(input_binding.unit, variable, definitions, where=label)
+        low, high = variable.bounds
+        stated_low, stated_high = sorted(
+            unit_conversion.to_fmu(limit) for limit in input_binding.limits
+        )
+        if stated_low > high or stated_high < low:
+            raise BindingError(
+                f"The range of {self.place_in_binding(label)} lies outside that of "
+                f"{variable.name!r}, {low:g} to {high:g}{variable.in_unit}; correct minimum or "
+                "maximum."
+            )
+        return InputSlot(
+            label=label,
+            positions=positions,
+            low=max(low, stated_low),
+            high=min(high, stated_high),
+            conversion=unit_conversion,
+            variable=variable,
+        )
+
+    def start_slot(self, label: str, input_binding: InputBinding) -> InputSlot:
+        """Return the slot of a value that is set before the initialisation.
+
+        Its positions count from the first value of the variable itself.
+
+        Raises
+        ------
+        BindingError
+            If the binding does not fit the FMU.
+        """
+        selection = self.find(input_binding.variable, label, "parameter")
+        return self.slot(label, input_binding, selection.variable, selection.elements)
+
+    # ------------------------------------------------------------------ ports
+
+    def port_quantities(self) -> list[PortQuantity]:
+        """Return the quantities of all ports.
+
+        Raises
+        ------
+        BindingError
+            If a port mixes inputs and outputs, or force and motion are on the same side of the FMU.
+        """
+        quantities = []
+        for port_name, port in self.binding.port.items():
+            force_count = len(port.force.variables)
+            sides: dict[str, bool] = {}
+            for quantity, vector in port.quantities.items():
+                name = f"{port_name}.{quantity}"
+                sides[quantity] = self._is_output_vector(f"port.{name}", vector, force_count)
+                quantities.append(PortQuantity(name, vector, sides[quantity]))
+            force_is_output = sides.pop("force")
+            if force_is_output in sides.values():
+                side = "outputs" if force_is_output else "inputs"
+                raise BindingError(
+                    f"In {self.place_in_binding(f'port.{port_name}')}, force and motion are both "
+                    f"{side} of the FMU; at a port one is given for the other."
+                )
+        return quantities
+
+    def _is_output_vector(self, label: str, vector: VectorBinding, force_count: int) -> bool:
+        """Return whether the variables of a port's quantity are outputs of the FMU."""
+        where = self.place_in_binding(label)
+        count = len(vector.variables)
+        if count != force_count:
+            raise BindingError(
+                f"{where} has {count} values and the force {force_count}; give as many."
+            )
+        sides = {self._is_input(variable) for variable in vector.variables}
+        if len(sides) > 1:
+            raise BindingError(f"{where} mixes inputs and outputs of the FMU.")
+        return not sides.pop()
+
+    def _is_input(self, name: str) -> bool:
+        variable = self.variable_or_array(name)
+        return variable is not None and variable.causality == "input"

@@ -1,0 +1,264 @@
+"""Repeated runs of an FMU from stated starts.
+
+A model of campaigns asks its FMU for thousands of short motions and equilibria. One instance for
+each step size stays open and is reset, and results are cached.
+"""
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property
+from operator import attrgetter
+from pathlib import Path
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from fe.runtime.arrays import FloatArray
+from fmu_asset.errors import FmuOutputError
+from reporting.memory import ResultCache
+
+from .binding import Binding
+from .session import FmiAsset
+
+MOST_INSTANCES = 8
+"""Instances (step sizes) that are open at the same time."""
+CACHE_BYTES = 256 * 2**20
+"""Results that are remembered."""
+SETTLE_CHUNK = 200
+"""Steps between two looks whether the motion has come to rest."""
+NO_OFFSETS: Mapping[str, float] = MappingProxyType({})
+
+
+class OperatingPoint(NamedTuple):
+    """Parameters and constant inputs of a run; pairs of the binding's name and a value, sorted."""
+
+    parameters: tuple[tuple[str, float], ...] = ()
+    inputs: tuple[tuple[str, float], ...] = ()
+
+    def with_parameters(self, values: Mapping[str, float]) -> "OperatingPoint":
+        """Return the point with other values of some parameters."""
+        parameters = {**dict(self.parameters), **values}
+        return self._replace(parameters=tuple(sorted(parameters.items())))
+
+
+class FmuRun(NamedTuple):
+    """A motion that an FMU is asked for.
+
+    Attributes
+    ----------
+    operating_point : OperatingPoint
+        Parameters and constant inputs.
+    step : float
+        Communication step [s].
+    steps : int
+        Number of steps.
+    initial_offsets : mapping of str to float
+        Additions to inputs before the run; under these the FMU is at rest at its start.
+    offsets : mapping of str to (steps,) array
+        Additions to inputs in each step of the run.
+    """
+
+    operating_point: OperatingPoint
+    step: float
+    steps: int
+    initial_offsets: Mapping[str, float] = NO_OFFSETS
+    offsets: Mapping[str, FloatArray] = MappingProxyType({})
+
+
+class FmuRuns:
+    """An FMU that is run again and again.
+
+    Parameters
+    ----------
+    path : Path
+        The FMU file.
+    binding : Binding
+        Its variables; the inputs that are set are its loads, zero unless a run gives a value.
+    isolated : bool
+        Whether instances run in processes of their own.
+    limit : float
+        Longest motion until rest [s].
+    tolerance : float
+        Largest movement of an output that counts as rest, as a share of its largest value.
+    """
+
+    def __init__(
+        self, path: Path, binding: Binding, isolated: bool, limit: float, tolerance: float
+    ) -> None:
+        self._path = path
+        self._binding = binding
+        self._isolated = isolated
+        self._limit = limit
+        self._tolerance = tolerance
+        self._assets = ResultCache(MOST_INSTANCES, end=FmiAsset.close)
+        self._results = ResultCache(CACHE_BYTES, attrgetter("nbytes"))
+
+    def refusal_context(self) -> AbstractContextManager[None]:
+        """Return a context for calls of the FMU; a subclass adds to what the FMU's errors say."""
+        return nullcontext()
+
+    @cached_property
+    def asset(self) -> FmiAsset:
+        """The FMU with its binding, for what it declares.
+
+        Raises
+        ------
+        FmuError
+            If the FMU is missing, or the binding does not fit it.
+        """
+        return FmiAsset(self._path, self._binding, isolated=self._isolated)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave out the asset when this is sent to another process, which opens its own."""
+        return {name: value for name, value in vars(self).items() if name != "asset"}
+
+    def cached(self, key: Hashable, compute: Callable[[], FloatArray]) -> FloatArray:
+        """Return the result of `compute` for a key, computed once; old results are dropped."""
+        result = self._results.get(key, compute)
+        result.setflags(write=False)
+        return result
+
+    def close(self) -> None:
+        """Close all instances; they are opened again when they are needed."""
+        self._assets.clear()
+
+    def probing_amplitude(self, name: str) -> float:
+        """Return an amplitude that an input can have with both signs, for tests of linearity."""
+        low, high = self.asset.input_range("load", name)
+        return min(1.0, 0.1 * abs(low), 0.1 * abs(high))
+
+    def start_run(self, run: FmuRun) -> tuple[FmiAsset, FloatArray, dict[str, FloatArray]]:
+        """Return an instance at the start of a run, its outputs there, and the inputs of each step.
+
+        Parameters
+        ----------
+        run : FmuRun
+            The run.
+
+        Returns
+        -------
+        asset : FmiAsset
+            The instance, at its start or, with initial offsets, at rest under them.
+        outputs : (C,) ndarray
+            Its outputs.
+        inputs : dict of str to (steps,) ndarray
+            Value of every input in each step.
+
+        Raises
+        ------
+        FmuError
+            If the FMU refuses, or does not come to rest.
+        """
+        constant = self._constant_inputs(run.operating_point, NO_OFFSETS)
+        inputs = {name: value + np.zeros(run.steps) for name, value in constant.items()}
+        for name, offsets in run.offsets.items():
+            inputs[name] = inputs[name] + offsets
+        with self.refusal_context():
+            asset = self._reset_instance(run.operating_point, run.step, run.initial_offsets)
+            if any(run.initial_offsets.values()):
+                outputs = self._outputs_after_settling(asset)
+            else:
+                outputs = np.array(asset.observe().values)
+        return asset, outputs, inputs
+
+    def outputs_of_run(self, run: FmuRun) -> FloatArray:
+        """Return the outputs (steps + 1, C) of a run, the first at its start.
+
+        Raises
+        ------
+        FmuError
+            If the FMU refuses, or does not come to rest.
+        """
+        asset, first, inputs = self.start_run(run)
+        with self.refusal_context():
+            history = asset.simulate(load=inputs, steps=run.steps)
+            return np.vstack((first, history.values))
+
+    def outputs_at_rest(
+        self,
+        points: Sequence[OperatingPoint],
+        offsets: Mapping[str, FloatArray],
+        step: float,
+        *,
+        settle: bool,
+    ) -> FloatArray:
+        """Return the outputs (L, C) of the FMU at rest at several operating points.
+
+        Parameters
+        ----------
+        points : sequence of OperatingPoint
+            L operating points, which differ in inputs only.
+        offsets : mapping of str to (L,) ndarray
+            Additions to inputs at each point.
+        step : float
+            Communication step [s].
+        settle : bool
+            Whether the motion at each point is followed until it rests; otherwise the FMU is
+            quasi-static, and a step gives the equilibrium.
+
+        Raises
+        ------
+        FmuError
+            If the FMU refuses, or does not come to rest.
+        """
+        offsets_by_point = []
+        for row in range(len(points)):
+            offsets_by_point.append({name: float(values[row]) for name, values in offsets.items()})
+        with self.refusal_context():
+            if settle:
+                outputs = []
+                for point, point_offsets in zip(points, offsets_by_point, strict=True):
+                    asset = self._reset_instance(point, step, point_offsets)
+                    outputs.append(self._outputs_after_settling(asset))
+                return np.array(outputs)
+            rows = []
+            for point, point_offsets in zip(points, offsets_by_point, strict=True):
+                rows.append(self._constant_inputs(point, point_offsets))
+            inputs = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+            asset = self._reset_instance(points[0], step, offsets_by_point[0])
+            return asset.simulate(load=inputs, steps=len(rows)).values
+
+    def _constant_inputs(
+        self, point: OperatingPoint, offsets: Mapping[str, float]
+    ) -> dict[str, float]:
+        """Return the value of every input at an operating point, offsets added."""
+        inputs = {**dict.fromkeys(self._binding.load, 0.0), **dict(point.inputs)}
+        for name, offset in offsets.items():
+            inputs[name] = inputs[name] + offset
+        return inputs
+
+    def _reset_instance(
+        self, point: OperatingPoint, step: float, offsets: Mapping[str, float]
+    ) -> FmiAsset:
+        """Return the instance of a step size [s], reset to an operating point with offsets."""
+        binding = self._binding.with_header(step_size=step)
+        asset = self._assets.get(
+            step, lambda: FmiAsset(self._path, binding, isolated=self._isolated)
+        )
+        inputs = self._constant_inputs(point, offsets)
+        asset.reset(dict(point.parameters), load=inputs or None)
+        return asset
+
+    def _outputs_after_settling(self, asset: FmiAsset) -> FloatArray:
+        """Return the outputs (C,) of an instance when it has come to rest under its inputs."""
+        duration = 0.0
+        largest: FloatArray | float = 0.0
+        while True:
+            chunk = asset.simulate(steps=SETTLE_CHUNK).values
+            duration += SETTLE_CHUNK * asset.binding.step_size
+            high = chunk.max(axis=0)
+            low = chunk.min(axis=0)
+            largest = np.maximum(largest, np.abs(chunk).max(axis=0))
+            if np.all(high - low <= self._tolerance * largest):
+                return np.asarray(0.5 * (high + low))
+            if duration >= self._limit:
+                relative = (high - low) / np.where(largest > 0.0, largest, 1.0)
+                worst = int(np.argmax(relative))
+                output = asset.binding.observation_variables[worst]
+                raise FmuOutputError(
+                    f"the motion did not come to rest within {self._limit:g} s: the output "
+                    f"{output!r} still moves by {high[worst] - low[worst]:.2g}; raise `limit` or "
+                    "`tolerance` in [static], or give the FMU's parameters for a state at rest "
+                    "there."
+                )

@@ -1,0 +1,162 @@
+"""The state of an asset as bytes, which the checkpoint of a mission keeps."""
+
+import struct
+from collections.abc import Sequence
+from typing import ClassVar, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from fmu_asset.errors import FmuStateError
+
+from .values import PlainValue
+
+StateMethod = Literal["serialised", "replay"]
+"""How a state is kept: serialised by the FMU, or as the inputs of all steps, to be replayed."""
+_HEADER = struct.Struct("<8sI")
+
+
+class PackedState(BaseModel):
+    """A state of an asset: a head, kept as JSON, and a body of bytes.
+
+    Attributes
+    ----------
+    body : bytes
+        States of the FMUs themselves.
+    """
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        allow_inf_nan=False,
+        ser_json_bytes="hex",
+        val_json_bytes="hex",
+    )
+    magic: ClassVar[bytes]
+    """First bytes of such a state."""
+    what: ClassVar[str]
+    """Name of the asset's kind, for messages."""
+
+    body: bytes = Field(b"", exclude=True)
+
+    def to_bytes(self) -> bytes:
+        """Return the state as bytes; equal states give equal bytes."""
+        head = self.model_dump_json().encode()
+        return _HEADER.pack(self.magic, len(head)) + head + self.body
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Self:
+        """Return the state that `to_bytes` packed.
+
+        Raises
+        ------
+        FmuStateError
+            If the bytes are something else, or damaged.
+        """
+        try:
+            magic, length = _HEADER.unpack_from(content)
+            begin_of_body = _HEADER.size + length
+            if magic != cls.magic:
+                raise ValueError(magic)
+            state = cls.model_validate_json(content[_HEADER.size : begin_of_body])
+        except (struct.error, ValueError, TypeError) as error:
+            raise FmuStateError(
+                f"What was given is not a state of {cls.what}, or it is damaged."
+            ) from error
+        return state.model_copy(update={"body": content[begin_of_body:]})
+
+
+class SavedState(PackedState):
+    """A saved state of one FMU.
+
+    The body is the FMU's serialised state, or the inputs of each step.
+
+    Attributes
+    ----------
+    index : int
+        Number of steps made.
+    method : {"serialised", "replay"}
+        How the state is kept in the body.
+    fmu : str
+        SHA-256 of the FMU file.
+    step_size, start_time : float
+        Time between observations and start of the binding [s].
+    parameters : dict of str to float, str or list
+        Parameters of the last start, by the binding's names.
+    health : dict of str to float or list
+        Health that was set at the last start.
+    first_index : int
+        Number of steps before the last start.
+    start_inputs : bytes
+        Inputs during the initialisation, as doubles; empty if there were none.
+    inputs : bytes
+        Inputs that hold at the moment of the state, as doubles.
+    outputs : bytes
+        Outputs at that moment, as doubles; the restored FMU must give them again.
+    """
+
+    magic = b"UAVASSET"
+    what = "an FMI asset"
+
+    index: int = Field(ge=0)
+    method: StateMethod
+    fmu: str
+    step_size: float
+    start_time: float
+    parameters: dict[str, PlainValue]
+    health: dict[str, PlainValue] = Field(default_factory=dict)
+    first_index: int = Field(0, ge=0)
+    start_inputs: bytes
+    inputs: bytes
+    outputs: bytes
+
+    @property
+    def steps_since_start(self) -> int:
+        """Number of steps since the last start."""
+        return self.index - self.first_index
+
+    def refuse_other_outputs(self, outputs: bytes, names: Sequence[str]) -> None:
+        """Refuse a restored FMU that does not give the outputs that it gave when it was saved.
+
+        Parameters
+        ----------
+        outputs : bytes
+            Its present outputs, as doubles.
+        names : sequence of str
+            Names of the outputs.
+
+        Raises
+        ------
+        FmuStateError
+            If a bit differs: the FMU declares a capability that it does not have.
+        """
+        if outputs == self.outputs:
+            return
+        if len(outputs) != len(self.outputs):
+            raise FmuStateError("The state was saved with another binding; use that one.")
+        saved = np.frombuffer(self.outputs)
+        present = np.frombuffer(outputs)
+        # compare bits: 0.0 and -0.0 are equal numbers
+        differs = present.view(np.int64) != saved.view(np.int64)
+        first = int(np.flatnonzero(differs)[0])
+        cause = "it does not give equal outputs for equal inputs, so that it cannot be resumed"
+        if self.method == "serialised":
+            cause = partial_state_sentence("does not restore all of its state")
+        raise FmuStateError(
+            f"After the state was restored the FMU gives {names[first]} = "
+            f"{float(present[first])!r} instead of {float(saved[first])!r}: {cause}."
+        )
+
+
+def partial_state_sentence(fault: str) -> str:
+    """Return the end of a sentence on an FMU that declares a state and does not keep all of it.
+
+    Parameters
+    ----------
+    fault : str
+        What it does instead, such as "does not restore all of its state".
+    """
+    return (
+        f'it declares canGetAndSetFMUstate but {fault}; write `state = "replay"` into the table '
+        "[binding] of its binding"
+    )

@@ -1,0 +1,342 @@
+"""Communication steps of an FMU with a binding, one by one or many at once."""
+
+import numpy as np
+
+from fmu_asset.errors import FmuEndedError, FmuError
+from reporting.arrays import Float
+from reporting.progress import Progress, Stage, reporter
+
+from .health_at_start import split_where_health_changes
+from .observations import Observation, ObservationHistory, joined_histories
+from .opened_fmu import HEAD_BYTES, OpenedFmu
+from .values import Histories, InputsByRole, Values
+
+_BLOCK_BYTES = 2**20
+"""Largest size of the requests, or replies, that are sent in one message."""
+
+
+class SteppedFmu(OpenedFmu):
+    """An opened FMU that makes communication steps; `FmiAsset` adds saved states.
+
+    Parameters, attributes and errors are those of `FmiAsset`.
+    """
+
+    def step(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+    ) -> Observation:
+        """Make one communication step.
+
+        Inputs are given by the binding's names and in its units; one that is not given keeps its
+        last value. If the FMU refuses the step, the asset is where it was before it.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to float, or to a sequence for an array
+            Inputs of this step; those of a port are called `<port>.<quantity>`.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or outside the FMU's range; nothing was sent.
+        BindingError
+            If a name is not in the binding.
+        FmuCallError
+            If the FMU refused the step (Discard) or failed.
+        FmuEndedError
+            If the FMU ended its simulation; `observe` still reads its outputs.
+        FmuOutputError
+            If an output is not finite.
+        FmuWorkerError, FmuTimeoutError
+            If the worker died or took too long.
+        """
+        inputs: InputsByRole = {"control": control, "health": health, "load": load, "port": port}
+        if self._exchange.health_slots:
+            inputs = self._restart_if_health_changes(inputs)
+        instance = self._opened_instance(inputs)
+        request = self._request
+        request_before = request.tobytes()
+        begin = self._start_time + self.step_index * self._interval
+        if self._linear_count:
+            # lines begin where the last ones ended
+            request[-self._linear_count :] = request[2 : 2 + self._linear_count]
+        try:
+            self._exchange.request.place(request, inputs)
+            request[0] = begin
+            request[1] = self._step_size
+            instance.step()
+            if not self.step_index:
+                self._repeat_first_step_if_contradicted()
+        except FmuError as error:
+            self._request.cast("B")[:] = request_before
+            self._raise_located(error, f"step {self.step_index} from t = {begin:g} s")
+        self.step_index += 1
+        if self.state_method == "replay":
+            self._record.append(self._request.tobytes()[HEAD_BYTES:])
+        return self._observation()
+
+    def _repeat_first_step_if_contradicted(self) -> None:
+        """Repeat the first step in other instances until one has begun at its start."""
+        while True:
+            other = self._replaced_instance(self._request.tobytes(), self._reply)
+            if other is None:
+                return
+            other.step()
+
+    def hold(
+        self,
+        control: Values | None = None,
+        health: Values | None = None,
+        load: Values | None = None,
+        port: Values | None = None,
+    ) -> None:
+        """Set inputs from this moment on, without a step.
+
+        A step that does not name them keeps them. Under linear interpolation the lines of the next
+        step begin there, so that an input can jump.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to float, or to a sequence for an array
+            Inputs, as for `step`.
+
+        Raises
+        ------
+        FmuInputError, BindingError
+            As `step`.
+        """
+        inputs: InputsByRole = {"control": control, "health": health, "load": load, "port": port}
+        if self._exchange.health_slots:
+            inputs = self._restart_if_health_changes(inputs)
+        self._opened_instance(inputs)
+        request_before = self._request.tobytes()
+        try:
+            self._exchange.request.place(self._request, inputs)
+        except FmuError:
+            self._request.cast("B")[:] = request_before
+            raise
+
+    # ------------------------------------------------------------------ many steps
+
+    def simulate(
+        self,
+        control: Histories | None = None,
+        health: Histories | None = None,
+        load: Histories | None = None,
+        port: Histories | None = None,
+        *,
+        steps: int | None = None,
+        progress: Progress | None = None,
+    ) -> ObservationHistory:
+        """Make many communication steps under prescribed inputs, from where the asset is.
+
+        The result is that of as many calls of `step`, to the bit. All inputs are checked before the
+        first step. If a step fails, the steps before it are made and the asset is where it was
+        before that one. If the FMU ends its simulation, the result ends there and says so in
+        `ended`.
+
+        Parameters
+        ----------
+        control, health, load, port : mapping of str to (N,) array-like or float
+            Inputs by the binding's names and in its units: one for each step, or one for all; (N,
+            n) or (n,) for an array. One that is not given keeps its last value.
+        steps : int, optional
+            Number of steps N; that of the histories if absent.
+        progress : Progress, optional
+            Where progress is shown.
+
+        Raises
+        ------
+        FmuInputError
+            If a value is not finite or out of range, or histories have different lengths; nothing
+            was sent.
+        BindingError, FmuCallError, FmuOutputError, FmuWorkerError, FmuTimeoutError
+            As `step`; the message says at which step. A worker that dies or takes too long reports
+            every 20 ms: the step named may be a little early.
+        """
+        histories: InputsByRole = {
+            "control": control,
+            "health": health,
+            "load": load,
+            "port": port,
+        }
+        if self._exchange.health_slots:
+            return self._simulate_with_restarts(histories, steps, progress)
+        return self._simulate(histories, steps, progress)
+
+    def _simulate_with_restarts(
+        self, histories: InputsByRole, steps: int | None, progress: Progress | None
+    ) -> ObservationHistory:
+        """Make many steps, with a new start wherever health changes; see `simulate`."""
+        parts = []
+        for run in split_where_health_changes(self._exchange, histories, steps):
+            self._restart_if_health_changes(run.first_inputs)
+            part = self._simulate(run.histories, run.steps, progress)
+            parts.append(part)
+            if part.ended:
+                break
+        return joined_histories(parts)
+
+    def _simulate(
+        self, histories: InputsByRole, steps: int | None, progress: Progress | None
+    ) -> ObservationHistory:
+        """Make many steps in one instance; see `simulate`."""
+        self._opened_instance(histories)
+        requests = self._exchange.request.rows(np.array(self._request), histories, steps)
+        count = len(requests)
+        index = np.arange(self.step_index, self.step_index + count + 1)
+        times = np.asarray(self._start_time + index * self._interval, dtype=np.float64)
+        requests[:, 0] = times[:-1]
+        requests[:, 1] = self._step_size
+        if self._linear_count:
+            self._set_begins_of_lines(requests)
+        replies = np.full((count, len(self._reply)), np.nan)
+        first_index = self.step_index
+        ended = self._run_in_blocks(requests, replies, progress)
+        if ended is None:
+            return self._exchange.outputs.history(times[1:], replies)
+        made = self.step_index - first_index
+        if ended.time is not None and ended.time > times[made]:
+            # the FMU has made a part of the next step, or all of it
+            made += 1
+            times[made] = ended.time
+            replies[made - 1] = np.frombuffer(self._present_outputs())
+        return self._exchange.outputs.history(times[1 : made + 1], replies[:made], ended.sentence)
+
+    def _set_begins_of_lines(self, requests: Float) -> None:
+        """Let the lines of each step begin where those of the step before end."""
+        moving = slice(2, 2 + self._linear_count)
+        requests[0, -self._linear_count :] = np.array(self._request[moving])
+        requests[1:, -self._linear_count :] = requests[:-1, moving]
+
+    def _run_in_blocks(
+        self, requests: Float, replies: Float, progress: Progress | None
+    ) -> FmuEndedError | None:
+        """Make steps in blocks of limited size; return how the FMU ended its simulation, if it did.
+
+        Parameters
+        ----------
+        requests : (N, 2 + n_inputs) ndarray
+            Request block of each step.
+        replies : (N, n_outputs) ndarray
+            Filled with the reply block of each step.
+        progress : Progress, optional
+            Where progress is shown.
+        """
+        length = max(1, _BLOCK_BYTES // max(requests[0].nbytes, replies[0].nbytes))
+        total = len(requests)
+        with reporter(progress).stage("Simulating", total=total, unit="steps") as stage:
+            for first in range(0, total, length):
+                block = slice(first, first + length)
+                ended = self._run_block(requests[block], replies[block], stage)
+                if ended is not None:
+                    return ended
+        return None
+
+    def _run_block(self, requests: Float, replies: Float, stage: Stage) -> FmuEndedError | None:
+        """Make a block of steps; return how the FMU ended its simulation, if it did.
+
+        Whatever happens, the asset is where the last complete step has left it.
+        """
+        request_before = np.array(self._request)
+        first_index = self.step_index
+        counter = _StepCounter(stage)
+        failure: FmuError | None = None
+        try:
+            failure = self._run_and_check_start(requests, replies, counter)
+        finally:
+            made = counter.made
+            self.step_index += made
+            last_request = requests[made - 1] if made else request_before
+            self._request[:] = last_request.data
+            if self.state_method == "replay":
+                self._record += [row[2:].tobytes() for row in requests[:made]]
+        if isinstance(failure, FmuEndedError):
+            return failure
+        if failure is not None:
+            self._raise_located(failure, f"step {self.step_index} from t = {self.time:g} s")
+        self._reply[:] = replies[made - 1]
+        self._refuse_not_finite(f" It was step {first_index + made - 1}.")
+        return None
+
+    def _run_and_check_start(
+        self, requests: Float, replies: Float, counter: "_StepCounter"
+    ) -> FmuError | None:
+        """Make a block of steps, again in other instances if the first step contradicts the start.
+
+        Parameters
+        ----------
+        requests : (N, 2 + n_inputs) ndarray
+            Request block of each step.
+        replies : (N, n_outputs) ndarray
+            Filled with the reply block of each step.
+        counter : _StepCounter
+            Counts the steps made.
+
+        Returns
+        -------
+        FmuError or None
+            Error of the step at which the FMU failed, if one did.
+        """
+        instance = self._opened_instance()
+        is_first_block = self.step_index == 0
+        while True:
+            failure: FmuError | None = None
+            try:
+                instance.run(requests, replies, counter.report)
+            except FmuError as error:
+                failure = error
+            if not is_first_block or not counter.made:
+                return failure
+            other = self._replaced_instance(requests[0].tobytes(), replies[0])
+            if other is None:
+                return failure
+            instance = other
+            counter.report(0)
+
+    def observe(self) -> Observation:
+        """Return the observation of this moment without a step, such as the initial one.
+
+        Raises
+        ------
+        FmuError
+            If the FMU fails, or an output is not finite.
+        """
+        instance = self._opened_instance()
+        try:
+            instance.read()
+        except FmuError as error:
+            self._raise_located(error, f"reading at t = {self.time:g} s")
+        return self._observation()
+
+    def _present_outputs(self) -> bytes:
+        """Return the outputs of this moment as doubles, as the FMU gives them."""
+        self._instance.read()
+        return self._reply.tobytes()
+
+
+class _StepCounter:
+    """Counts the steps of a block and shows them as progress.
+
+    Parameters
+    ----------
+    stage : Stage
+        Where progress is shown.
+
+    Attributes
+    ----------
+    made : int
+        Number of steps made.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self.made = 0
+
+    def report(self, made: int) -> None:
+        """Take the number of steps made."""
+        self._stage.advance(made - self.made)
+        self.made = made

@@ -1,1 +1,0 @@
-"""The one door to any FMU: bindings, what is sent and read."""

@@ -1,0 +1,377 @@
+"""Model exchange of FMI 1.0, 2.0 and 3.0, solved by SUNDIALS CVODE as if it were co-simulation.
+
+The solver is fmpy's, with the failures and the memory that its wrapper loses.
+"""
+
+# ruff: noqa: N802, N815 - methods and arguments have fmpy's names
+
+import ctypes
+import math
+from collections.abc import Callable, MutableSequence
+from typing import Protocol
+
+from fmpy.fmi1 import FMICallException, FMU1Model
+from fmpy.fmi2 import FMU2Model
+from fmpy.fmi3 import FMU3Model
+from fmpy.sundials import CVodeSolver
+from fmpy.sundials.libraries import sundials_core
+from fmpy.sundials.nvector_serial import N_VDestroy_Serial
+
+from fmu_asset.errors import FmuCallError, FmuError
+
+from .base import FmiCall, FmpyInstance, FmuInstance
+from .plan import InitialValues, LinearInputs, Plan
+from .statuses import DISCARD
+
+_MOST_EVENT_ITERATIONS = 100
+_MOST_EVENTS_IN_A_STEP = 10_000
+_MOST_INTERNAL_STEPS = 100_000
+_ROUNDING = 1e-12
+"""Share of a step by which two times may differ and still be the same."""
+
+for _name in ("SUNLinSolFree", "SUNMatDestroy", "SUNContext_Free"):
+    getattr(sundials_core, _name).argtypes = [ctypes.c_void_p]
+
+
+class FMU1ModelExchange(FMU1Model):  # type: ignore[misc]
+    """FMI 1.0 model exchange, which has no modes, with the methods of FMI 2.0."""
+
+    getNominalsOfContinuousStates = FMU1Model.getNominalContinuousStates
+
+    def setupExperiment(
+        self, *, startTime: float, stopTime: float | None, tolerance: float | None
+    ) -> None:
+        """Set the time, and keep the tolerance; this interface is told no end."""
+        self._tolerance = tolerance
+        self.setTime(startTime)
+
+    def enterInitializationMode(self) -> None:
+        """Do nothing, as in the other modes."""
+
+    enterEventMode = enterContinuousTimeMode = enterInitializationMode
+
+    def exitInitializationMode(self) -> None:
+        """Initialise, which is the first iteration of an event."""
+        is_controlled = b"\x00" if self._tolerance is None else b"\x01"
+        self._first_event = self.initialize(is_controlled, self._tolerance or 0.0)
+
+    def newDiscreteStates(self) -> tuple[bool, bool, bool, bool, bool, float]:
+        """Iterate once over an event."""
+        event = self._first_event or self.eventUpdate()
+        self._first_event = None
+        converged, _, _, terminated, has_next_event, next_event_time = event
+        return not converged, terminated, False, False, has_next_event, next_event_time
+
+    def completedIntegratorStep(self) -> tuple[bool, bool]:
+        """Return whether the FMU wants an event, and False: it cannot want to end."""
+        return bool(super().completedIntegratorStep()), False
+
+    def reset(self) -> None:
+        """Refuse: FMI 1.0 model exchange has no reset, so the asset makes a new instance."""
+        raise FmuCallError("FMI 1.0 model exchange has no reset.")
+
+
+class FMU3ModelExchange(FMU3Model):  # type: ignore[misc]
+    """FMI 3.0 model exchange with the methods of FMI 2.0."""
+
+    getDerivatives = FMU3Model.getContinuousStateDerivatives
+    newDiscreteStates = FMU3Model.updateDiscreteStates
+
+
+class MovingInputs(Protocol):
+    """The inputs of a model as the solver sees them."""
+
+    def apply(self, time: float) -> None:
+        """Set the inputs at a time [s]."""
+
+
+class CvodeSolver(CVodeSolver):  # type: ignore[misc]
+    """Backward differentiation with root finding for one model-exchange instance.
+
+    Parameters
+    ----------
+    fmu : fmpy model
+        The FMU, with the methods of FMI 2.0.
+    plan : Plan
+        Its numbers of states and event indicators, and the relative tolerance; absolute tolerances
+        are this times the nominal values.
+    inputs : MovingInputs
+        The inputs; they are set before each evaluation.
+    start_time : float
+        Start of the integration [s].
+    largest_step : float
+        Limit of internal steps [s], so that an event indicator that changes its sign twice is not
+        missed for long.
+    """
+
+    def __init__(
+        self,
+        fmu: FmpyInstance,
+        plan: Plan,
+        inputs: MovingInputs,
+        start_time: float,
+        largest_step: float,
+    ) -> None:
+        self._failure: Exception | None = None
+        self._is_open = True
+
+        def get_nominals(values: MutableSequence[float], count: int) -> None:
+            fmu.getNominalsOfContinuousStates(values, count)
+            for index in range(count):
+                # zero is no nominal value, and CVODE takes no tolerance of zero for a state of zero
+                values[index] = abs(values[index]) or 1.0
+
+        super().__init__(
+            nx=plan.fmu.states,
+            nz=plan.fmu.event_indicators,
+            get_x=fmu.getContinuousStates,
+            set_x=fmu.setContinuousStates,
+            get_dx=fmu.getDerivatives,
+            get_z=fmu.getEventIndicators,
+            get_nominals=get_nominals,
+            set_time=fmu.setTime,
+            input=inputs,
+            startTime=start_time,
+            maxStep=largest_step,
+            relativeTolerance=plan.solver_tolerance,
+            maxNumSteps=_MOST_INTERNAL_STEPS,
+        )
+
+    # ctypes prints and forgets an exception that leaves a callback, and CVODE would go on with
+    # wrong values: the exception is kept, and CVODE gets a status.
+
+    def f(self, t: float, y: object, ydot: object, user_data: object) -> int:
+        """Compute the right-hand side for CVODE: 1 asks for a smaller step, -1 ends integration."""
+        return self._guarded(self._right_hand_side, t, y, ydot, user_data)
+
+    def _right_hand_side(self, t: float, y: object, ydot: object, user_data: object) -> int:
+        self.input.apply(t)
+        return int(super().f(t, y, ydot, user_data))
+
+    def g(self, t: float, y: object, gout: object, user_data: object) -> int:
+        """Compute the event indicators for CVODE."""
+        return self._guarded(super().g, t, y, gout, user_data)
+
+    def _guarded(
+        self, function: Callable[..., int], t: float, y: object, result: object, user_data: object
+    ) -> int:
+        """Return the status of a callback; keep its exception instead of raising it."""
+        try:
+            return function(t, y, result, user_data)
+        except (FMICallException, FmuError) as error:
+            self._failure = error
+            return 1 if getattr(error, "status", None) == DISCARD else -1
+
+    def advance(self, begin: float, end: float) -> tuple[bool, float]:
+        """Integrate until a time [s] or an event.
+
+        Parameters
+        ----------
+        begin, end : float
+            Interval of integration [s].
+
+        Returns
+        -------
+        event : bool
+            Whether there was an event.
+        time : float
+            Time that was reached [s].
+
+        Raises
+        ------
+        FMICallException, FmuCallError
+            If the FMU failed.
+        RuntimeError
+            If CVODE failed.
+        """
+        self._failure = None
+        try:
+            event, _, time = self.step(begin, end)
+        except Exception as error:
+            if self._failure is not None:
+                raise self._failure from error
+            raise RuntimeError(self.error_info[3] if self.error_info else str(error)) from error
+        return event, time
+
+    def close(self) -> None:
+        """Free the solver, and what fmpy's wrapper does not free.
+
+        These are the vectors, the matrix, the linear solver and the context.
+        """
+        if not self._is_open:
+            return
+        super().__del__()
+        sundials_core.SUNLinSolFree(self.LS)
+        sundials_core.SUNMatDestroy(self.A)
+        N_VDestroy_Serial(self.x)
+        N_VDestroy_Serial(self.abstol)
+        sundials_core.SUNContext_Free(ctypes.byref(self.sunctx))
+        self._is_open = False
+
+    def __del__(self) -> None:
+        """Do nothing: `close` frees the solver."""
+
+
+class ModelExchange(FmuInstance):
+    """A model-exchange instance with its solver.
+
+    Inputs are held over a communication step, or move in straight lines. Where they differ from the
+    last ones there is an event at the communication point, and the solver starts again there, as it
+    does where a line bends; without a change it keeps its step size and order.
+    """
+
+    classes = {1: FMU1ModelExchange, 2: FMU2Model, 3: FMU3ModelExchange}  # noqa: RUF012
+    _solver: CvodeSolver | None = None
+    _next_event_time: float | None = None
+    _sent_inputs: bytes | None = None
+
+    def _go_to_start(
+        self, start_time: float, parameters: InitialValues, *, with_inputs: bool
+    ) -> None:
+        """Bring the instance to its first communication point, with its discrete states settled."""
+        self._close_solver()
+        super()._go_to_start(start_time, parameters, with_inputs=with_inputs)
+        self._settle_discrete_states(start_time)
+        self._sent_inputs = self._inputs_now() if with_inputs else None
+
+    def _inputs_now(self) -> bytes:
+        """Return the inputs of the block, after time and step size, to compare them to the bit."""
+        return bytes(self._values)[16:]
+
+    def _send_inputs(self) -> None:
+        """Set inputs that have changed, as an event."""
+        line_bends = False
+        if self._lines is not None:
+            slopes_before = bytes(self._lines.slopes)
+            self._lines.begin_step()
+            line_bends = bytes(self._lines.slopes) != slopes_before
+        inputs = self._inputs_now()
+        has_changed = inputs != self._sent_inputs
+        if not has_changed and not line_bends:
+            return
+        with self._fmpy_calls("setting inputs"):
+            if has_changed:
+                self._fmu.enterEventMode()
+                self._make_calls(self._set_calls)
+                self._sent_inputs = inputs
+                self._settle_discrete_states(self.request[0])
+            if self._solver is not None:
+                self._solver.reset(self.request[0])
+
+    def _calls_that_move(self, lines: LinearInputs) -> list[FmiCall]:
+        """Return the calls that set inputs that move, again at each evaluation of the model."""
+        moving = tuple(group for group in self._plan.inputs if group.linear)
+        return self._group_calls("Set", moving, self._values, 2)
+
+    def _send_moved_inputs(self, lines: LinearInputs) -> None:
+        """Do nothing: inputs move with the solver's time."""
+
+    def apply(self, time: float) -> None:
+        """Set the inputs that move at a time [s]; the solver calls this before each evaluation."""
+        if self._lines is not None:
+            self._lines.move_to(time)
+            self._make_calls(self._motion_calls)
+
+    def _do_step(self) -> None:
+        """Integrate over one communication step, from event to event."""
+        begin = self._step_begin.value
+        size = self._step_size.value
+        end = begin + size
+        with self._fmpy_calls(self._step_label()):
+            if self._solver is None:
+                self._solver = CvodeSolver(self._fmu, self._plan, self, begin, size)
+            time = begin
+            for _ in range(_MOST_EVENTS_IN_A_STEP):
+                time = self._integrate_to_event(self._solver, time, end, _ROUNDING * size)
+                if time >= end:
+                    self._sent_inputs = self._inputs_now()
+                    return
+        raise self._lost_error(
+            f"The FMU had {_MOST_EVENTS_IN_A_STEP} events in {self._step_label()} and is at "
+            f"t = {time:g} s; its events probably pile up. Reset the asset, and try a smaller "
+            "step_size."
+        )
+
+    def _integrate_to_event(
+        self, solver: CvodeSolver, time: float, end: float, resolution: float
+    ) -> float:
+        """Integrate to the end or to the next event, and handle that; return the time reached [s].
+
+        Parameters
+        ----------
+        solver : CvodeSolver
+            The solver.
+        time, end : float
+            Present time, and end of the communication step [s].
+        resolution : float
+            Times that differ by less are the same [s].
+        """
+        # integrate
+        due = self._next_event_time
+        target = end if due is None or due >= end - resolution else max(due, time)
+        has_event = False
+        if target > time + resolution:
+            try:
+                has_event, time = solver.advance(time, target)
+            except RuntimeError as error:
+                raise self._lost_error(
+                    f"The solver could not integrate the FMU in the step from t = {time:g} s "
+                    f"({error}); reset the asset, and try a smaller step_size or another tolerance "
+                    "in the binding."
+                ) from error
+        if not has_event and abs(time - end) <= resolution:
+            time = end
+        # bring the FMU to the time reached
+        self._fmu.setTime(time)
+        self.apply(time)
+        if self._plan.fmu.completed_step:
+            wants_event, terminated = self._fmu.completedIntegratorStep()
+            if terminated:
+                raise self._ended_error(time)
+            has_event = has_event or bool(wants_event)
+        # handle an event
+        is_time_event = due is not None and time >= due - resolution
+        if has_event or is_time_event:
+            self._fmu.enterEventMode()
+            self._settle_discrete_states(time)
+            solver.reset(time)
+        return time
+
+    def _settle_discrete_states(self, time: float) -> None:
+        """Update the discrete states until they do not change, and go on in continuous time."""
+        for _ in range(_MOST_EVENT_ITERATIONS):
+            update = self._fmu.newDiscreteStates()
+            needs_another, terminated, _, _, has_next_event, next_event_time = update
+            if terminated:
+                raise self._ended_error(time)
+            if not needs_another:
+                break
+        else:
+            raise self._lost_error(
+                f"The FMU's discrete states do not settle at t = {time:g} s: "
+                f"{_MOST_EVENT_ITERATIONS} event iterations were made; the instance is lost."
+            )
+        is_stated = has_next_event and math.isfinite(next_event_time)
+        self._next_event_time = next_event_time if is_stated else None
+        self._fmu.enterContinuousTimeMode()
+
+    def _lost_error(self, sentence: str) -> FmuCallError:
+        """Give the instance up, and return the error that says why."""
+        self.lost = True
+        return FmuCallError(sentence, self._last_messages())
+
+    def _close_solver(self) -> None:
+        if self._solver is not None:
+            self._solver.close()
+        self._solver = None
+        self._next_event_time = None
+        self._sent_inputs = None
+
+    def reset(self) -> None:
+        """Bring the instance back to the moment after its instantiation."""
+        self._close_solver()
+        super().reset()
+
+    def _terminate_and_free(self) -> None:
+        self._close_solver()
+        super()._terminate_and_free()

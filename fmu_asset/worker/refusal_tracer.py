@@ -1,0 +1,232 @@
+"""The tracer by which a supervisor counts what the sandbox refuses its worker (ptrace(2))."""
+
+import ctypes
+import json
+import os
+import signal
+import struct
+from contextlib import suppress
+from errno import EACCES, EPERM, EXDEV
+from typing import Any
+
+from .traced_calls import (
+    CALLS_OF_FOLDERS,
+    PATH_OF_PROGRAM,
+    RENAMING,
+    SIGNALLING,
+    SystemCall,
+    calls_of_this_processor,
+)
+
+_FAMILIES = {1: "Unix", 2: "IPv4", 10: "IPv6", 16: "netlink", 17: "packet"}
+_UNIX = 1
+_IPV4 = 2
+_IPV6 = 10
+
+# requests of ptrace(2), <linux/ptrace.h>
+_CONTINUE_TO_CALL = 24
+_SEIZE = 0x4206
+_INTERRUPT = 0x4207
+_LISTEN = 0x4208
+_GET_CALL = 0x420E
+# options: mark stops at calls, and follow all descendants
+_MARK_CALLS = 1 << 0
+_FOLLOW_FORK = 1 << 1
+_FOLLOW_VFORK = 1 << 2
+_FOLLOW_CLONE = 1 << 3
+_FOLLOW_EXEC = 1 << 4
+_END_WITH_TRACER = 1 << 20
+_OPTIONS = (
+    _MARK_CALLS | _FOLLOW_FORK | _FOLLOW_VFORK | _FOLLOW_CLONE | _FOLLOW_EXEC | _END_WITH_TRACER
+)
+_CALL_STOP = signal.SIGTRAP | 0x80
+"""Signal that waitpid(2) shows for a thread that has stopped at a call."""
+_STOP_EVENT = 128
+_HALTING = (signal.SIGSTOP, signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU)
+# struct ptrace_syscall_info: its head, and its parts at the entry and at the exit of a call
+_CALL_HEAD = struct.Struct("<B3xIQQ")
+_CALL_ENTRY = struct.Struct("<7Q")
+_CALL_EXIT = struct.Struct("<qB")
+_AT_ENTRY = 1
+_AT_EXIT = 2
+_LONGEST_PATH = 4096
+_LONGEST_ADDRESS = 128
+_WORKING_FOLDER = -100  # AT_FDCWD
+
+
+class RefusalTracer:
+    """The supervisor's tracer of one worker and its descendants.
+
+    Parameters
+    ----------
+    report : int
+        File descriptor of the report, which holds the refusals of earlier workers.
+    """
+
+    def __init__(self, report: int) -> None:
+        self._report = report
+        content = os.pread(report, os.fstat(report).st_size, 0)
+        self._refused: dict[str, tuple[int, str]] = json.loads(content or b"{}").get("refused", {})
+        self._calls = calls_of_this_processor()
+        # number and arguments of the system call that each thread is in
+        self._pending: dict[int, tuple[int, ...]] = {}
+        self._libc = ctypes.CDLL(None, use_errno=True)
+        self._libc.ptrace.argtypes = [
+            ctypes.c_long,
+            ctypes.c_long,
+            ctypes.c_void_p,
+            ctypes.c_void_p,
+        ]
+        self._libc.ptrace.restype = ctypes.c_long
+        self._buffer = ctypes.create_string_buffer(_CALL_HEAD.size + 8 * 8)
+
+    def begin(self, worker: int) -> None:
+        """Trace a process from now on; if the system does not allow it, the report says so.
+
+        Parameters
+        ----------
+        worker : int
+            Number of the process.
+        """
+        try:
+            if not self._calls:
+                raise OSError(0, f"the system calls of {os.uname().machine} are not known")
+            self._ptrace(_SEIZE, worker, 0, _OPTIONS)
+            self._ptrace(_INTERRUPT, worker)
+        except OSError as error:
+            self._write({"unavailable": error.strerror})
+            return
+        self._save()
+
+    def resume(self, thread: int, status: int) -> None:
+        """Resume a thread that has stopped, after a look at the system call that it has made.
+
+        Parameters
+        ----------
+        thread, status : int
+            Number and status of the thread from waitpid(2).
+        """
+        stop_signal = os.WSTOPSIG(status)
+        event = status >> 16
+        delivered = 0
+        request = _CONTINUE_TO_CALL
+        if stop_signal == _CALL_STOP:
+            self._look_at_call(thread)
+        elif event == _STOP_EVENT and stop_signal in _HALTING:
+            request = _LISTEN
+        elif not event:
+            delivered = stop_signal
+        # it may have been killed meanwhile
+        with suppress(OSError):
+            self._ptrace(request, thread, 0, delivered)
+
+    def _ptrace(self, request: int, thread: int, address: int = 0, data: int = 0) -> None:
+        if self._libc.ptrace(request, thread, address, data) < 0:
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+    def _look_at_call(self, thread: int) -> None:
+        """Remember a call that begins; count one that ends with a refusal."""
+        try:
+            self._ptrace(_GET_CALL, thread, len(self._buffer), ctypes.addressof(self._buffer))
+        except OSError:
+            return
+        stage, *_ = _CALL_HEAD.unpack_from(self._buffer)
+        if stage == _AT_ENTRY:
+            self._pending[thread] = _CALL_ENTRY.unpack_from(self._buffer, _CALL_HEAD.size)
+        elif stage == _AT_EXIT:
+            number, *arguments = self._pending.pop(thread, (0,))
+            result, has_failed = _CALL_EXIT.unpack_from(self._buffer, _CALL_HEAD.size)
+            call = self._calls.get(number)
+            if has_failed and arguments and call is not None and _is_refusal(call, -result):
+                self._count(thread, call, arguments)
+
+    def _count(self, thread: int, call: SystemCall, arguments: list[int]) -> None:
+        """Count a refused call; the first of its kind is described.
+
+        Parameters
+        ----------
+        thread : int
+            Number of the thread that made the call.
+        call : SystemCall
+            The call.
+        arguments : list of int
+            Its arguments.
+        """
+        count, first = self._refused.get(call.kind, (0, ""))
+        description = first or self._description(thread, call, arguments)
+        self._refused[call.kind] = (count + 1, description)
+        self._save()
+
+    def _description(self, thread: int, call: SystemCall, arguments: list[int]) -> str:
+        """Return the thing that a call reached for, and its name; arguments as for `_count`."""
+        value = arguments[call.argument]
+        if call.kind == "others":
+            return call.name
+        if call.kind == "files" or call.name in PATH_OF_PROGRAM:
+            folder = _WORKING_FOLDER
+            if call.name in CALLS_OF_FOLDERS:
+                folder = ctypes.c_int(arguments[0]).value
+            return f"{self._path(thread, folder, value)} by {call.name}"
+        if call.name in ("socket", "socketpair"):
+            return f"{_FAMILIES.get(value, f'family {value}')} by {call.name}"
+        if call.name == "sendmsg":
+            return call.name
+        if call.kind == "sockets":
+            return f"{_address_text(self._memory(thread, value, _LONGEST_ADDRESS))} by {call.name}"
+        return f"process {ctypes.c_int(value).value} by {call.name}"
+
+    def _path(self, thread: int, folder: int, address: int) -> str:
+        """Return the absolute path at an address in the memory of a thread."""
+        text, *_ = self._memory(thread, address, _LONGEST_PATH).split(b"\0")
+        path = os.fsdecode(text)
+        start = "cwd" if folder == _WORKING_FOLDER else f"fd/{folder}"
+        with suppress(OSError):
+            base = os.readlink(f"/proc/{thread}/{start}")  # noqa: PTH115 - light
+            path = os.path.join(base, path)  # noqa: PTH118
+        return path.encode("utf-8", "replace").decode()
+
+    def _memory(self, thread: int, address: int, length: int) -> bytes:
+        """Return the bytes at an address; fewer where the memory ends, none where there is none."""
+        try:
+            memory = os.open(f"/proc/{thread}/mem", os.O_RDONLY | os.O_CLOEXEC)
+        except OSError:
+            return b""
+        try:
+            return os.pread(memory, length, address)
+        except (OSError, OverflowError):
+            return b""
+        finally:
+            os.close(memory)
+
+    def _save(self) -> None:
+        self._write({"refused": self._refused})
+
+    def _write(self, record: dict[str, Any]) -> None:
+        content = json.dumps(record).encode()
+        os.pwrite(self._report, content, 0)
+        os.ftruncate(self._report, len(content))
+
+
+def _is_refusal(call: SystemCall, error: int) -> bool:
+    """Return whether a call has failed with an error as the sandbox lets it fail."""
+    if error == EACCES:
+        return True
+    if error == EPERM:
+        return call.name in SIGNALLING
+    return error == EXDEV and call.name in RENAMING
+
+
+def _address_text(address: bytes) -> str:
+    """Return a socket address (`struct sockaddr`) as text."""
+    if len(address) < 2:
+        return "an address"
+    family = int.from_bytes(address[:2], "little")
+    port = int.from_bytes(address[2:4], "big")
+    if family == _IPV4:
+        return f"{'.'.join(str(byte) for byte in address[4:8])}:{port}"
+    if family == _IPV6:
+        groups = ":".join(address[k : k + 2].hex() for k in range(8, 24, 2))
+        return f"[{groups}]:{port}"
+    if family == _UNIX:
+        return address[2:].split(b"\0")[0].decode("utf-8", "replace") or "a Unix socket"
+    return f"family {family}"

@@ -1,0 +1,347 @@
+"""The supervisor: a process between twin and worker that clears up when one of them is gone.
+
+The worker is a fork of the supervisor, made before any library is loaded, and nothing of the FMU
+ever runs in the supervisor: neither an endless loop nor an FMU in Python that holds the interpreter
+can stop it. The system hands it all orphans of the worker (`PR_SET_CHILD_SUBREAPER`), so that
+processes that the FMU has started are ended in whatever process group or session they hide.
+
+`PR_SET_PDEATHSIG` alone would leave folders and orphans behind, and seen from the twin it goes off
+when the thread that started the worker ends, not the process.
+"""
+
+import ctypes
+import os
+import select
+import signal
+import time
+from contextlib import suppress
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+from fmu_asset.folders import remove_folder
+
+from .protocol import WORKER_NUMBER, Exit, has_ended
+
+if TYPE_CHECKING:
+    from .refusal_tracer import RefusalTracer
+
+_GRACE = 2.0
+"""Seconds in which a worker without a twin ends by itself."""
+_LONGEST_END = 5.0
+"""Seconds in which the descendants of a worker must have ended."""
+_PR_SET_PDEATHSIG = 1
+_PR_SET_CHILD_SUBREAPER = 36
+_ALL_THREADS = 0x40000000  # __WALL of waitpid(2)
+_MOST_STOPS = 1000
+"""Stops of a traced worker after which the supervisor looks at the twin."""
+_HANDLED_SIGNALS = (signal.SIGTERM, signal.SIGCHLD)
+
+
+class _Twin(NamedTuple):
+    """The twin as its supervisor sees it.
+
+    Attributes
+    ----------
+    process : int
+        File descriptor of its process.
+    incoming, outgoing : int
+        File descriptors of the two pipes.
+    """
+
+    process: int
+    incoming: int
+    outgoing: int
+
+
+class _Worker(NamedTuple):
+    """The worker as its supervisor sees it.
+
+    Attributes
+    ----------
+    number : int
+        Process number.
+    process : int
+        File descriptor of its process.
+    """
+
+    number: int
+    process: int
+
+
+def supervise(scratch: str, shared: str, grants: str, report: str) -> NoReturn:
+    """Start the worker, wait for its end or the twin's, clear up, and end as the worker did.
+
+    The pipes to the twin are the standard input and output. The worker has them elsewhere, and
+    what an FMU prints goes to the log.
+
+    Parameters
+    ----------
+    scratch, shared : str
+        Folder of the worker, and of the extracted FMU; the twin removes them unless it is dead.
+    grants : str
+        `Grants` of the sandbox as JSON; an empty text for none.
+    report : str
+        Number of the file descriptor to which refusals of the sandbox go; an empty text if none are
+        counted.
+    """
+    twin = _move_pipes_of_twin()
+    _limit_this_process()
+    # start the worker
+    signal.pthread_sigmask(signal.SIG_BLOCK, _HANDLED_SIGNALS)
+    worker = _start_worker(twin, scratch, shared, grants, report)
+    tracer = _tracer_of(worker.number, report)
+    statuses: dict[int, int] = {}
+    was_asked_to_end = False
+
+    def end_worker(*_: object) -> None:
+        nonlocal was_asked_to_end
+        was_asked_to_end = True
+        _kill(worker.process)
+
+    def reap_children(*_: object) -> None:
+        _reap_children(statuses)
+
+    signal.signal(signal.SIGCHLD, reap_children if tracer is None else _do_nothing)
+    signal.signal(signal.SIGTERM, end_worker)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _HANDLED_SIGNALS)
+    os.write(twin.outgoing, WORKER_NUMBER.pack(worker.number))
+    os.close(twin.outgoing)
+    # wait for its end
+    is_deserted = _wait_for_end(worker, twin, tracer, statuses)
+    # from here on no process number is reused unnoticed
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    if worker.number in statuses:
+        status = statuses[worker.number]
+    else:
+        _, status = os.waitpid(worker.number, 0)
+    # clear up
+    _end_descendants()
+    # the pipes of a twin are closed a moment before it is dead
+    if is_deserted and not was_asked_to_end and status != 0 and has_ended(twin.process, 1.0):
+        remove_folder(scratch)
+        remove_folder(shared)
+    _end_as(status)
+
+
+def _move_pipes_of_twin() -> _Twin:
+    """Return the twin and its pipes, which are no longer the standard input and output."""
+    parent = os.getppid()
+    # The end of a pipe says nothing: an FMU can open the other side of it for itself.
+    process = os.pidfd_open(parent)
+    if os.getppid() != parent:
+        os._exit(0)  # the twin has ended meanwhile
+    twin = _Twin(process, incoming=os.dup(0), outgoing=os.dup(1))
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(2, 1)
+    return twin
+
+
+def _limit_this_process() -> None:
+    """Write no core files, and become the parent of all orphans among the descendants."""
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def _start_worker(twin: _Twin, scratch: str, shared: str, grants: str, report: str) -> _Worker:
+    """Return the worker, a fork of this process; arguments as for `supervise`."""
+    supervisor = os.getpid()
+    number = os.fork()
+    if number == 0:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, _HANDLED_SIGNALS)
+        os.close(twin.process)
+        if report:
+            os.close(int(report))
+        os.setpgid(0, 0)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        if os.getppid() != supervisor:
+            os._exit(0)  # the supervisor has ended meanwhile
+        _work(twin, scratch, shared, grants)
+    return _Worker(number, os.pidfd_open(number))
+
+
+def _work(twin: _Twin, scratch: str, shared: str, grants: str) -> NoReturn:
+    """Serve the twin in the sandbox, as the worker; arguments as for `supervise`."""
+    # Imports are here so that the supervisor has nothing of them, and before the sandbox, since
+    # some libraries start programs.
+    try:
+        import json
+
+        from .sandbox import Grants, confine
+        from .server import serve
+
+        is_confined = False
+        if grants:
+            is_confined = confine(Grants(**json.loads(grants)), scratch, shared)
+        serve(twin.incoming, twin.outgoing, confined=is_confined)
+    except BaseException:  # noqa: BLE001 - the twin reads the last words in worker.log
+        import traceback
+
+        traceback.print_exc()
+    os._exit(Exit.OWN_FAILURE)
+
+
+def _end_as(status: int) -> NoReturn:
+    """End this process in the way of the worker, by the same signal or exit status.
+
+    The twin sees only this process, and reports how the worker died.
+
+    Parameters
+    ----------
+    status : int
+        Status of the worker from waitpid(2).
+    """
+    if os.WIFSIGNALED(status):
+        number = os.WTERMSIG(status)
+        if number != signal.SIGKILL:
+            signal.signal(number, signal.SIG_DFL)
+        os.kill(os.getpid(), number)
+    os._exit(os.waitstatus_to_exitcode(status) % 256)
+
+
+def _tracer_of(worker: int, report: str) -> "RefusalTracer | None":
+    """Return the tracer that counts the refusals of a worker; None if they are not counted.
+
+    Parameters
+    ----------
+    worker : int
+        Process number of the worker.
+    report : str
+        Number of the file descriptor for the counts, or an empty text.
+    """
+    if not report:
+        return None
+    from .refusal_tracer import RefusalTracer
+
+    tracer = RefusalTracer(int(report))
+    tracer.begin(worker)
+    return tracer
+
+
+def _kill(process: int) -> None:
+    with suppress(ProcessLookupError):
+        signal.pidfd_send_signal(process, signal.SIGKILL)
+
+
+def _do_nothing(*_: object) -> None:
+    """Handle a signal: that it came is seen at the wakeup descriptor."""
+
+
+def _reap_children(statuses: dict[int, int]) -> None:
+    """Reap all children that have ended, and keep their exit statuses by process number."""
+    with suppress(ChildProcessError):
+        while True:
+            process, status = os.waitpid(-1, os.WNOHANG)
+            if process == 0:
+                return
+            statuses[process] = status
+
+
+def _resume_stopped(tracer: "RefusalTracer", statuses: dict[int, int]) -> bool:
+    """Resume threads that have stopped at a system call, and reap processes that have ended.
+
+    Parameters
+    ----------
+    tracer : RefusalTracer
+        The tracer, which looks at the calls.
+    statuses : dict of int to int
+        Exit statuses by process number; extended in place.
+
+    Returns
+    -------
+    bool
+        Whether there may be more of them.
+    """
+    with suppress(ChildProcessError):
+        for _ in range(_MOST_STOPS):
+            process, status = os.waitpid(-1, os.WNOHANG | _ALL_THREADS)
+            if process == 0:
+                return False
+            if os.WIFSTOPPED(status):
+                tracer.resume(process, status)
+            else:
+                statuses[process] = status
+        return True
+    return False
+
+
+def _wait_for_end(
+    worker: _Worker, twin: _Twin, tracer: "RefusalTracer | None", statuses: dict[int, int]
+) -> bool:
+    """Wait for the worker's end; return whether the twin has closed its pipe or is gone.
+
+    A traced worker stops at each of its system calls until it is resumed here. That is not done in
+    the handler of SIGCHLD, since handlers interrupt each other.
+
+    Parameters
+    ----------
+    worker : _Worker
+        The worker.
+    twin : _Twin
+        The twin.
+    tracer : RefusalTracer or None
+        Counts the refusals of the worker.
+    statuses : dict of int to int
+        Exit statuses by process number; extended in place.
+    """
+    woken, waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+    signal.set_wakeup_fd(waking, warn_on_full_buffer=False)
+    has_stopped = tracer is not None
+    poll = select.poll()
+    poll.register(woken, select.POLLIN)
+    poll.register(worker.process, select.POLLIN)
+    poll.register(twin.incoming, 0)  # the end of a pipe is reported in any case
+    poll.register(twin.process, select.POLLIN)
+    deadline: float | None = None
+    while True:
+        limit = None if deadline is None else 1000.0 * max(deadline - time.monotonic(), 0.0)
+        events = {descriptor for descriptor, _ in poll.poll(0 if has_stopped else limit)}
+        if woken in events:
+            os.read(woken, 4096)
+        if tracer is not None and (has_stopped or woken in events):
+            has_stopped = _resume_stopped(tracer, statuses)
+        # the twin first: a worker that its twin has left may end before we look
+        for descriptor in events - {worker.process, woken}:
+            poll.unregister(descriptor)
+            deadline = time.monotonic() + _GRACE
+        if worker.process in events:
+            return deadline is not None
+        if deadline is not None and time.monotonic() >= deadline:
+            _kill(worker.process)
+            deadline = time.monotonic() + _GRACE
+
+
+def _end_descendants() -> None:
+    """Kill the processes that the worker has left.
+
+    The children of a process that is killed become the supervisor's children, and are next.
+    """
+    deadline = time.monotonic() + _LONGEST_END
+    while time.monotonic() < deadline:
+        try:
+            process, _ = os.waitpid(-1, os.WNOHANG)
+        except ChildProcessError:
+            return
+        if process:
+            continue
+        for child in _children():
+            os.kill(child, signal.SIGKILL)
+            group = os.getpgid(child)
+            if group != os.getpgrp():
+                # the whole group at once, so that none of them starts a child meanwhile
+                os.killpg(group, signal.SIGKILL)
+        time.sleep(0.002)
+
+
+def _children() -> list[int]:
+    """Return the process numbers of the supervisor's children."""
+    children = []
+    for name in os.listdir("/proc"):  # noqa: PTH208 - pathlib would be loaded for this alone
+        if not name.isdigit():
+            continue
+        with suppress(OSError):
+            with open(f"/proc/{name}/stat", "rb") as file:  # noqa: PTH123
+                fields_after_name = file.read().rpartition(b")")[2].split()
+            if int(fields_after_name[1]) == os.getpid():
+                children.append(int(name))
+    return children
