@@ -5,7 +5,8 @@ By the latter, campaigns are calibrated and effects searched for: `docs/fmu_mode
 
 import numpy as np
 
-from fe.structure.design import Load, MatrixDesign, MatrixLoad, MeshDesign, NodeOutput, PointOutput
+from fe.structure.design import MeshDesign, MeshLoad, PointOutput
+from fe.structure.matrix_design import MatrixDesign, MatrixLoad, NodeOutput
 from fe.structure.tables import StructureDesign
 from fmu_asset.client.binding import Binding, parse_binding
 from fmu_asset.description import rendered
@@ -82,7 +83,7 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     return text.rstrip() + "\n"
 
 
-def _is_unit_force_along(load: Load | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
+def _is_unit_force_along(load: MeshLoad | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
     """Return whether a load is a force of 1 N at the point or node of an output, and along it."""
     if load.force is None or output.direction is None:
         return False
@@ -93,6 +94,6 @@ def _is_unit_force_along(load: Load | MatrixLoad, output: PointOutput | NodeOutp
     return bool(np.abs(np.asarray(load.force) - direction).max() < 1e-9)
 
 
-def _location(part: Load | MatrixLoad | PointOutput | NodeOutput) -> object:
+def _location(part: MeshLoad | MatrixLoad | PointOutput | NodeOutput) -> object:
     """Return the point or node of a load or output; None if it has none."""
     return getattr(part, "point", getattr(part, "node", None))
