@@ -14,7 +14,8 @@ from fmpy import simulate_fmu
 from fmpy.fmi2 import FMU2Slave
 
 from fmu_asset.archive.fmu_file import extract_fmu, read_fmu
-from fmu_asset.compiled.package import compile_library, fmi_headers
+from fmu_asset.compiled.compiler import compile_library
+from fmu_asset.compiled.package import fmi_headers
 
 LEVELS = 400
 """How many levels of damage follow one another."""

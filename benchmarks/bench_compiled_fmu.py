@@ -11,7 +11,7 @@ from benchmarks.measurement import Measurement, least_seconds, median_seconds
 from fe.reduction.model_cache import reduced_model
 from fmu_asset.client.binding import load_binding
 from fmu_asset.client.session import FmiAsset
-from fmu_asset.compiled.package import find_compiler
+from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
 from fmu_asset.packing.structure_fmu import build_fmu
 

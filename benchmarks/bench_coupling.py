@@ -16,12 +16,12 @@ from fmu_asset.companions.build import companion_bytes
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
     Component,
+    ComponentSetting,
     Connector,
-    Setting,
     SystemStructure,
     expand_connection,
 )
-from fmu_asset.coupling.system import parts_of, system_description
+from fmu_asset.coupling.system import stepped_components, system_description
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
@@ -74,7 +74,9 @@ def three_fmus(folder: Path) -> Wiring:
     )
     components = tuple(
         Component(
-            c.name, fmus[c.name], {key: Setting(value) for key, value in c.parameters.items()}
+            c.name,
+            fmus[c.name],
+            {key: ComponentSetting(value) for key, value in c.parameters.items()},
         )
         for c in asset.component
     )
@@ -87,7 +89,7 @@ def _in_process(wiring: Wiring, binding: Binding) -> tuple[float, float, float, 
     The FMUs alone have the bindings and inputs that they have in the system, and nothing passes
     between them.
     """
-    parts = parts_of(wiring, Exchange(system_description(wiring), binding))
+    parts = stepped_components(wiring, Exchange(system_description(wiring), binding))
     loads = itertools.cycle((2.0, 3.0))
     assets, inputs = [], []
     with CoupledAsset(wiring, binding, isolated=False) as coupled:

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.measurement import Measurement
 from fe.reduction.model_cache import reduced_model
-from fmu_asset.packing.contents import build_script_fmu
+from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from scenarios import asset_scripts, binding_files
 from twin_master.library.grid import SamplingGrid

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calibration.errors import ExperimentDataError, ExperimentFileError
-from calibration.result.record import ParameterPrior, Reading
+from calibration.result.record import FigureReading, ParameterPrior
 from calibration.static.experiments import HALF_WIDTH_95
 from calibration.static.posterior import GaussianPrior
 from fe.runtime.errors import InvalidDesignError
@@ -79,9 +79,11 @@ class MeasuredLength:
         )
 
     @property
-    def reading(self) -> Reading:
+    def reading(self) -> FigureReading:
         """The reading: the measured length with its uncertainty."""
-        return Reading(self.name, "planform", self.measured, READING_UNCERTAINTY / HALF_WIDTH_95)
+        return FigureReading(
+            self.name, "planform", self.measured, READING_UNCERTAINTY / HALF_WIDTH_95
+        )
 
     @property
     def posterior(self) -> GaussianPrior:

@@ -15,7 +15,7 @@ import numpy as np
 from calibration.dynamics.records import RingDownRecord
 from calibration.errors import ExperimentDataError
 from calibration.joint.wing_table import weighed
-from calibration.result.record import Reading
+from calibration.result.record import FigureReading
 from calibration.static.experiments import (
     HALF_WIDTH_95,
     LoadDisplacementData,
@@ -324,7 +324,7 @@ def measure_lengths(
     return Lengths(*lengths)
 
 
-def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> Reading:
+def weigh(truth: DigitalState, seed: Seed, *, standard_deviation: float = 1e-3) -> FigureReading:
     """Return the reading of a weighing of two servos and the pitot tube.
 
     Parameters

@@ -1,12 +1,11 @@
-"""Loops over numbers compiled by numba, with the machine code kept on disk between processes.
+"""Numerical loops compiled by numba, with the machine code kept on disk between processes.
 
-Without numba (extra `uav-twin[fast]`) they run as what they are, plain Python.
+Without numba (extra `uav-twin[fast]`) the same functions run as plain Python.
 """
 
 import functools
 import hashlib
 import inspect
-import itertools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -30,161 +29,212 @@ except ModuleNotFoundError:
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
-OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-"""A division by zero gives infinity, as in NumPy: a loop that might raise is not computed side by side."""
-WITHOUT = (
-    "numba is not installed, and loops run as plain Python: a mission takes 25 seconds more, `discrepancy` "
-    "several times as long. pip install 'uav-twin[fast]'"
+NumericalFunction = Callable[..., Any]
+"""A function in the subset of Python that numba knows."""
+
+# A division by zero gives infinity, as in NumPy: numba does not vectorise a loop that may raise an
+# error.
+OPTIONS: dict[str, bool | str] = {"nogil": True, "error_model": "numpy"}
+"""Options of numba."""
+
+WITHOUT_NUMBA = (
+    "numba is not installed, and loops run as plain Python: a mission takes 25 seconds more, "
+    "`discrepancy` several times as long. pip install 'uav-twin[fast]'"
 )
 
 
 def compiled(
-    function: Callable[Parameters, Result], calls: Iterable[Callable[..., Any]] = ()
+    function: Callable[Parameters, Result], calls: Iterable[NumericalFunction] = ()
 ) -> Callable[Parameters, Result]:
-    """Compile `function` with numba when it is first called; it runs without the interpreter lock.
+    """Return a function compiled by numba, at its first call; it runs without the interpreter lock.
 
-    That it is compiled, or runs plain, is told once in a process.
+    The first time in a process that something is compiled, or runs as plain Python, the user gets a
+    note.
 
-    The machine code is kept where `NUMBA_CACHE_DIR` says, else beside the function's file, else in the folder
-    of what is kept between runs, under a hash of the sources. If none can be written, it is compiled anew in
-    every process.
+    The machine code is kept in the folder `NUMBA_CACHE_DIR`, else beside the function's file, else
+    in the folder of what is kept between runs, under a hash of the sources. If none can be written,
+    the function is compiled anew in every process.
 
     Parameters
     ----------
     function : callable
-        In the subset of Python that numba knows.
+        The function, in the subset of Python that numba knows.
     calls : iterable of callable
-        Plain functions of other files that it calls: numba by itself sees changes of its own file only.
-        The files of compiled functions that its module names count without being told.
+        Plain functions of other files that it calls: numba by itself sees changes of its own file
+        only. The files of compiled functions that its module names are found without them.
     """
     if numba is None:
-        return _plain(function)
-    named = [item.py_func for item in function.__globals__.values() if hasattr(item, "py_func")]
-    with _kept_by_sources([inspect.getfile(item) for item in (function, *calls, *named)]):
+        return _plain_with_note(function)
+    compiled_callees = [
+        value.py_func for value in function.__globals__.values() if hasattr(value, "py_func")
+    ]
+    source_files = [inspect.getfile(source) for source in (function, *calls, *compiled_callees)]
+    with _cache_named_by_sources(source_files):
         try:
-            made = numba.njit(cache=True, **OPTIONS)(function)
-        except RuntimeError:  # numba's way to say that it found no writable folder
-            made = numba.njit(**OPTIONS)(function)
-    return cast("Callable[Parameters, Result]", made)
+            compiled_function = numba.njit(cache=True, **OPTIONS)(function)
+        except RuntimeError:  # raised by numba if it finds no folder that it can write to
+            compiled_function = numba.njit(**OPTIONS)(function)
+    return cast("Callable[Parameters, Result]", compiled_function)
 
 
-def _plain(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def _plain_with_note(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Return a function as plain Python that tells once that numba is missing."""
     with_silent_divisions = np.errstate(all="ignore")(function)
 
     @functools.wraps(function)
-    def plain(*given: Parameters.args, **named: Parameters.kwargs) -> Result:
-        _tell_once(WITHOUT)
-        return with_silent_divisions(*given, **named)
+    def plain(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        _note_once(WITHOUT_NUMBA)
+        return with_silent_divisions(*args, **kwargs)
 
     return plain
 
 
-_tell_once = functools.cache(note)
+_note_once = functools.cache(note)
 
 if numba is not None:
 
-    class _Announcement(event.Listener):  # type: ignore[misc]
-        """Told is the first loop that is not found on disk."""
+    class _CompilationNote(event.Listener):  # type: ignore[misc]
+        """Notes the first compilation of a function that is not on disk."""
 
-        def on_start(self, event: Any) -> None:
-            _tell_once("Compiling loops by numba, kept for later runs: 10 to 25 s ...")
+        def on_start(self, event: object) -> None:
+            _note_once("Compiling loops by numba, kept for later runs: 10 to 25 s ...")
 
-        def on_end(self, event: Any) -> None:
-            """Nothing: the stage of the command that compiles tells its time."""
+        def on_end(self, event: object) -> None:
+            """Do nothing: the stage of the command that compiles shows its time."""
 
-    event.register("numba:compile", _Announcement())
+    event.register("numba:compile", _CompilationNote())
 
 
 @contextmanager
-def _kept_by_sources(files: list[str]) -> Iterator[None]:
-    """Have numba keep what is declared meanwhile by the content of files, the function's own first."""
+def _cache_named_by_sources(files: list[str]) -> Iterator[None]:
+    """Set numba's cache folder, meanwhile, to one that is named by the content of source files.
+
+    Parameters
+    ----------
+    files : list of str
+        The source files, the compiled function's own first.
+    """
     digest = hashlib.sha256()
-    for file in sorted({*files, __file__}):  # what makes a choice among laws, too
+    for file in sorted({*files, __file__}):  # this file generates code, too
         digest.update(Path(file).read_bytes())
-    given = numba.config.CACHE_DIR
-    beside = Path(files[0]).parent
-    folder = beside / "__pycache__" if os.access(beside, os.W_OK) else cache_folder() / "compiled"
-    numba.config.CACHE_DIR = str(Path(given or folder) / f"numba-{digest.hexdigest()[:16]}")
+    previous_folder = numba.config.CACHE_DIR
+    folder_of_function = Path(files[0]).parent
+    if previous_folder:
+        parent = Path(previous_folder)
+    elif os.access(folder_of_function, os.W_OK):
+        parent = folder_of_function / "__pycache__"
+    else:
+        parent = cache_folder() / "compiled"
+    numba.config.CACHE_DIR = str(parent / f"numba-{digest.hexdigest()[:16]}")
     try:
         yield
     finally:
-        numba.config.CACHE_DIR = given
+        numba.config.CACHE_DIR = previous_folder
 
 
 def callable_when_compiled(
-    function: Callable[..., Any],
+    function: NumericalFunction,
     *,
     makes_arrays: bool = True,
     inline: bool = False,
-) -> Callable[..., Any]:
-    """Let compiled functions call a plain one, which itself stays plain; returns it.
+) -> NumericalFunction:
+    """Let compiled functions call a plain one; return the function, which stays plain itself.
 
     Parameters
     ----------
     function : callable
-        In the subset of Python that numba knows.
+        The function, in the subset of Python that numba knows.
     makes_arrays : bool
-        If neither it nor what it calls makes an array, numba need not count the references to those that are
-        handed on, which takes longer than a short function itself.
+        If neither the function nor what it calls makes an array, numba need not count the
+        references to arrays that are handed on, which takes longer than a short function itself.
     inline : bool
-        Make it part of its callers.
+        Whether the function becomes part of its callers.
     """
     if numba is not None:
         register_jitable(**OPTIONS, _nrt=makes_arrays, forceinline=inline)(function)
     return function
 
 
-def _functions(module: ModuleType) -> list[Callable[..., Any]]:
-    found = inspect.getmembers(module, inspect.isfunction)
-    return [item for _, item in found if item.__module__ == module.__name__]
+def _functions_of(module: ModuleType) -> list[NumericalFunction]:
+    """Return the functions that a module defines itself."""
+    functions = [function for _, function in inspect.getmembers(module, inspect.isfunction)]
+    return [function for function in functions if function.__module__ == module.__name__]
 
 
 @functools.cache
-def law_functions() -> tuple[Callable[..., Any], ...]:
+def law_functions() -> tuple[NumericalFunction, ...]:
     """Return the functions of `fe.runtime.laws`, which compiled functions can call from then on."""
-    tables = {
-        choice: laws.functions_by_law(choice.__name__) for choice in (laws.advance, laws.force_and_slope)
+    implementations = {
+        choice: laws.functions_by_law(choice.__name__)
+        for choice in (laws.advance, laws.force_and_slope)
     }
-    functions = [item for module in laws.MODULES for item in _functions(module)]
-    found = tuple(dict.fromkeys((*functions, *itertools.chain(*tables.values()))))
-    for function in found:
+    functions: list[NumericalFunction] = []
+    for module in laws.MODULES:
+        functions += _functions_of(module)
+    for functions_of_laws in implementations.values():
+        functions += functions_of_laws
+    functions = list(dict.fromkeys(functions))
+    for function in functions:
         callable_when_compiled(function, makes_arrays=False)
-    for choice, table in tables.items() if numba is not None else ():
-        _choose_when_compiled(choice, table)
-    return found
+    if numba is not None:
+        for choice, functions_of_laws in implementations.items():
+            _choose_when_compiled(choice, functions_of_laws)
+    return tuple(functions)
 
 
-def _choose_when_compiled(choice: Callable[..., Any], table: tuple[Callable[..., Any], ...]) -> None:
-    """Let compiled functions call `choice(number, ...)`, which is `table[number](...)`."""
-    # Written out as one function: a chain of functions would be compiled link by link. Its signature is that
-    # of `compiled_choice`, as numba asks.
-    scope: dict[str, Any] = {"Any": Any} | {f"answer_{number}": each for number, each in enumerate(table)}
-    lines = [f"    if number == {number}: return answer_{number}(*given)" for number in range(len(table) - 1)]
-    head, end = "def choice(number: Any, *given: Any) -> Any:", f"    return answer_{len(table) - 1}(*given)"
-    exec("\n".join([head, *lines, end]), scope)
+def _choose_when_compiled(
+    choice: NumericalFunction, functions: tuple[NumericalFunction, ...]
+) -> None:
+    """Let compiled functions call `choice(number, ...)`, which calls one of several functions.
+
+    The function is written out as source text with one line for each number: a chain of functions
+    would be compiled link by link.
+
+    Parameters
+    ----------
+    choice : callable
+        The plain function whose first argument is a number.
+    functions : tuple of callable
+        The function that it calls for each number from 0 on.
+    """
+    namespace: dict[str, Any] = {"Any": Any}
+    for number, function in enumerate(functions):
+        namespace[f"answer_{number}"] = function
+    last_number = len(functions) - 1
+    # numba asks for the signature of `compiled_choice` below.
+    lines = ["def choice(number: Any, *given: Any) -> Any:"]
+    for number in range(last_number):
+        lines.append(f"    if number == {number}: return answer_{number}(*given)")
+    lines.append(f"    return answer_{last_number}(*given)")
+    exec("\n".join(lines), namespace)
 
     def compiled_choice(number: Any, *given: Any) -> Any:
-        return scope["choice"]
+        return namespace["choice"]
 
-    overload(choice, jit_options={"nogil": True, "_nrt": False, "forceinline": True})(compiled_choice)
+    jit_options = {"nogil": True, "_nrt": False, "forceinline": True}
+    overload(choice, jit_options=jit_options)(compiled_choice)
 
 
 @functools.cache
 def compiled_kernel() -> Kernel:
-    """Return the compiled loops of `fe.runtime.motion.advance` and `static_solution`, for their `kernel`.
+    """Return the compiled loops for the argument `kernel` of `advance` and `static_solution`.
 
-    The functions of `fe.runtime` stay plain; they can be called from compiled ones from then on.
+    The functions of `fe.runtime` stay plain; compiled functions can call them from then on.
     """
-    inner = {
-        *_functions(motion_arrays),
-        *_functions(dry_friction),
-        *_functions(motion_kernel),
-    } - {motion_kernel.integrate}
-    for function in inner:
+    inner_functions = {
+        *_functions_of(motion_arrays),
+        *_functions_of(dry_friction),
+        *_functions_of(motion_kernel),
+    }
+    inner_functions.remove(motion_kernel.integrate)
+    for function in inner_functions:
         callable_when_compiled(function, makes_arrays=False, inline=True)
-    static_inner = {*_functions(static_path)} - {static_path.static_path}
-    with_arrays = {static_path.static_forces, static_path.solve_static_position}
-    for function in static_inner:
-        callable_when_compiled(function, makes_arrays=function in with_arrays)
-    sources = (*law_functions(), *inner, *static_inner)
-    return Kernel(compiled(motion_kernel.integrate, sources), compiled(static_path.static_path, sources))
+    static_functions = {*_functions_of(static_path)}
+    static_functions.remove(static_path.static_path)
+    functions_with_arrays = {static_path.static_forces, static_path.solve_static_position}
+    for function in static_functions:
+        callable_when_compiled(function, makes_arrays=function in functions_with_arrays)
+    called_functions = (*law_functions(), *inner_functions, *static_functions)
+    integrate = compiled(motion_kernel.integrate, called_functions)
+    follow_static_path = compiled(static_path.static_path, called_functions)
+    return Kernel(integrate, follow_static_path)

@@ -1,6 +1,7 @@
-"""High-pass filters of whole records, of any order, exact for signals that are linear between samples."""
+"""High-pass filters of whole records, exact for signals that are linear between samples."""
 
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import fftconvolve
@@ -11,33 +12,67 @@ from fe.runtime.errors import InvalidPatchError
 from fe.runtime.patch import HighPass
 from fe.runtime.sensors import SensorRecord, levels_before_record
 
-FAR, TERMS = 700.0, 10
-"""Beyond which exp(-u) is nothing beside powers of u, and how many of these are taken, to rounding."""
+_ASYMPTOTIC_FROM = 700.0
+"""Above this u the asymptotic series of 1F1 is used: exp(-u) is nothing beside powers of u."""
+
+_ASYMPTOTIC_TERMS = 10
+"""Terms of the series, which is then exact to rounding."""
+
+_UNEVEN_SAMPLING = 2e-3
+"""Relative deviation of a sampling interval above which a record is resampled."""
 
 
 def filtered_record(
-    item: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
+    high_pass_filter: HighPass, record: SensorRecord, signal: FloatArray, slope: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Pass columns (N, C) of a record, and their rates, through a filter, on an even grid and back."""
-    time, tau = record.time, item.time_constant
-    count, span, steps = max(len(time) - 1, 1), float(time[-1] - time[0]), np.diff(time)
-    if count > 1 and np.max(np.abs(steps - span / count)) > 2e-3 * span / count:
-        count = int(np.ceil(2.0 * span / np.median(steps)))  # a grid twice as fine as the usual step
-    grid, interval = np.linspace(time[0], time[-1], count + 1), span / count
-    signal, slope = _at(grid, time, signal), _at(grid, time, slope)
-    held = levels_before_record(item, record, signal[0])
-    shown = high_pass(signal, interval, tau, item.order, held)
-    if item.order == int(item.order):  # each stage obeys y' = x' - y / tau
-        for order in range(1, int(item.order) + 1):
-            slope = slope - high_pass(signal, interval, tau, order, held) / tau
+    """Return the channels of a record, and their rates, after a high-pass filter.
+
+    The filter needs an even grid of times; the channels are interpolated to one and back.
+
+    Parameters
+    ----------
+    high_pass_filter : HighPass
+        The filter: order and time constant.
+    record : SensorRecord
+        The times of the record.
+    signal, slope : (N, C) array
+        The channels before the filter, and their rates [1/s].
+
+    Returns
+    -------
+    signal, slope : (N, C) array
+        The channels after the filter, and their rates [1/s].
+    """
+    time = record.time
+    time_constant = high_pass_filter.time_constant
+    # even grid, twice as fine as the usual step if the sampling is uneven
+    steps = np.diff(time)
+    count = max(len(time) - 1, 1)
+    span = float(time[-1] - time[0])
+    if count > 1 and np.max(np.abs(steps - span / count)) > _UNEVEN_SAMPLING * span / count:
+        count = int(np.ceil(2.0 * span / np.median(steps)))
+    grid = np.linspace(time[0], time[-1], count + 1)
+    interval = span / count
+    signal = _interpolated(grid, time, signal)
+    slope = _interpolated(grid, time, slope)
+    # signal
+    held = levels_before_record(high_pass_filter, record, signal[0])
+    filtered = high_pass(signal, interval, time_constant, high_pass_filter.order, held)
+    # rate; each of several whole stages obeys y' = x' - y / tau
+    is_whole_order = high_pass_filter.order == int(high_pass_filter.order)
+    if is_whole_order:
+        for order in range(1, int(high_pass_filter.order) + 1):
+            stage_output = high_pass(signal, interval, time_constant, order, held)
+            slope = slope - stage_output / time_constant
     else:
-        slope = high_pass(slope, interval, tau, item.order, 0.0)
-    return _at(time, grid, shown), _at(time, grid, slope)
+        slope = high_pass(slope, interval, time_constant, high_pass_filter.order, 0.0)
+    return _interpolated(time, grid, filtered), _interpolated(time, grid, slope)
 
 
-def _at(times: FloatArray, known: FloatArray, values: FloatArray) -> FloatArray:
-    """Return columns (N, C) that are known at some times at others, linear in between."""
-    return np.stack([np.interp(times, known, column) for column in values.T], axis=1)
+def _interpolated(times: FloatArray, known_times: FloatArray, values: FloatArray) -> FloatArray:
+    """Return columns (N, C) that are known at some times at others, by linear interpolation."""
+    columns = [np.interp(times, known_times, column) for column in values.T]
+    return np.stack(columns, axis=1)
 
 
 def high_pass(
@@ -47,24 +82,30 @@ def high_pass(
     order: float = 1.0,
     held: FloatArray | float | None = None,
 ) -> FloatArray:
-    """Return the output of (s tau / (1 + s tau))^order for a signal that is linear between its samples.
+    """Return (s tau / (1 + s tau))^order of a signal that is linear between its samples.
 
-    The response to a unit step is 1F1(order; 1; -t / tau), whose integral is t 1F1(order; 2; -t / tau): the
-    inverse of s^(order - 1) tau^order / (1 + s tau)^order, Abramowitz and Stegun 1964, 13.1.2 termwise. The
-    output is the convolution of the signal's increments with it, exact to rounding for every order.
+    The response to a unit step is 1F1(order; 1; -t / tau), whose integral is t 1F1(order; 2; -t /
+    tau): the inverse of s^(order - 1) tau^order / (1 + s tau)^order, Abramowitz and Stegun 1964,
+    13.1.2 termwise. The output is the convolution of the signal's increments with it, exact to
+    rounding for every order.
 
     Parameters
     ----------
-    signal : (N, ...) ndarray
-        Samples, time along the first axis.
+    signal : (N, ...) array
+        The samples, time along the first axis.
     interval : float
-        Of sampling [s].
+        The sampling interval [s].
     time_constant : float
-        tau [s].
+        The time constant tau [s].
     order : float
-        Number of equal first-order stages, not necessarily whole, from 0 to 4.
-    held : (...) ndarray or float, optional
-        Value that the signal had held for ever before its first sample; that first sample by default.
+        The number of equal first-order stages, not necessarily whole, from 0 to 4.
+    held : (...) array or float, optional
+        The value of the signal at all times before its first sample; by default that first sample.
+
+    Returns
+    -------
+    (N, ...) array
+        The output at the samples.
 
     Raises
     ------
@@ -73,43 +114,69 @@ def high_pass(
     """
     if not (time_constant > 0.0 and interval > 0.0):
         raise InvalidPatchError(
-            f"A high-pass needs a positive time constant and sampling interval, but has {time_constant} s "
-            f"and {interval} s."
+            "A high-pass needs a positive time constant and sampling interval, but has "
+            f"{time_constant} s and {interval} s."
         )
     if not 0.0 <= order <= 4.0:
         raise InvalidPatchError(f"The order of a high-pass must be within 0 to 4, but is {order}.")
     count = len(signal)
     if count == 0:
         return np.array(signal, dtype=np.float64)
-    step, ramp = _kernel(count, interval / time_constant, float(order))
+    responses = _filter_responses(count, interval / time_constant, float(order))
     rows = np.asarray(signal, dtype=np.float64).reshape(count, -1)
-    output = fftconvolve(np.diff(rows, axis=0, prepend=rows[:1]), ramp[:, None], axes=0)[:count]
+    increments = np.diff(rows, axis=0, prepend=rows[:1])
+    output = fftconvolve(increments, responses.increment[:, None], axes=0)[:count]
     if held is not None:
-        jump = rows[0] - np.broadcast_to(held, np.shape(signal)[1:]).reshape(-1)
-        output = output + step[:, None] * jump
+        held_row = np.broadcast_to(held, np.shape(signal)[1:]).reshape(-1)
+        jump = rows[0] - held_row
+        output = output + responses.step[:, None] * jump
     return np.asarray(output.reshape(np.shape(signal)))
 
 
-@lru_cache(maxsize=32)
-def _kernel(count: int, ratio: float, order: float) -> tuple[FloatArray, FloatArray]:
-    """Return the responses (N,) to a unit step and to a unit increment that is spread over one interval.
+class _Responses(NamedTuple):
+    """Responses of a high-pass filter at the samples.
 
-    `ratio` is the sampling interval over tau. Entry k of the second is what is left, k samples later, of the
-    increment: the mean of the step response over that interval.
+    Attributes
+    ----------
+    step : (N,) array
+        The response to a unit step.
+    increment : (N,) array
+        The response to a unit increment that is spread over one interval: entry k is the mean of
+        the step response over the interval k.
     """
+
+    step: FloatArray
+    increment: FloatArray
+
+
+@lru_cache(maxsize=32)
+def _filter_responses(count: int, ratio: float, order: float) -> _Responses:
+    """Return the responses of a filter at `count` samples; the ratio is the interval over tau."""
     u: FloatArray = ratio * np.arange(count + 1, dtype=np.float64)
-    return _confluent(order, 1, u[:-1]), np.diff(u * _confluent(order, 2, u)) / ratio
+    integral = u * _confluent(order, 2, u)
+    return _Responses(step=_confluent(order, 1, u[:-1]), increment=np.diff(integral) / ratio)
 
 
 def _confluent(order: float, second: int, u: FloatArray) -> FloatArray:
-    """Return 1F1(order; second; -u) for u from 0 on and a `second` of 1 or 2.
+    """Return the confluent hypergeometric function 1F1(order; second; -u).
 
-    Far out by its asymptotic series, Abramowitz and Stegun 1964, 13.5.1: SciPy's is infinite about u = 1418.
+    For large u by its asymptotic series, Abramowitz and Stegun 1964, 13.5.1: SciPy's function is
+    infinite from about u = 1418 on.
+
+    Parameters
+    ----------
+    order : float
+        The first parameter.
+    second : {1, 2}
+        The second parameter.
+    u : (N,) array
+        The negative argument, from 0 on.
     """
-    near, far = hyp1f1(order, second, -np.minimum(u, FAR)), np.maximum(u, FAR)
-    term = rgamma(second - order) * far**-order
+    exact = hyp1f1(order, second, -np.minimum(u, _ASYMPTOTIC_FROM))
+    large_u = np.maximum(u, _ASYMPTOTIC_FROM)
+    term = rgamma(second - order) * large_u**-order
     series = np.zeros_like(u)
-    for k in range(TERMS):
+    for k in range(_ASYMPTOTIC_TERMS):
         series += term
-        term = term * (order + k) * (order - second + 1 + k) / ((k + 1) * far)
-    return np.where(u > FAR, series, near)
+        term = term * (order + k) * (order - second + 1 + k) / ((k + 1) * large_u)
+    return np.where(u > _ASYMPTOTIC_FROM, series, exact)

@@ -1,13 +1,8 @@
-"""Errors of FMUs, named by cause, and the lookup of long messages."""
+"""Errors of FMUs, named by cause."""
 
 from collections.abc import Sequence
 
 from reporting.errors import StandsForOthersError
-from reporting.sentences import Sentences
-
-said = Sentences(__file__).said
-"""Return a long message by "table.name", with its values filled in."""
-
 
 _CONTROL_CODES = (*range(9), *range(11, 32), *range(127, 160))
 """Codes of control characters, without tabulator and line feed."""

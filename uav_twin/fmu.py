@@ -416,7 +416,9 @@ def _draw(
 
 def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:
     """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""  # noqa: E501
-    parts.checked_target(out, replace=replace, what="An SSP file", suffix=".ssp", error=SspError)
+    parts.checked_target(
+        out, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError
+    )
     if _is_design(what):
         design = None if what == "uav_wing" else Path(what)
         path = parts.export_design(design, out, replace_file=replace)

@@ -83,8 +83,8 @@ from fe.reduction.model_cache import write_wing_vtu as write_wing_vtu
 from fe.reduction.reduced_basis import measured_errors as measured_errors
 from fe.runtime.patch import ModelPatch as ModelPatch
 from fe.runtime.reduced import ReducedModel as ReducedModel
+from fe.structure.affine import AffineResponse as AffineResponse
 from fe.structure.affine import AffineStructure as AffineStructure
-from fe.structure.affine import StaticResponse as StaticResponse
 from fe.structure.affine import natural_frequencies as natural_frequencies
 from fe.structure.affine import static_responses as static_responses
 from fe.structure.design import is_structure as is_structure
@@ -122,9 +122,9 @@ from fmu_asset.client.observations import ObservationHistory as ObservationHisto
 from fmu_asset.client.session import FmiAsset as FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset as CoupledAsset
 from fmu_asset.coupling.system import system_description as system_description
-from fmu_asset.packing.contents import build_script_fmu as build_script_fmu
 from fmu_asset.packing.contents import checked_target as checked_target
 from fmu_asset.packing.patch_file import load_patch as load_patch
+from fmu_asset.packing.script import build_script_fmu as build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
 from fmu_asset.packing.structure_fmu import check_form as check_form
 from fmu_asset.packing.structure_fmu import pack_wing as pack_wing

@@ -179,7 +179,7 @@ def structure_record(structure: "parts.AffineStructure", modes: int) -> dict[str
 
 
 def _load_facts(
-    structure: "parts.AffineStructure", name: str, response: "parts.StaticResponse"
+    structure: "parts.AffineStructure", name: str, response: "parts.AffineResponse"
 ) -> dict[str, Any]:
     """Return the facts about a load and the response to it alone, by name."""
     strains = response.strain.tolist()

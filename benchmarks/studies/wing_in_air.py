@@ -5,8 +5,8 @@ from pathlib import Path
 
 from fe.reduction.model_cache import reduced_model
 from fe.runtime.patch import Primitive
-from fmu_asset.packing.contents import script_fmu
 from fmu_asset.packing.patch_file import parse_patch
+from fmu_asset.packing.script import script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes, atomic_write_text
 

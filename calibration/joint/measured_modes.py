@@ -16,7 +16,7 @@ from calibration.dynamics.trials import (
     amplitude_dependence,
 )
 from calibration.errors import ExperimentDataError
-from calibration.result.record import Reading
+from calibration.result.record import FigureReading
 from reporting.arrays import Float
 
 MODAL = ("frequency_1", "frequency_2", "damping_ratio_1", "damping_ratio_2")
@@ -30,7 +30,9 @@ _SAME_MODE = 0.2  # relative change of frequency beyond which a fit has found an
 _VISIBLE = 1.0  # amplitude of the second mode at the later start, over the residuals
 
 
-def modal_readings(values: Sequence[float], deviations: Sequence[float]) -> tuple[Reading, ...]:
+def modal_readings(
+    values: Sequence[float], deviations: Sequence[float]
+) -> tuple[FigureReading, ...]:
     """Return the readings of two modes.
 
     Parameters
@@ -50,7 +52,7 @@ def modal_readings(values: Sequence[float], deviations: Sequence[float]) -> tupl
                 f"ring-down: {name} comes out as {value:g} without any uncertainty; "
                 "give records as they were measured, noise and all."
             )
-        readings.append(Reading(name, "ring-down", value, deviation))
+        readings.append(FigureReading(name, "ring-down", value, deviation))
     return tuple(readings)
 
 
@@ -68,7 +70,7 @@ class _SystematicTerms(NamedTuple):
     damping_ratio: float
 
 
-def measured_modes(trials: Fits) -> tuple[Reading, ...]:
+def measured_modes(trials: Fits) -> tuple[FigureReading, ...]:
     """Return mean frequencies and damping ratios of fitted trials, with their uncertainty.
 
     *Statistical*: the standard error of the mean over the trials, from the least-squares fits;

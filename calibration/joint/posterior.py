@@ -24,7 +24,7 @@ from scipy.stats import multivariate_t
 
 from calibration.errors import ExperimentDataError, OutsideValidityError, PosteriorError
 from calibration.joint.wing_table import MODEL_ERROR, QUANTITIES, WingTable, wing_priors
-from calibration.result.record import ParameterPrior, Reading
+from calibration.result.record import FigureReading, ParameterPrior
 from calibration.static.errors_in_variables import exact_posterior, residual_variance
 from calibration.static.experiments import LoadDisplacementData
 from calibration.static.posterior import GaussianPrior, Seed, child_seed
@@ -223,7 +223,7 @@ _IMPROBABLE = 2.33  # standard deviations that one in a hundred exceeds
 def joint_posterior(
     wing: WingTable,
     static: LoadDisplacementData,
-    readings: Sequence[Reading],
+    readings: Sequence[FigureReading],
     *,
     priors: tuple[ParameterPrior, ...] | None = None,
     model_error: tuple[float, float] = MODEL_ERROR,
@@ -238,7 +238,7 @@ def joint_posterior(
         The wing, by `tabulate_wing`.
     static : LoadDisplacementData
         The load test.
-    readings : sequence of Reading
+    readings : sequence of FigureReading
         The weighed mass and the readings of both modes; others are ignored.
     priors : tuple of ParameterPrior, optional
         The priors; `wing_priors` of the model by default.
@@ -281,7 +281,7 @@ def joint_posterior(
     return samples
 
 
-def _readings_of_outputs(readings: Sequence[Reading]) -> dict[str, Reading]:
+def _readings_of_outputs(readings: Sequence[FigureReading]) -> dict[str, FigureReading]:
     """Return, by name, the readings of a wing's outputs other than its stiffness."""
     names = {quantity.name for quantity in QUANTITIES[1:]}
     return {reading.name: reading for reading in readings if reading.name in names}
@@ -290,7 +290,7 @@ def _readings_of_outputs(readings: Sequence[Reading]) -> dict[str, Reading]:
 def _comparison_with_wing(
     wing: WingTable,
     static: LoadDisplacementData,
-    readings: Sequence[Reading],
+    readings: Sequence[FigureReading],
     model_error: tuple[float, float],
 ) -> Callable[[Float], Comparison]:
     """Return the function that compares the load test and other readings with a wing.
@@ -301,7 +301,7 @@ def _comparison_with_wing(
         The wing.
     static : LoadDisplacementData
         The load test.
-    readings : sequence of Reading
+    readings : sequence of FigureReading
         The weighed mass and the readings of the modes.
     model_error : (float, float)
         The relative standard deviations of the model's two frequencies.
@@ -350,7 +350,7 @@ def _refuse_samples_at_limits(e: Float, prior: ParameterPrior) -> None:
             )
 
 
-def _refuse_negative_damping(readings: Mapping[str, Reading]) -> None:
+def _refuse_negative_damping(readings: Mapping[str, FigureReading]) -> None:
     """Refuse damping ratios that almost certainly need a negative Rayleigh coefficient."""
     omega = 2.0 * math.pi * np.array([readings[f"frequency_{mode}"].value for mode in (1, 2)])
     # Ratios zeta_i = (alpha / omega_i + beta omega_i) / 2, solved for alpha and beta

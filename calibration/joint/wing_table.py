@@ -12,7 +12,7 @@ from numpy.polynomial.chebyshev import chebval3d, chebvander3d
 from numpy.typing import ArrayLike
 
 from calibration.errors import OutsideValidityError, PosteriorError
-from calibration.result.record import CalibratedFigure, ParameterPrior, Reading
+from calibration.result.record import CalibratedFigure, FigureReading, ParameterPrior
 from calibration.static.posterior import PRIOR_DEVIATION, StiffnessCurve, stiffness_curve_of
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.runtime.reduced import ReducedModel
@@ -30,7 +30,7 @@ for the choice and for other choices.
 """
 
 
-def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> Reading:
+def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> FigureReading:
     """Return the reading of a weighing of two servos and the pitot tube.
 
     The paper gives no uncertainty. Our choice is 1 g: a scale that shows grams, and leads that may
@@ -41,7 +41,7 @@ def weighed(mass: float = TOTAL_MASS, deviation: float = 1e-3) -> Reading:
     mass, deviation : float
         The mass and its standard deviation [kg].
     """
-    return Reading("weighed_mass", "weighing", mass, deviation)
+    return FigureReading("weighed_mass", "weighing", mass, deviation)
 
 
 class _Prior(NamedTuple):

@@ -16,7 +16,7 @@ from calibration.dynamics.records import STEP_FOLDER
 from calibration.errors import ExperimentDataError
 from calibration.joint.posterior import servo_range
 from calibration.lab_folder import lab_table
-from calibration.result.record import Reading
+from calibration.result.record import FigureReading
 from fe.runtime.modal_system import rayleigh_coefficients
 from reporting.arrays import Float
 
@@ -48,7 +48,7 @@ def fit_masses(
     frequencies: FrequencyModel,
     young_modulus_factor: Float,
     validity: Mapping[str, tuple[float, float]],
-    readings: Sequence[Reading],
+    readings: Sequence[FigureReading],
 ) -> PaperSamples:
     """Return the masses and the damping coefficients that fit the readings, for each sample of e.
 
@@ -64,7 +64,7 @@ def fit_masses(
         The samples of e [1].
     validity : mapping of str to (float, float)
         The ranges of the masses in the model [kg].
-    readings : sequence of Reading
+    readings : sequence of FigureReading
         The weighed mass and both modes.
 
     Raises

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import gaussian_kde
 
-from calibration.result.record import Calibration, Reading
+from calibration.result.record import Calibration, FigureReading
 from calibration.result.text import NOTICEABLE_CORRELATION
 from calibration.static.experiments import HALF_WIDTH_95
 from reporting import figures as style
@@ -175,7 +175,7 @@ def readings_figure(result: Calibration) -> Figure:
     return figure
 
 
-def _draw_reading(axes: Axes, result: Calibration, reading: Reading) -> None:
+def _draw_reading(axes: Axes, result: Calibration, reading: FigureReading) -> None:
     """Draw the prior and the posterior density of a quantity, with its reading."""
     prior = result.draws_of(reading.name, prior=True)
     posterior = result.draws_of(reading.name)

@@ -117,7 +117,7 @@ class ChannelFit:
 
 
 @dataclass(frozen=True)
-class Reading:
+class FigureReading:
     """A measured value of a figure.
 
     Attributes
@@ -169,7 +169,7 @@ class Calibration:
         The SHA-256 of the design or structure of the model; empty if it is not known.
     quantities : tuple of CalibratedFigure
         The Q figures of the model that follow from the parameters.
-    readings : tuple of Reading
+    readings : tuple of FigureReading
         The measured values of parameters and quantities.
     measured : Dataset
         The readings that are more than one number, by name, with units.
@@ -197,7 +197,7 @@ class Calibration:
     provenance: Mapping[str, Any]
     design_hash: str = ""
     quantities: tuple[CalibratedFigure, ...] = ()
-    readings: tuple[Reading, ...] = ()
+    readings: tuple[FigureReading, ...] = ()
     measured: xr.Dataset = field(default_factory=xr.Dataset)
     design: WingDesign | None = None
 
@@ -298,7 +298,7 @@ class Calibration:
         trace = np.trace(prior_precision @ posterior_covariance)
         return 0.5 * float(trace + shift @ prior_precision @ shift - len(shift) + log_volume_ratio)
 
-    def score(self, reading: Reading) -> float:
+    def score(self, reading: FigureReading) -> float:
         """Return the difference between model and reading, in standard deviations of both [1]."""
         deviation = np.hypot(reading.deviation, self.standard_deviation(reading.name))
         return (self.mean(reading.name) - reading.value) / float(deviation)

@@ -18,8 +18,8 @@ from calibration.result.file import save_calibration
 from calibration.result.record import (
     Calibration,
     ChannelFit,
+    FigureReading,
     Procedure,
-    Reading,
     check_name,
     prior_samples,
 )
@@ -319,7 +319,7 @@ def _length_samples(lengths: Lengths, count: int, seed: int) -> Float:
     return np.column_stack(samples_of_lengths)
 
 
-def _all_readings(lab: LabData) -> tuple[Reading, ...]:
+def _all_readings(lab: LabData) -> tuple[FigureReading, ...]:
     """Return all readings of a laboratory: lengths, tip stiffness, mass and modes."""
     pairs = lab.pairs
     # The stiffness k by the pairs alone: least squares of f = k x, so k = f'x / x'x with the
@@ -330,7 +330,7 @@ def _all_readings(lab: LabData) -> tuple[Reading, ...]:
         pairs.load_standard_deviation, stiffness * pairs.displacement_standard_deviation
     )
     deviation = float(load_deviation / np.sqrt(displacement_square))
-    tip_stiffness = Reading("tip_stiffness", "load test", stiffness, deviation)
+    tip_stiffness = FigureReading("tip_stiffness", "load test", stiffness, deviation)
     return (*(length.reading for length in lab.lengths), tip_stiffness, *lab.readings)
 
 

@@ -23,7 +23,7 @@ from calibration.joint.measured_modes import PUBLISHED_MODES, measured_modes
 from calibration.joint.wing_table import weighed
 from calibration.lab_folder import find_in_lab_folder, lab_table
 from calibration.paper.procedure import RESULTS_FILE, PaperSamples, read_published_results
-from calibration.result.record import Reading
+from calibration.result.record import FigureReading
 from calibration.static.experiments import (
     MEASUREMENTS_FILE,
     LoadDisplacementData,
@@ -47,7 +47,7 @@ def write_lab_folder(
     lengths: Lengths,
     load_test: LoadDisplacementData,
     records: Sequence[RingDownRecord],
-    total_mass: Reading,
+    total_mass: FigureReading,
 ) -> tuple[Path, ...]:
     """Write measurements into a folder as `read_lab_folder` reads them; each file in one step.
 
@@ -63,7 +63,7 @@ def write_lab_folder(
     records : sequence of RingDownRecord
         The records, for `step3/initialconditiondata_N.DAT`: time [s], spanwise signal [V], and a
         chordwise column of zeros, because the wing model has no chordwise gauge.
-    total_mass : Reading
+    total_mass : FigureReading
         The weighed total, for `step3/weighed_mass.csv` [g].
 
     Returns
@@ -114,7 +114,7 @@ def _record_text(record: RingDownRecord) -> str:
     return stream.getvalue()
 
 
-def read_weighed_mass(file: Path) -> Reading:
+def read_weighed_mass(file: Path) -> FigureReading:
     """Return the weighed total of a laboratory.
 
     Raises
@@ -176,7 +176,7 @@ class LabData:
         The lengths of step 1.
     pairs : LoadDisplacementData
         The load test of step 2.
-    readings : tuple of Reading
+    readings : tuple of FigureReading
         The weighed mass of two servos and the pitot tube, the frequencies and the damping ratios.
     origins : tuple of StepOrigin
         The origin of the measurements of each step.
@@ -190,7 +190,7 @@ class LabData:
 
     lengths: Lengths
     pairs: LoadDisplacementData
-    readings: tuple[Reading, ...]
+    readings: tuple[FigureReading, ...]
     origins: tuple[StepOrigin, ...]
     input_hashes: dict[str, str]
     trials: Fits | None = None

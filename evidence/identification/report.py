@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from reporting.figures import to_svg
-from reporting.page import Column, Page, Table
+from reporting.page import Page, PageColumn, Table
 
 from .comparison import Comparison
 from .figures import gauge_figure, identifiability_figure, profile_figure
@@ -94,7 +94,7 @@ def _add_identifiability(page: Page, result: Identification) -> None:
     if result.analysis.fixed:
         page.add_table(
             Table(
-                (Column("number"), Column("imitated", "%", numeric=True)),
+                (PageColumn("number"), PageColumn("imitated", "%", numeric=True)),
                 [(name, f"{100.0 * share:.1f}") for name, share in result.analysis.fixed],
             ),
             "Which share of the effect of a number that was not free the free ones can imitate.",
@@ -111,15 +111,15 @@ def _add_identifiability(page: Page, result: Identification) -> None:
 def comparison_table(rows: Sequence[Comparison], before: Sequence[Comparison]) -> Table:
     """Return the comparison before and after as a table."""
     columns = (
-        Column("output"),
-        Column("unit"),
-        Column("wanted rms"),
-        Column("wanted largest"),
-        Column("start", "rms / largest", numeric=True),
-        Column("identified", "rms / largest", numeric=True),
-        Column("where"),
-        Column("kept"),
-        Column("fitted"),
+        PageColumn("output"),
+        PageColumn("unit"),
+        PageColumn("wanted rms"),
+        PageColumn("wanted largest"),
+        PageColumn("start", "rms / largest", numeric=True),
+        PageColumn("identified", "rms / largest", numeric=True),
+        PageColumn("where"),
+        PageColumn("kept"),
+        PageColumn("fitted"),
     )
     return Table(
         columns,
@@ -143,9 +143,9 @@ def comparison_table(rows: Sequence[Comparison], before: Sequence[Comparison]) -
 def remeshed_table(remeshed: Sequence[tuple[float, int, Sequence[Comparison]]]) -> Table:
     """Return the comparison on several meshes, (refinement, unknowns, rows) each, as a table."""
     first = remeshed[0][2]
-    columns = [Column("output"), Column("unit")]
+    columns = [PageColumn("output"), PageColumn("unit")]
     columns += [
-        Column(f"x{refinement:g}", f"{unknowns:,}", numeric=True) for refinement, unknowns, _ in remeshed
+        PageColumn(f"x{refinement:g}", f"{unknowns:,}", numeric=True) for refinement, unknowns, _ in remeshed
     ]
     rows = [
         (row.name, row.unit if row.unit != "1" else "", *(_pair(rows[number]) for _, _, rows in remeshed))
@@ -165,13 +165,13 @@ def _parameter_table(result: Identification) -> Table:
     shift = scaled(fit.parameters, fit.values)
     width = analysis.width * deviations(fit.parameters)
     columns = (
-        Column("number"),
-        Column("unit"),
-        Column("before", numeric=True),
-        Column("after", numeric=True),
-        Column("shift", "prior deviations", numeric=True),
-        Column("width after / before", numeric=True),
-        Column("why it is free"),
+        PageColumn("number"),
+        PageColumn("unit"),
+        PageColumn("before", numeric=True),
+        PageColumn("after", numeric=True),
+        PageColumn("shift", "prior deviations", numeric=True),
+        PageColumn("width after / before", numeric=True),
+        PageColumn("why it is free"),
     )
     rows = [
         (
@@ -194,17 +194,17 @@ def _direction_table(result: Identification) -> Table:
     analysis = result.analysis
     weak = range(len(analysis.singular_values) - 1, max(-1, len(analysis.singular_values) - 7), -1)
     return Table(
-        (Column("singular value", numeric=True), Column("direction, in prior deviations")),
+        (PageColumn("singular value", numeric=True), PageColumn("direction, in prior deviations")),
         [(f"{analysis.singular_values[n]:.3g}", analysis.describe(n)) for n in weak],
     )
 
 
 def _iteration_table(result: Identification) -> Table:
     columns = (
-        Column("model"),
-        Column("objective", numeric=True),
-        Column("of it misfit", numeric=True),
-        Column("next step", "prior deviations", numeric=True),
+        PageColumn("model"),
+        PageColumn("objective", numeric=True),
+        PageColumn("of it misfit", numeric=True),
+        PageColumn("next step", "prior deviations", numeric=True),
     )
     rows = [
         (str(number), f"{row.objective:.2f}", f"{row.misfit:.2f}", f"{row.largest_step:.4f}")

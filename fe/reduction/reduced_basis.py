@@ -10,8 +10,8 @@ from fe.runtime.errors import ReductionError
 from fe.runtime.reduced import ReducedModel
 from fe.runtime.reduced_results import ReducedResponse as ReducedResponse
 from fe.structure.affine import (
+    AffineResponse,
     AffineStructure,
-    StaticResponse,
     natural_frequencies,
     static_response,
 )
@@ -244,7 +244,7 @@ class _RelativeErrors(NamedTuple):
     bounds: FloatArray
 
 
-def _relative_errors(exact: StaticResponse, reduced: ReducedResponse) -> _RelativeErrors:
+def _relative_errors(exact: AffineResponse, reduced: ReducedResponse) -> _RelativeErrors:
     """Return the errors of a reduced model's response against the exact one."""
     errors = np.full(2, np.nan)
     bounds = np.full(2, np.nan)

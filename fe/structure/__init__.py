@@ -1,1 +1,1 @@
-"""A structure of any shape: one TOML file beside a mesh, checked, as affine operators with names."""
+"""A structure of any shape, from one TOML file beside a mesh or matrices, as affine operators."""

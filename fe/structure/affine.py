@@ -1,8 +1,8 @@
 """A structure as affine operators with names: sums of a few matrices and vectors.
 
 K = sum of p (1 - z) K_pz over the pairs of a parameter p (or none) and a damage region z (or none),
-M = M_0 + sum of m M_m over the free point masses, and loads f = sum of u (f_l0 + sum of m f_lm) with
-the controls u, where acceleration fields act on the free masses, too.
+M = M_0 + sum of m M_m over the free point masses, and loads f = sum of u (f_l0 + sum of m f_lm)
+with the controls u, where acceleration fields act on the free masses, too.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,7 +23,7 @@ from .tables import StructureDesign
 
 Values = Mapping[str, float]
 PORT_PREFIX = "port."
-"""Begins the names of the force and the displacement at a port, see `AffineStructure.pushed_at_ports`.
+"""Begin of the names of force and displacement at a port; see `AffineStructure.pushed_at_ports`.
 
 No name in a structure file has a dot.
 """
@@ -36,7 +36,7 @@ def affine_sum(coefficients: ArrayLike, terms: Sequence[sparse.csr_array]) -> sp
 
 
 class StiffnessTerm(NamedTuple):
-    """Stiffness (n, n) [N/m] that is proportional to a parameter, and to one minus a region's loss."""
+    """Stiffness (n, n) [N/m], proportional to a parameter and to one minus a region's loss."""
 
     matrix: sparse.csr_array
     parameter: str | None = None
@@ -90,7 +90,7 @@ class AffineStructure:
     control_units : dict of str to str
         Unit of each control.
     ranges : dict of str to (float, float)
-        Least and largest value for which a reduced model is to hold, of parameters, losses, free
+        Least and largest value for which a reduced model is valid, of parameters, losses, free
         masses and controls, by name.
     regions : tuple of str
         Names of the damage regions.
@@ -141,7 +141,7 @@ class AffineStructure:
     design_hash: str
 
     followed_load: ClassVar[int | None] = None
-    """Number of the load by which two modes are followed: those that contribute most to its compliance."""
+    """Number of the load by which two modes are followed: those that add most to its compliance."""
 
     @property
     def unknowns(self) -> int:
@@ -164,7 +164,10 @@ class AffineStructure:
         losses = losses_of(stiffness_loss, self.regions)
         loss_of_region = {None: 0.0} | dict(zip(self.regions, losses, strict=True))
         return np.array(
-            [factors[term.parameter] * (1.0 - loss_of_region[term.region]) for term in self.stiffness_terms]
+            [
+                factors[term.parameter] * (1.0 - loss_of_region[term.region])
+                for term in self.stiffness_terms
+            ]
         )
 
     def stiffness(
@@ -188,8 +191,8 @@ class AffineStructure:
     def control_value_alone(self, load: str) -> float:
         """Return the value of a load's control at which the load is examined alone.
 
-        That is the nominal value, or one if the nominal value is zero, at which there is no load. It
-        is one for a constant load.
+        That is the nominal value, or one if the nominal value is zero, at which there is no load.
+        It is one for a constant load.
         """
         nominal = self._nominal_control(load)
         return 1.0 if nominal == 0.0 else nominal
@@ -199,7 +202,9 @@ class AffineStructure:
         control = self.loads[load]
         return 1.0 if control is None else self.controls[control]
 
-    def load(self, name: str, value: float | None = None, masses: Values | None = None) -> FloatArray:
+    def load(
+        self, name: str, value: float | None = None, masses: Values | None = None
+    ) -> FloatArray:
         """Return a load (n,) [N].
 
         Parameters
@@ -247,9 +252,10 @@ class AffineStructure:
         return SplitValues(among(self.parameters), among(self.regions), among(self.masses))
 
     def pushed_at_ports(self) -> "AffineStructure":
-        """Return the structure with a force [N] and a displacement [m] at each port, named `port.NAME`.
+        """Return the structure with a force [N] and a displacement [m], `port.NAME`, at each port.
 
-        The force is a control whose nominal value is zero: it acts only where something asks for it.
+        The force is a control whose nominal value is zero: it acts only where something asks for
+        it.
         """
         names = tuple(f"{PORT_PREFIX}{port}" for port in self.ports)
         unit_forces = self.port_output.toarray()
@@ -262,7 +268,9 @@ class AffineStructure:
             loads=self.loads | dict(zip(names, names, strict=True)),
             load_terms=(*self.load_terms, *port_loads),
             displacements=(*self.displacements, *names),
-            displacement_output=sparse.vstack((self.displacement_output, self.port_output), format="csr"),
+            displacement_output=sparse.vstack(
+                (self.displacement_output, self.port_output), format="csr"
+            ),
         )
 
     def full_displacement(self, free: FloatArray) -> FloatArray:
@@ -270,7 +278,9 @@ class AffineStructure:
         return np.asarray(self.expansion @ free).reshape(-1, 3)
 
 
-def _changed_factors(nominal: dict[str, float], changed: Values | None, kind: str) -> dict[str | None, float]:
+def _changed_factors(
+    nominal: dict[str, float], changed: Values | None, kind: str
+) -> dict[str | None, float]:
     """Return the factors of terms by name: one for None, then nominal values or changed ones.
 
     Parameters
@@ -291,7 +301,8 @@ def _changed_factors(nominal: dict[str, float], changed: Values | None, kind: st
     unknown_names = set(changes) - set(nominal)
     if unknown_names:
         raise InvalidStateError(
-            f"The structure has no {kind} named {min(unknown_names)!r}; there are {comma_list(nominal)}."
+            f"The structure has no {kind} named {min(unknown_names)!r}; there are "
+            f"{comma_list(nominal)}."
         )
     factors: dict[str | None, float] = {None: 1.0}
     factors.update(nominal | changes)
@@ -299,7 +310,7 @@ def _changed_factors(nominal: dict[str, float], changed: Values | None, kind: st
 
 
 @dataclass(frozen=True)
-class StaticResponse:
+class AffineResponse:
     """Static response of a structure.
 
     Attributes
@@ -320,7 +331,7 @@ class StaticResponse:
     output: FloatArray
 
 
-def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
+def static_responses(structure: AffineStructure) -> dict[str, AffineResponse]:
     """Solve for each load alone, the structure undamaged, with the value of `control_value_alone`.
 
     Parameters
@@ -330,7 +341,7 @@ def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
 
     Returns
     -------
-    dict of str to StaticResponse
+    dict of str to AffineResponse
         The response to each load by the load's name.
 
     Raises
@@ -351,7 +362,7 @@ def static_responses(structure: AffineStructure) -> dict[str, StaticResponse]:
     }
 
 
-def static_response(structure: AffineStructure, values: Mapping[str, float]) -> StaticResponse:
+def static_response(structure: AffineStructure, values: Mapping[str, float]) -> AffineResponse:
     """Solve for all loads together.
 
     Parameters
@@ -370,10 +381,10 @@ def static_response(structure: AffineStructure, values: Mapping[str, float]) -> 
     return _static_response(structure, Factorisation(system.stiffness).solve(system.load))
 
 
-def _static_response(structure: AffineStructure, displacement: FloatArray) -> StaticResponse:
+def _static_response(structure: AffineStructure, displacement: FloatArray) -> AffineResponse:
     """Return the response with free unknowns (n,)."""
     nodal_displacement = structure.full_displacement(displacement)
-    return StaticResponse(
+    return AffineResponse(
         displacement=displacement,
         largest=float(np.linalg.norm(nodal_displacement, axis=1).max()),
         strain=np.asarray(structure.gauge_output @ displacement),
@@ -423,12 +434,16 @@ def natural_frequencies(
     most = structure.unknowns - 1
     if not 1 <= count <= most:
         raise SolutionError(
-            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns gives 1 to "
-            f"{most}."
+            f"{count} modes were asked for, but a structure of {structure.unknowns} free unknowns "
+            f"gives 1 to {most}."
         )
     system = structure.system_at(values or {})
     if not system.mass.diagonal().any():
-        raise SolutionError("The structure has no mass, hence no modes; give its materials a density.")
+        raise SolutionError(
+            "The structure has no mass, hence no modes; give its materials a density."
+        )
     squares, shapes = lowest_eigenpairs(factors or system.stiffness, system.mass, count)
     modal_masses = np.einsum("im,im->m", shapes, system.mass @ shapes)
-    return NaturalModes(frequency=np.sqrt(squares) / (2.0 * np.pi), shape=shapes / np.sqrt(modal_masses))
+    return NaturalModes(
+        frequency=np.sqrt(squares) / (2.0 * np.pi), shape=shapes / np.sqrt(modal_masses)
+    )

@@ -103,7 +103,9 @@ def affine_fields(
         "control_units": {control.name: control.unit for control in design.control},
         "ranges": design.ranges,
         "regions": tuple(region.name for region in design.damage),
-        "mass_terms": tuple((restriction @ (matrix @ expansion)).tocsr() for matrix in masses.values()),
+        "mass_terms": tuple(
+            (restriction @ (matrix @ expansion)).tocsr() for matrix in masses.values()
+        ),
         "loads": {load.name: load.control for load in design.load},
         "load_terms": tuple(load_terms),
         "gauges": tuple(gauge.name for gauge in design.gauge),
@@ -119,19 +121,19 @@ def affine_fields(
 
 
 def _check_ports_can_move(design: StructureDesign, port_output: sparse.csr_array) -> None:
-    """Raise `InvalidDesignError` if a row (n,) of a port is zero: the supports hold all that it moves."""
+    """Raise `InvalidDesignError` if a row (n,) of a port is zero: the supports hold it."""
     for (label, port), row in zip(design.numbered("port"), port_output.toarray(), strict=True):
         if not row.any():
             raise InvalidDesignError(
-                f"{label} ({port.name}): the supports hold all that a force there would move; put the port "
-                "where the structure can move."
+                f"{label} ({port.name}): the supports hold all that a force there would move; put "
+                "the port where the structure can move."
             )
 
 
 def _masses_by_name(
     design: StructureDesign, mass: sparse.csr_array, point_masses: Iterable[sparse.csr_array]
 ) -> dict[str | None, sparse.csr_array]:
-    """Return the mass with the fixed point masses by None, then 1 kg of each free mass by its name."""
+    """Return the mass with fixed point masses under None, and 1 kg of each free mass by name."""
     fixed = mass
     free: dict[str | None, sparse.csr_array] = {}
     for part, matrix in zip(design.mass, point_masses, strict=True):

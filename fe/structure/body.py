@@ -20,7 +20,7 @@ from .tables import StructureDesign
 Mesh = TypeVar("Mesh", bound=CellMesh, covariant=True)
 
 
-class PointMass(NamedTuple):
+class MassAtPoints(NamedTuple):
     """The same mass at each of k points.
 
     Attributes
@@ -56,7 +56,7 @@ class Body(Generic[Mesh]):
         Part of the stiffness that each cell belongs to.
     parts : tuple of (str or None, str or None)
         Parameter and damage region of each part.
-    masses : tuple of PointMass
+    masses : tuple of MassAtPoints
         Point masses with their nominal values.
     variation : (nc, q) or (1, 1) array
         Elasticity at the points of the stiffness rule over that of the cell.
@@ -70,7 +70,7 @@ class Body(Generic[Mesh]):
     density: FloatArray
     part: IntArray
     parts: tuple[tuple[str | None, str | None], ...]
-    masses: tuple[PointMass, ...]
+    masses: tuple[MassAtPoints, ...]
     variation: FloatArray = field(default_factory=lambda: np.ones((1, 1)))
     mass_rule: Rule | None = None
 
@@ -93,7 +93,8 @@ class Body(Generic[Mesh]):
             springs = self.supports.stiffness
             terms[constant] = terms[constant] + springs if constant in terms else springs
         return tuple(
-            StiffnessTerm(matrix, parameter, region) for (parameter, region), matrix in terms.items()
+            StiffnessTerm(matrix, parameter, region)
+            for (parameter, region), matrix in terms.items()
         )
 
     @cached_property

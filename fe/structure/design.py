@@ -1,8 +1,8 @@
 """A structure as its engineer describes it: a TOML file beside a mesh or matrices, checked.
 
-Places and lengths are in the unit of length of the mesh, which the file names; all else is in SI units.
-Matrices, of any finite element code, are in newtons, seconds and the unit of length that the file names; a
-mass in kg and an acceleration in m/s^2 are turned into these units.
+Places and lengths are in the unit of length of the mesh, which the file names; all else is in SI
+units. Matrices, of any finite element code, are in newtons, seconds and the unit of length that the
+file names; a mass in kg and an acceleration in m/s^2 are turned into these units.
 """
 
 import hashlib
@@ -12,23 +12,28 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from fe.elements.elasticity import axes_of, isotropic_compliance, orthotropic_compliance, rotate_elasticity
+from fe.elements.elasticity import (
+    axes_of,
+    isotropic_compliance,
+    orthotropic_compliance,
+    rotate_elasticity,
+)
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import DesignFileError, InvalidDesignError, MeshError
 from fe.runtime.state import MOST_REGIONS
-from fe.sentences import said
 from reporting.toml_file import Fault, read_toml, validate
 
 from . import tables
+from .matrix_design import MatrixDesign
 
 LEAST_SINE = 1e-3
 """Two axes whose angle has a smaller sine do not span a plane."""
 
 
-class Spot(tables.Part):
-    """Where a gauge lies: its strain is the mean over `length` along its direction and `width` across it."""
+class Spot(tables.DesignSection):
+    """A place of a gauge: the strain is the mean over `length` along it and `width` across it."""
 
     point: tables.Vector
     length: float = Field(default=0.0, ge=0.0)
@@ -44,8 +49,10 @@ class Gauge(tables.Named, Spot):
 def _span_a_plane(
     axes: tuple[tables.Direction, tables.Direction],
 ) -> tuple[tables.Direction, tables.Direction]:
-    sizes = np.linalg.norm(axes[0]) * np.linalg.norm(axes[1])
-    if np.linalg.norm(np.cross(*axes)) <= LEAST_SINE * sizes:
+    """Return two axes; refuse them if they are parallel."""
+    first, second = axes
+    product_of_lengths = np.linalg.norm(first) * np.linalg.norm(second)
+    if np.linalg.norm(np.cross(first, second)) <= LEAST_SINE * product_of_lengths:
         raise ValueError("the two axes must not be parallel, and must point in two directions")
     return axes
 
@@ -62,24 +69,29 @@ class Rosette(Spot):
     angles: Annotated[tuple[float, ...], Field(min_length=2, max_length=6)] = (0.0, 45.0, 90.0)
 
     def gauges(self) -> list[Gauge]:
-        """Return its gauges."""
-        first, second, _ = axes_of(*self.axes)
-        common, found = self.model_dump(include={*Spot.model_fields}), []
+        """Return the gauges of the rosette."""
+        first_axis, second_axis, _ = axes_of(*self.axes)
+        place = self.model_dump(include={*Spot.model_fields})
+        gauges = []
         for letter, angle in zip("abcdef", np.radians(self.angles).tolist(), strict=False):
-            direction = tuple((np.cos(angle) * first + np.sin(angle) * second).tolist())
-            found.append(Gauge(name=f"{self.name}_{letter}", direction=direction, **common))
-        return found
+            direction = np.cos(angle) * first_axis + np.sin(angle) * second_axis
+            name = f"{self.name}_{letter}"
+            gauges.append(Gauge(name=name, direction=tuple(direction.tolist()), **place))
+        return gauges
 
 
-class Gauged(tables.Part):
+class Gauged(tables.DesignSection):
     """Gauges; those of rosettes come behind the others."""
 
     gauge: tuple[Gauge, ...] = ()
     rosette: tuple[Rosette, ...] = Field(default=(), exclude=True)
 
     @model_validator(mode="after")
-    def _with_those_of_rosettes(self) -> "Gauged":
-        self.__dict__["gauge"] = (*self.gauge, *(own for part in self.rosette for own in part.gauges()))
+    def _add_gauges_of_rosettes(self) -> "Gauged":
+        gauges = list(self.gauge)
+        for rosette in self.rosette:
+            gauges += rosette.gauges()
+        self.__dict__["gauge"] = tuple(gauges)  # past the check of frozen sections
         return self
 
 
@@ -89,24 +101,26 @@ Spring = Annotated[float, Field(ge=0.0, le=1e15, description="N/m")]
 Springs = tuple[Spring, Spring, Spring] | tuple[Spring, Spring, Spring, Spring, Spring, Spring]
 
 
-class NamedSet(tables.Part):
-    """Set of the nodes, or of the cells whose centres, lie in a box: two corners [unit of length]."""
+class NamedSet(tables.DesignSection):
+    """Set of nodes, or of cells by their centres, in a box: two corners [unit of length]."""
 
     name: SetName
     of: Literal["nodes", "cells"]
     box: tuple[tables.Vector, tables.Vector]
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a box that is none."""
-        turned = any(high < low for low, high in zip(*self.box, strict=True))
-        yield turned, "box must give its lower corner first, then its upper one"
+        """Yield a fault if the box has its corners in the wrong order."""
+        lower, upper = self.box
+        is_reversed = any(high < low for low, high in zip(lower, upper, strict=True))
+        yield is_reversed, "box must give its lower corner first, then its upper one"
 
 
-class Material(tables.Given):
+class MeshMaterial(tables.AlternativeKeys):
     """Material of the cells of a set: isotropic, or orthotropic in axes given by two vectors.
 
-    An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13 and 23
-    (ratio ij is the contraction along j under tension along i) and shear moduli 12, 13 and 23.
+    An orthotropic material gives three moduli along its axes 1, 2 and 3, Poisson's ratios 12, 13
+    and 23 (ratio ij is the contraction along j under tension along i) and shear moduli 12, 13 and
+    23.
     """
 
     name: tables.Name
@@ -119,16 +133,21 @@ class Material(tables.Given):
     shear_moduli: tuple[tables.Modulus, tables.Modulus, tables.Modulus] | None = None
     axes: Axes | None = None
     scaled_by: tables.Name | None = None
-    ways = (
+    alternatives = (
         ("young_modulus", "poisson_ratio"),
         ("young_moduli", "poisson_ratios", "shear_moduli", "axes"),
     )
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what is not given in one way, or not stable."""
+        """Yield faults of a material that is given in several ways, or is not stable."""
         yield from super().faults()
-        gives = self.axes is not None and np.linalg.eigvalsh(self.compliance)[0] <= 0.0
-        yield gives, said("design.unstable")
+        is_orthotropic = self.axes is not None
+        is_unstable = is_orthotropic and np.linalg.eigvalsh(self.compliance)[0] <= 0.0
+        yield (
+            is_unstable,
+            "the moduli and Poisson's ratios belong to no stable material: its compliance is not "
+            "positive definite",
+        )
 
     @property
     def compliance(self) -> FloatArray:
@@ -142,18 +161,21 @@ class Material(tables.Given):
     @property
     def elasticity(self) -> FloatArray:
         """Elasticity (6, 6) [Pa] in space."""
-        local = np.asarray(np.linalg.inv(self.compliance), dtype=np.float64)
+        local_elasticity = np.asarray(np.linalg.inv(self.compliance), dtype=np.float64)
         if self.axes is None:
-            return local
-        return np.asarray(rotate_elasticity(local[None], axes_of(*self.axes)[None])[0])
+            return local_elasticity
+        first_vector, second_vector = self.axes
+        axes = axes_of(first_vector, second_vector)
+        (elasticity,) = rotate_elasticity(local_elasticity[None], axes[None])
+        return np.asarray(elasticity)
 
 
-class Support(tables.Part):
+class Support(tables.DesignSection):
     """Nodes of a set: directions that are held, or springs [N/m], shared equally among the nodes.
 
-    With `rigid_about`, a point, the nodes move together as a rigid body, such as a stiff flange: `hold` may
-    name rotations about the axes through the point, too, and `springs` act on the motions x, y, z [N/m] and
-    rx, ry, rz [N m/rad] of the body that are not held.
+    With `rigid_about`, a point, the nodes move together as a rigid body, such as a stiff flange:
+    `hold` may name rotations about the axes through the point, too, and `springs` act on the
+    motions x, y, z [N/m] and rx, ry, rz [N m/rad] of the body that are not held.
     """
 
     set: SetName
@@ -162,23 +184,30 @@ class Support(tables.Part):
     rigid_about: tables.Vector | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what holds nothing, or twice."""
+        """Yield faults of a support that holds nothing, or holds a motion twice."""
         springs = self.springs or ()
-        turns = len(springs) > 3 or any(name not in tables.MOTIONS[:3] for name in self.hold)
-        loose = self.rigid_about is None and (turns or bool(self.hold) == any(springs))
-        yield loose, said("design.support")
-        yield not self.hold and not any(springs), "a rigid set needs hold, springs or both"
-        for name, spring in zip(tables.MOTIONS, springs, strict=False):
-            twice = spring and name in self.hold
-            yield twice, f"the motion {name} is held, so that no spring can act on it"
+        translations = tables.MOTIONS[:3]
+        has_springs = any(springs)
+        has_rotations = len(springs) > 3 or any(name not in translations for name in self.hold)
+        has_either = bool(self.hold) != has_springs
+        is_rigid = self.rigid_about is not None
+        yield (
+            not is_rigid and (has_rotations or not has_either),
+            'either hold = ["x", "y", "z"] or springs = [x, y, z] in N/m is expected; what turns, '
+            "too, is a rigid set, with the point `rigid_about`",
+        )
+        yield not self.hold and not has_springs, "a rigid set needs hold, springs or both"
+        for motion, spring in zip(tables.MOTIONS, springs, strict=False):
+            is_held_twice = bool(spring) and motion in self.hold
+            yield is_held_twice, f"the motion {motion} is held, so that no spring can act on it"
 
 
-class Load(tables.Given, tables.Commanded):
+class MeshLoad(tables.AlternativeKeys, tables.ControlledLoad):
     """A load, constant or times the value of a control.
 
-    Either a `force` [N] on a set (shared by area where it holds faces, else equally among its nodes) or at a
-    point, a `pressure` [Pa] against the faces of a set, or an `acceleration` [m/s^2] of everything that has
-    mass: (0, 0, -9.81) is gravity along -z.
+    Either a `force` [N] on a set (shared by area where it holds faces, else equally among its
+    nodes) or at a point, a `pressure` [Pa] against the faces of a set, or an `acceleration` [m/s^2]
+    of everything that has mass: (0, 0, -9.81) is gravity along -z.
     """
 
     set: SetName | None = None
@@ -186,39 +215,39 @@ class Load(tables.Given, tables.Commanded):
     force: tables.Direction | None = None
     pressure: float | None = None
 
-    ways = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
+    alternatives = (("force", "set"), ("force", "point"), ("pressure", "set"), ("acceleration",))
 
 
 class Damage(tables.Region):
-    """Region of the cells of a set."""
+    """A region that may lose stiffness: the cells of a set."""
 
     set: SetName
 
 
-class PointMass(tables.ChosenMass):
-    """Mass at a point of the structure."""
+class MeshMass(tables.ChosenMass):
+    """A mass at a point of the structure."""
 
     point: tables.Vector
 
 
 class PointOutput(tables.Named):
-    """Displacement, or acceleration, of a point along a direction."""
+    """An output of the structure: displacement or acceleration of a point along a direction."""
 
     point: tables.Vector
     direction: tables.Direction
 
 
-class Port(tables.Given, tables.Named):
-    """Where a force that the model lacks may act: on a set, shared as a load's force is, or at a point.
+class MeshPort(tables.AlternativeKeys, tables.Named):
+    """A port: a set or a point where a force that the model lacks may act.
 
-    It acts along `direction`, on the mean displacement of the set, or on that of the point.
+    The force acts along `direction`, on the mean displacement of the set, or on that of the point.
     """
 
     direction: tables.Direction
     set: SetName | None = None
     point: tables.Vector | None = None
 
-    ways = (("set",), ("point",))
+    alternatives = (("set",), ("point",))
 
 
 class MeshDesign(tables.StructureDesign, Gauged):
@@ -226,15 +255,15 @@ class MeshDesign(tables.StructureDesign, Gauged):
 
     mesh: str = Field(min_length=1)
     set: tuple[NamedSet, ...] = ()
-    material: tuple[Material, ...] = Field(min_length=1)
+    material: tuple[MeshMaterial, ...] = Field(min_length=1)
     support: tuple[Support, ...] = Field(min_length=1)
-    load: tuple[Load, ...] = ()
+    load: tuple[MeshLoad, ...] = ()
     damage: tuple[Damage, ...] = Field(default=(), max_length=MOST_REGIONS)
-    mass: tuple[PointMass, ...] = ()
+    mass: tuple[MeshMass, ...] = ()
     gauge: tuple[Gauge, ...] = ()
     displacement: tuple[PointOutput, ...] = ()
     acceleration: tuple[PointOutput, ...] = ()
-    port: tuple[Port, ...] = ()
+    port: tuple[MeshPort, ...] = ()
 
     what = "mesh"
     scaled_table = "material"
@@ -246,142 +275,33 @@ class MeshDesign(tables.StructureDesign, Gauged):
         return (self.mesh,)
 
 
-FileName = Annotated[str, Field(min_length=1)]
-Files = Annotated[
-    tuple[FileName, ...],
-    Field(min_length=1),
-    BeforeValidator(lambda files: (files,) if isinstance(files, str) else files),
-]
-Node = Annotated[int, Field(ge=0)]
-
-
-class MatrixSupport(tables.Part):
-    """Motions of nodes that are held: `rx`, `ry`, `rz` are the components 4, 5 and 6."""
-
-    nodes: Annotated[tuple[Node, ...], Field(min_length=1)]
-    hold: Annotated[tuple[Literal["x", "y", "z", "rx", "ry", "rz"], ...], Field(min_length=1)]
-
-
-class StiffnessPart(tables.Given):
-    """Share of the stiffness that a parameter scales, a region may lose, or both.
-
-    Either its own `matrix`, or that of the whole structure, `changed` by making the part's modulus `times`
-    what it is.
-    """
-
-    matrix: FileName | None = None
-    changed: FileName | None = None
-    times: float | None = Field(default=None, ge=0.0, lt=1.0)
-    scaled_by: tables.Name | None = None
-    damage: tables.Name | None = None
-
-    ways = (("matrix",), ("changed", "times"))
-
-
-class MatrixLoad(tables.Given, tables.Commanded):
-    """A load: a `vector` of its own, a `force` [N] at a node, or an `acceleration` [m/s^2] of all mass."""
-
-    vector: FileName | None = None
-    node: Node | None = None
-    force: tables.Direction | None = None
-
-    ways = (("vector",), ("node", "force"), ("acceleration",))
-
-
-class MatrixMass(tables.Given, tables.ChosenMass):
-    """Mass at a `node`, or times the `matrix` of 1 kg."""
-
-    node: Node | None = None
-    matrix: FileName | None = None
-
-    ways = (("node",), ("matrix",))
-
-
-class Extension(tables.Given, tables.Named):
-    """Strain: a `vector` of its own, or how far two nodes move apart along a direction, over a length."""
-
-    vector: FileName | None = None
-    nodes: tuple[Node, Node] | None = None
-    direction: tables.Direction | None = None
-    length: float | None = Field(default=None, gt=0.0)
-
-    ways = (("vector",), ("nodes", "direction", "length"))
-
-
-class NodeOutput(tables.Given, tables.Named):
-    """Displacement, acceleration or port: a `vector` of its own, or of a node along a direction."""
-
-    vector: FileName | None = None
-    node: Node | None = None
-    direction: tables.Direction | None = None
-
-    ways = (("vector",), ("node", "direction"))
-
-
-class MatrixDesign(tables.StructureDesign):
-    """A structure from matrices.
-
-    `stiffness_matrix` and `mass_matrix` are those of the whole structure, undamaged and with nominal
-    parameters, or files whose matrices sum to them; `unknowns` says which node and component each row is,
-    where they do not.
-    """
-
-    stiffness_matrix: Files
-    mass_matrix: Files
-    unknowns: FileName | None = None
-    part: tuple[StiffnessPart, ...] = ()
-    support: tuple[MatrixSupport, ...] = ()
-    load: tuple[MatrixLoad, ...] = ()
-    damage: tuple[tables.Region, ...] = Field(default=(), max_length=MOST_REGIONS)
-    mass: tuple[MatrixMass, ...] = ()
-    gauge: tuple[Extension, ...] = ()
-    displacement: tuple[NodeOutput, ...] = ()
-    acceleration: tuple[NodeOutput, ...] = ()
-    port: tuple[NodeOutput, ...] = ()
-
-    what = "matrix"
-    scaled_table = "part"
-
-    def faults(self) -> Iterator[Fault]:
-        """Yield what does not fit together, and regions without parts."""
-        yield from super().faults()
-        empty = "has no stiffness: no part names it"
-        yield from self.wrong_ties("part", "damage", "damage", "is of the region", empty)
-
-    @property
-    def files(self) -> tuple[str, ...]:
-        """Every file that is named, once, in the order of the tables."""
-        outputs = (self.gauge, self.displacement, self.acceleration, self.port)
-        tables = (self.part, self.load, self.mass, *outputs)
-        own = (getattr(part, key, None) for table in tables for part in table for key in _FILES)
-        named = filter(None, (*self.stiffness_matrix, *self.mass_matrix, self.unknowns, *own))
-        return tuple(dict.fromkeys(file_of(name)[0] for name in named))
-
-
-_FILES = ("matrix", "changed", "vector")
-
-
-def file_of(name: str) -> tuple[str, str]:
-    """Return the file, and the matrix in it, that `FILE` or `FILE:MATRIX` names."""
-    file, _, matrix = name.partition(":")
-    return file, matrix
-
-
 def is_structure(content: Mapping[str, Any]) -> bool:
-    """Return whether the content of a file is a structure's: no other model names a mesh or matrices."""
+    """Return whether the content of a TOML file describes a structure by mesh or matrices."""
     return "mesh" in content or "stiffness_matrix" in content
 
 
-def parse_structure(content: dict[str, Any], source: str = "the structure") -> MeshDesign | MatrixDesign:
-    """Check the content of a structure file, of matrices where it names a stiffness matrix, else of a mesh.
+def parse_structure(
+    content: dict[str, Any], source: str = "the structure"
+) -> MeshDesign | MatrixDesign:
+    """Return the structure that the content of a file describes, from a mesh or from matrices.
+
+    Parameters
+    ----------
+    content : dict
+        The content of the TOML file.
+    source : str
+        The name of the file in messages.
 
     Raises
     ------
     InvalidDesignError
-        One sentence that names `source`, the place, what came and what was expected.
+        If the content is not a structure; one sentence names the place, what came and what was
+        expected.
     """
     if "stiffness_matrix" in content:
-        return validate(MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices")
+        return validate(
+            MatrixDesign, content, source, InvalidDesignError, what="a structure from matrices"
+        )
     return validate(MeshDesign, content, source, InvalidDesignError, what="a structure")
 
 
@@ -396,10 +316,14 @@ def load_structure(path: Path | str) -> MeshDesign | MatrixDesign:
         If its content is no structure.
     """
     file = Path(path)
-    return parse_structure(read_toml(file, DesignFileError, what="structure file"), source=str(file))
+    return parse_structure(
+        read_toml(file, DesignFileError, what="structure file"), source=str(file)
+    )
 
 
-def structure_hash(design: tables.StructureDesign, folder: Path, *, with_ports: bool = False) -> str:
+def structure_hash(
+    design: tables.StructureDesign, folder: Path, *, with_ports: bool = False
+) -> str:
     """Return the SHA-256 of the design and of the bytes of its files, 64 hexadecimal digits.
 
     Parameters
@@ -409,7 +333,8 @@ def structure_hash(design: tables.StructureDesign, folder: Path, *, with_ports: 
     folder : Path
         Folder of its files.
     with_ports : bool
-        Whether its ports count. They change no answer of the structure, but an effect is found at one.
+        Whether its ports count. They change no answer of the structure, but an effect is found at
+        one.
 
     Raises
     ------
@@ -428,6 +353,7 @@ def structure_hash(design: tables.StructureDesign, folder: Path, *, with_ports: 
         try:
             digest.update((folder / name).read_bytes())
         except OSError as error:
-            place, why = folder / name, error.strerror
-            raise MeshError(said("design.unread", what=design.what, path=place, why=why)) from None
+            raise MeshError(
+                f"The {design.what} file {folder / name} cannot be read: {error.strerror}."
+            ) from None
     return digest.hexdigest()

@@ -47,7 +47,9 @@ class _GaugeStrain(NamedTuple):
     direction: FloatArray
 
 
-def gauge_rows(mesh: StructureMesh, gauges: tuple[Gauge, ...]) -> tuple[sparse.csr_array, FloatArray]:
+def gauge_rows(
+    mesh: StructureMesh, gauges: tuple[Gauge, ...]
+) -> tuple[sparse.csr_array, FloatArray]:
     """Return the strains of gauges as rows on the displacements.
 
     A gauge without a length reads the strain at its point, the mean of the cells that meet there.
@@ -133,11 +135,13 @@ def _averaging_points(
     across = np.cross(normal, direction)
     width_words = f" and {gauge.width:g} {mesh.unit_name} wide" if gauge.width else ""
     over_edge = (
-        f"{where}: {gauge.length:g} {mesh.unit_name} long{width_words}, the gauge reaches over the edge; its "
-        "point"
+        f"{where}: {gauge.length:g} {mesh.unit_name} long{width_words}, the gauge reaches over the "
+        "edge; its point"
     )
 
-    def project_grid(along_fractions: FloatArray, across_fractions: FloatArray) -> list[SurfacePoint]:
+    def project_grid(
+        along_fractions: FloatArray, across_fractions: FloatArray
+    ) -> list[SurfacePoint]:
         points = []
         for across_fraction, along_fraction in product(
             across_fractions if width else np.zeros(1), along_fractions if length else np.zeros(1)
@@ -172,8 +176,8 @@ def _projected_direction(direction: FloatArray, normal: FloatArray, where: str) 
     if angle > STEEPEST:
         normal_words = ", ".join(f"{value + 0.0:.3g}" for value in normal)
         raise InvalidDesignError(
-            f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal there is "
-            f"({normal_words}); at most {STEEPEST:g} degrees are allowed."
+            f"{where}: its direction points {angle:.0f} degrees out of the surface, whose normal "
+            f"there is ({normal_words}); at most {STEEPEST:g} degrees are allowed."
         )
     return unit_vector(direction - (direction @ normal) * normal)
 

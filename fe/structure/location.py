@@ -13,8 +13,10 @@ from fe.runtime.errors import InvalidDesignError
 from .mesh import StructureMesh
 
 FARTHEST = 0.1
-"""Largest distance of a point from the surface, in sizes of the nearest face: coordinates are rounded,
-and the faces of a mesh lie beside the curved surface that they approximate."""
+"""Largest distance of a point from the surface, in sizes of the nearest face.
+
+Coordinates are rounded, and the faces of a mesh lie beside the curved surface that they stand for.
+"""
 _INSIDE = 1e-9
 _MOST_STEPS = 25
 _SAME_PLACE = 1e-6
@@ -250,7 +252,9 @@ def _nearest_on_faces(
     return _nearest_points(mesh, point, on_faces, centres, partial(_nearest_on_face, corners))
 
 
-def _nearest_on_face(corners: FloatArray, coordinates: FloatArray, metric: FloatArray) -> FloatArray:
+def _nearest_on_face(
+    corners: FloatArray, coordinates: FloatArray, metric: FloatArray
+) -> FloatArray:
     """Return the points of convex faces that are nearest to points of their planes.
 
     Parameters

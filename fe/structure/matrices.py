@@ -1,8 +1,8 @@
-"""From matrices and a structure file to affine operators; matrices that are no structure's are refused.
+"""From matrices and a structure file to affine operators.
 
-Matrices are converted to SI units as they are read: stiffness in N/m, mass in kg, unknowns in metres
-(turns times the unit of length). A row that reads a displacement is then, transposed, a force of 1 N
-there.
+Matrices are converted to SI units as they are read: stiffness in N/m, mass in kg, unknowns in
+metres (turns times the unit of length). A row that reads a displacement is then, transposed, a
+force of 1 N there.
 """
 
 import itertools
@@ -19,9 +19,16 @@ from fe.runtime.errors import MeshError, SolutionError
 
 from .affine import AffineStructure, StiffnessTerm
 from .affine_fields import AffineFields, OutputRows, affine_fields
-from .design import Extension, MatrixDesign, MatrixLoad, MatrixMass, NodeOutput, StiffnessPart
+from .matrix_design import (
+    Extension,
+    MatrixDesign,
+    MatrixLoad,
+    MatrixMass,
+    NodeOutput,
+    StiffnessPart,
+)
 from .matrix_files import FORCE_WEIGHTS, READ_WEIGHTS, MatrixFiles, place_in_words
-from .mesh_file import Place, read_matrix, read_unknowns
+from .matrix_tables import Place, read_matrix, read_unknowns
 from .tables import MOTIONS
 
 _ROUNDING = 1e-12
@@ -49,15 +56,17 @@ def assemble_matrices(design: MatrixDesign, folder: Path, design_hash: str) -> A
     Raises
     ------
     MeshError
-        If a file cannot be read, does not fit the others, lacks what the design names, or is not of a
-        structure: unsymmetric, indefinite, not held, or with mass that nothing holds.
+        If a file cannot be read, does not fit the others, lacks what the design names, or is not of
+        a structure: unsymmetric, indefinite, not held, or with mass that nothing holds.
     """
     files = MatrixFiles(folder, _places(design, folder), design.unit)
     stiffness = sum(files.matrix(name, "stiffness_matrix") for name in design.stiffness_matrix)
     mass = sum(files.matrix(name, "mass_matrix") for name in design.mass_matrix)
     free = _free_rows(design, files, (stiffness.diagonal() != 0.0) | (mass.diagonal() != 0.0))
     if not len(free):
-        raise MeshError(f"{folder}: the matrices have no row that is free and has stiffness or mass.")
+        raise MeshError(
+            f"{folder}: the matrices have no row that is free and has stiffness or mass."
+        )
     free_places = [files.places[row] for row in free]
     _check_structure(stiffness[free][:, free], mass[free][:, free], free_places)
     fields = _fields(design, files, mass, free)
@@ -86,8 +95,8 @@ def _places(design: MatrixDesign, folder: Path) -> list[Place]:
         _, places_in_file = read_matrix(folder, name)
         if places_in_file is None:
             raise MeshError(
-                f"{folder / name} does not say which node and component each row is; name a file with a line "
-                "for each row, such as `97.3`, by the key unknowns."
+                f"{folder / name} does not say which node and component each row is; name a file "
+                "with a line for each row, such as `97.3`, by the key unknowns."
             )
         places.update(places_in_file)
     return sorted(places)
@@ -103,7 +112,9 @@ def _free_rows(design: MatrixDesign, files: MatrixFiles, can_move: FloatArray) -
     return np.flatnonzero(is_free)
 
 
-def _fields(design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, free: IntArray) -> AffineFields:
+def _fields(
+    design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, free: IntArray
+) -> AffineFields:
     """Return the fields of the affine model, whose expansion selects the free rows."""
     size = len(files.places)
     point_masses = (_point_mass(part, files, label) for label, part in design.numbered("mass"))
@@ -111,7 +122,8 @@ def _fields(design: MatrixDesign, files: MatrixFiles, mass: sparse.csr_array, fr
 
     def output_rows(key: str) -> sparse.csr_array:
         rows = [
-            _output_row(output, files, f"{label} ({output.name})") for label, output in design.numbered(key)
+            _output_row(output, files, f"{label} ({output.name})")
+            for label, output in design.numbered(key)
         ]
         return sparse.csr_array(np.array(rows).reshape(-1, size))
 
@@ -218,7 +230,7 @@ def _stiffness_terms(
 def _part_matrix(
     part: StiffnessPart, files: MatrixFiles, whole: sparse.csr_array, where: str
 ) -> sparse.csr_array:
-    """Return the stiffness (n, n) of a part: of its file, or from a whole with a changed modulus."""
+    """Return the stiffness (n, n) of a part, its own or from a whole with a changed modulus."""
     if part.changed is not None and part.times is not None:
         changed_whole = files.matrix(part.changed, where)
         return (whole - changed_whole) / (1.0 - part.times)
@@ -253,7 +265,9 @@ def _check_definite(matrix: sparse.csr_array, refusal: str) -> None:
         raise MeshError(refusal) from None
 
 
-def _check_structure(stiffness: sparse.csr_array, mass: sparse.csr_array, places: list[Place]) -> None:
+def _check_structure(
+    stiffness: sparse.csr_array, mass: sparse.csr_array, places: list[Place]
+) -> None:
     """Raise `MeshError` if the free matrices (m, m) are not those of a structure at rest.
 
     The stiffness must leave no motion free and be positive definite. The mass must be held, and be
@@ -294,7 +308,7 @@ def _check_rows(places: list[Place], is_faulty: FloatArray, fault: str) -> None:
 
 
 def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
-    """Raise `MeshError` for a stiffness that cannot be solved with: indefinite, or with free motions."""
+    """Raise `MeshError` for a stiffness that is indefinite or leaves free motions."""
     # unit diagonal, lifted so that free motions have the least positive eigenvalues
     scale = sparse.diags_array(1.0 / np.sqrt(stiffness.diagonal()))
     identity = sparse.eye_array(len(places))
@@ -310,6 +324,6 @@ def _refuse_singular(stiffness: sparse.csr_array, places: list[Place]) -> None:
     largest = int(np.abs(scale @ lowest_shape).argmax())
     raise MeshError(
         f"motions that the stiffness leaves free, or nearly: {free_count or 1}; in one "
-        f"{place_in_words(places[largest])} moves most. Hold the structure by [[support]], or before its "
-        "matrices are written."
+        f"{place_in_words(places[largest])} moves most. Hold the structure by [[support]], or "
+        "before its matrices are written."
     )

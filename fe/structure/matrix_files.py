@@ -11,7 +11,7 @@ from scipy import sparse
 from fe.runtime.arrays import FloatArray
 from fe.runtime.errors import MeshError
 
-from .mesh_file import Place, read_matrix, read_vector
+from .matrix_tables import Place, read_matrix, read_vector
 from .tables import Vector
 
 RowWeights = Mapping[int, tuple[float, ...]]
@@ -25,8 +25,8 @@ READ_WEIGHTS: RowWeights = {
     8: (0.25, 0.25, 0.25, 0.25, 0.0, 0.0, 0.0, 0.0),
 }
 """Weights of the rows of a name in its displacement. CalculiX expands a node of a shell into two or
-three nodes through the thickness, and one of a beam into four or eight; the weights follow from what
-version 2.20 prints."""
+three nodes through the thickness, and one of a beam into four or eight; the weights follow from
+what version 2.20 prints."""
 FORCE_WEIGHTS: RowWeights = {**READ_WEIGHTS, 3: (-0.5, 2.0, -0.5)}
 """Weights of these rows in a force on the node, as CalculiX distributes it."""
 
@@ -87,12 +87,15 @@ class MatrixFiles:
         components = [str(other) for number, other in sorted(self.rows) if number == node]
         known = f"its components {', '.join(components)}" if components else "no such node"
         raise MeshError(
-            f"{where}: node {node} has no component {component} in the matrices, which know {known}; what is "
-            "held or tied when they are written is not among them: name another node."
+            f"{where}: node {node} has no component {component} in the matrices, which know "
+            f"{known}; what is held or tied when they are written is not among them: name another "
+            "node."
         )
 
-    def unit_vector_at(self, place: Place, where: str, weights: RowWeights = READ_WEIGHTS) -> FloatArray:
-        """Return the vector (n,) of 1 at a node's component, distributed over the rows of that name.
+    def unit_vector_at(
+        self, place: Place, where: str, weights: RowWeights = READ_WEIGHTS
+    ) -> FloatArray:
+        """Return the vector (n,) of 1 at a node's component, spread over the rows of that name.
 
         Parameters
         ----------
@@ -112,8 +115,9 @@ class MatrixFiles:
         if len(rows) not in weights:
             node, component = place
             raise MeshError(
-                f"{where}: node {node} has {len(rows)} rows of component {component}, and how these share "
-                "what acts on the node is not known; name another node, or give a vector."
+                f"{where}: node {node} has {len(rows)} rows of component {component}, and how "
+                "these share what acts on the node is not known; name another node, or give a "
+                "vector."
             )
         vector = np.zeros(len(self.places))
         vector[rows] = weights[len(rows)]
@@ -140,15 +144,16 @@ class MatrixFiles:
         """
         if len(self.rows) < len(self.places):
             raise MeshError(
-                f"{where}: several rows of the matrices carry one name, as those of expanded shells and "
-                "beams do, and rows that turn cannot be told from rows that shift; give the load as a vector."
+                f"{where}: several rows of the matrices carry one name, as those of expanded "
+                "shells and beams do, and rows that turn cannot be told from rows that shift; "
+                "give the load as a vector."
             )
         no_rotations = (0.0, 0.0, 0.0)
         values = (*field, *no_rotations)
         return np.array([values[component - 1] for _, component in self.places])
 
     def vector(self, name: str, where: str, weights: RowWeights = READ_WEIGHTS) -> FloatArray:
-        """Return the vector (n,) of a file; raises `MeshError` if it cannot be read or does not fit."""
+        """Return the vector (n,) of a file; raises `MeshError` if it cannot be read or used."""
 
         def unit_vector_at(place: Place) -> FloatArray:
             return self.unit_vector_at(place, where, weights)
@@ -156,7 +161,7 @@ class MatrixFiles:
         return read_vector(self.folder, name, unit_vector_at, len(self.places))
 
     def matrix(self, name: str, where: str, *, partial: bool = False) -> sparse.csr_array:
-        """Return the symmetric matrix (n, n) of a file [N/m or kg], its rows in the order of the places.
+        """Return the symmetric matrix (n, n) of a file [N/m or kg], its rows in our order.
 
         Parameters
         ----------
@@ -183,8 +188,8 @@ class MatrixFiles:
             matrix.resize((size, size))
         if matrix.shape[0] != size:
             raise MeshError(
-                f"{label} has {matrix.shape[0]} rows, but there are {size} unknowns; matrices and unknowns "
-                "must be of the same run."
+                f"{label} has {matrix.shape[0]} rows, but there are {size} unknowns; matrices and "
+                "unknowns must be of the same run."
             )
         self._check_finite_and_symmetric(matrix, label)
         return sparse.csr_array(0.5 * (matrix + matrix.T) / self.unit)
@@ -199,7 +204,7 @@ class MatrixFiles:
             worst = int(asymmetry.data.argmax())
             row, column = (int(indices[worst]) for indices in asymmetry.coords)
             raise MeshError(
-                f"{label} is not symmetric: its entries between {place_in_words(self.places[row])} and "
-                f"{place_in_words(self.places[column])} differ by {asymmetry.data[worst]:.3g}; friction, "
-                "follower loads and gyroscopic terms cannot be taken."
+                f"{label} is not symmetric: its entries between {place_in_words(self.places[row])} "
+                f"and {place_in_words(self.places[column])} differ by {asymmetry.data[worst]:.3g}; "
+                "friction, follower loads and gyroscopic terms cannot be taken."
             )

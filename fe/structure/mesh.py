@@ -74,7 +74,8 @@ class StructureMesh(CellMesh):
     loose : (l,) array of int
         Numbers of the nodes that no cell uses.
     remarks : tuple of str
-        What a user should know of the file: words that were ignored though their meaning is unknown.
+        What a user should know of the file: words that were ignored though their meaning is
+        unknown.
     """
 
     source: str
@@ -160,12 +161,14 @@ class StructureMesh(CellMesh):
         loose_count = int((nodes < 0).sum())
         if loose_count:
             raise MeshError(
-                f"{where}: {loose_count} of the nodes of the set {name!r} of {self.source} touch no cell; "
-                "take them out of the set."
+                f"{where}: {loose_count} of the nodes of the set {name!r} of {self.source} touch "
+                "no cell; take them out of the set."
             )
         return nodes
 
-    def _members(self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str) -> _Content:
+    def _members(
+        self, sets: dict[str, _Content], name: str, kind: str, member: str, where: str
+    ) -> _Content:
         """Return the members of a set; raises `MeshError` if there is no such set, or it is empty.
 
         Parameters
@@ -182,14 +185,15 @@ class StructureMesh(CellMesh):
         members = _set_named(sets, name)
         if members is None:
             raise MeshError(
-                f"{where}: {self.source} holds no set of {kind} named {name!r}; there are {comma_list(sets)}."
+                f"{where}: {self.source} holds no set of {kind} named {name!r}; there are "
+                f"{comma_list(sets)}."
             )
         if not len(members):
             raise MeshError(f"{where}: the set {name!r} of {self.source} holds no {member}.")
         return members
 
     def faces_of(self, name: str, where: str) -> Surface:
-        """Return the faces of the surface in a set of faces, or of nodes with all corners of a face.
+        """Return the surface faces in a set of faces, or of nodes with all corners of a face.
 
         Parameters are those of `cells_of`.
 
@@ -201,8 +205,8 @@ class StructureMesh(CellMesh):
         surface = self.faces_between(name, self.nodes_of(name, where))
         if not len(surface):
             raise MeshError(
-                f"{where}: no face of the surface lies in the set {name!r} of {self.source}; a set of faces, "
-                "or all nodes of the faces, is expected."
+                f"{where}: no face of the surface lies in the set {name!r} of {self.source}; a set "
+                "of faces, or all nodes of the faces, is expected."
             )
         return surface
 

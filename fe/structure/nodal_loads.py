@@ -8,7 +8,7 @@ from fe.elements.cells import CellMesh
 from fe.elements.elasticity import unit_vector
 from fe.runtime.arrays import FloatArray
 
-from .design import Load, Port
+from .design import MeshLoad, MeshPort
 from .location import attach
 from .mesh import StructureMesh, Surface
 
@@ -59,14 +59,14 @@ def face_areas(mesh: CellMesh, surface: Surface) -> FaceAreas:
     return FaceAreas(vectors, areas)
 
 
-def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
+def nodal_load(mesh: StructureMesh, load: MeshLoad, where: str) -> FloatArray:
     """Return the nodal values of a load.
 
     Parameters
     ----------
     mesh : StructureMesh
         The mesh.
-    load : Load
+    load : MeshLoad
         The load.
     where : str
         Its name in sentences.
@@ -91,7 +91,7 @@ def nodal_load(mesh: StructureMesh, load: Load, where: str) -> FloatArray:
     return np.outer(_force_weights(mesh, load, where), np.asarray(load.force))
 
 
-def port_row(mesh: StructureMesh, port: Port, where: str) -> FloatArray:
+def port_row(mesh: StructureMesh, port: MeshPort, where: str) -> FloatArray:
     """Return the row (nodes, 3) that reads the displacement of a port.
 
     Transposed, the row is a force of 1 N at the port.
@@ -100,7 +100,7 @@ def port_row(mesh: StructureMesh, port: Port, where: str) -> FloatArray:
     ----------
     mesh : StructureMesh
         The mesh.
-    port : Port
+    port : MeshPort
         The port.
     where : str
         Its name in sentences.
@@ -115,8 +115,8 @@ def port_row(mesh: StructureMesh, port: Port, where: str) -> FloatArray:
     return np.outer(_force_weights(mesh, port, where), unit_vector(port.direction))
 
 
-def _force_weights(mesh: StructureMesh, part: Load | Port, where: str) -> FloatArray:
-    """Return the weights (nodes,) of the nodes in a force at a point or on a set; their sum is one."""
+def _force_weights(mesh: StructureMesh, part: MeshLoad | MeshPort, where: str) -> FloatArray:
+    """Return the weights (nodes,) of nodes in a force at a point or on a set; their sum is one."""
     if part.point is not None:
         return point_weights(mesh, part.point, where)
     # a force on a set: by area if it holds faces, else equally among the nodes

@@ -1,4 +1,4 @@
-"""From a structure file and its mesh to affine operators, and their fields as VTU files for ParaView."""
+"""From a structure file and its mesh to affine operators, and fields of both for ParaView."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -17,19 +17,19 @@ from reporting.files import atomic_file
 
 from .affine import AffineStructure, static_response
 from .affine_fields import OutputRows
-from .body import Body, PointMass
+from .body import Body, MassAtPoints
 from .design import (
     Damage,
-    Material,
-    MatrixDesign,
     MeshDesign,
+    MeshMaterial,
+    MeshPort,
     PointOutput,
-    Port,
     load_structure,
     structure_hash,
 )
 from .gauges import gauge_rows
 from .matrices import assemble_matrices
+from .matrix_design import MatrixDesign
 from .mesh import StructureMesh
 from .mesh_file import check_memory, read_mesh
 from .nodal_loads import nodal_load, point_weights, port_row
@@ -94,7 +94,9 @@ def structure_mesh(design: MeshDesign, file: Path) -> StructureMesh:
     return replace(mesh, node_sets=node_sets, cell_sets=cell_sets)
 
 
-def _part_of_cells(mesh: StructureMesh, labelled: list[tuple[str, Material | Damage]], kind: str) -> IntArray:
+def _part_of_cells(
+    mesh: StructureMesh, labelled: list[tuple[str, MeshMaterial | Damage]], kind: str
+) -> IntArray:
     """Return the number (nc,) of the part whose set holds each cell, -1 for none.
 
     Parameters
@@ -118,8 +120,8 @@ def _part_of_cells(mesh: StructureMesh, labelled: list[tuple[str, Material | Dam
         if len(shared):
             _, other = labelled[part_of_cell[shared[0]]]
             raise MeshError(
-                f"{label}: the {kind}s {part.name!r} and {other.name!r} share {len(shared)} elements, such "
-                f"as {mesh.cell(shared[0])}; their sets must not overlap."
+                f"{label}: the {kind}s {part.name!r} and {other.name!r} share {len(shared)} "
+                f"elements, such as {mesh.cell(shared[0])}; their sets must not overlap."
             )
         part_of_cell[cells] = number
     return part_of_cell
@@ -140,13 +142,17 @@ class _StiffnessParts(NamedTuple):
     names: tuple[tuple[str | None, str | None], ...]
 
 
-def _stiffness_parts(design: MeshDesign, material_of: IntArray, region_of: IntArray) -> _StiffnessParts:
+def _stiffness_parts(
+    design: MeshDesign, material_of: IntArray, region_of: IntArray
+) -> _StiffnessParts:
     """Return the parts of the stiffness from material and region (nc,) of each cell."""
     parameters: list[str | None] = [parameter.name for parameter in design.parameter]
     parameters.append(None)
     regions: list[str | None] = [region.name for region in design.damage]
     regions.append(None)
-    parameter_of_material = np.array([parameters.index(material.scaled_by) for material in design.material])
+    parameter_of_material = np.array(
+        [parameters.index(material.scaled_by) for material in design.material]
+    )
     region_number = region_of % len(regions)  # -1 becomes the number of no region, the last one
     pair_of_cell = np.column_stack((parameter_of_material[material_of], region_number))
     pairs, part_of = np.unique(pair_of_cell, axis=0, return_inverse=True)
@@ -174,15 +180,15 @@ def load_and_assemble(
     DesignFileError, InvalidDesignError
         If the structure file cannot be read, or does not describe a structure from a mesh.
     MeshError
-        If the mesh cannot be read, is faulty, does not hold what the design names, or would take too
-        much memory.
+        If the mesh cannot be read, is faulty, does not hold what the design names, or would take
+        too much memory.
     """
     file = Path(file)
     design = load_structure(file)
     if isinstance(design, MatrixDesign):
         raise InvalidDesignError(
-            f"{file} is a structure from matrices: without a mesh there is no field to draw, and nothing "
-            "that CalculiX could solve."
+            f"{file} is a structure from matrices: without a mesh there is no field to draw, and "
+            "nothing that CalculiX could solve."
         )
     mesh = structure_mesh(design, file)
     check_memory(mesh, memory_limit)
@@ -217,8 +223,8 @@ def _check_materials(mesh: StructureMesh, material_of: IntArray) -> None:
     bare = np.flatnonzero(material_of < 0)
     if len(bare):
         raise MeshError(
-            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among them "
-            f"{mesh.cell(bare[0])}."
+            f"{mesh.source}: {len(bare)} of {len(mesh.cells)} elements have no material, among "
+            f"them {mesh.cell(bare[0])}."
         )
 
 
@@ -242,7 +248,7 @@ def _body(
         part=parts.part_of,
         parts=parts.names,
         masses=tuple(
-            PointMass(mass.name, mass.mass, point_weights(mesh, mass.point, label)[None])
+            MassAtPoints(mass.name, mass.mass, point_weights(mesh, mass.point, label)[None])
             for label, mass in design.numbered("mass")
         ),
         mass_rule=mesh.kind.stiffness_rule if mass_as_stiffness else None,
@@ -274,7 +280,7 @@ def assemble_structure(file: Path | str, memory_limit: float | None = None) -> A
 
 
 def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) -> sparse.csr_array:
-    """Return rows (m, full) of the displacements of points along directions, each with its label."""
+    """Return rows (m, full) of displacements of points along directions, each with its label."""
     rows = []
     for label, output in labelled:
         weights = point_weights(mesh, output.point, label)
@@ -282,7 +288,7 @@ def _point_rows(mesh: StructureMesh, labelled: list[tuple[str, PointOutput]]) ->
     return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
 
 
-def _port_rows(mesh: StructureMesh, labelled: list[tuple[str, Port]]) -> sparse.csr_array:
+def _port_rows(mesh: StructureMesh, labelled: list[tuple[str, MeshPort]]) -> sparse.csr_array:
     """Return rows (ports, full) of the displacements of ports, each with its label."""
     rows = [port_row(mesh, port, label).ravel() for label, port in labelled]
     return sparse.csr_array(np.reshape(rows, (-1, mesh.unknowns)))
@@ -349,7 +355,11 @@ Data = Mapping[str, npt.ArrayLike]
 
 
 def write_vtu(
-    path: Path | str, points: FloatArray, cells: tuple[str, IntArray], point_data: Data, cell_data: Data
+    path: Path | str,
+    points: FloatArray,
+    cells: tuple[str, IntArray],
+    point_data: Data,
+    cell_data: Data,
 ) -> None:
     """Write a VTU file, whole or not at all.
 

@@ -15,7 +15,7 @@ from .mesh import StructureMesh
 from .tables import MOTIONS
 
 _FREE = 1e-8
-"""A rigid motion that the supports resist by less than this fraction of the stiffest one is free."""
+"""A rigid motion is free if the supports resist it by less than this part of the stiffest one."""
 
 
 class RigidSet(NamedTuple):
@@ -93,7 +93,7 @@ def supports(
 
 
 def _body_expansion(points: FloatArray, body: RigidSet) -> sparse.coo_array:
-    """Return the displacements (3 nodes, m) of all nodes by the m motions of a body that are not held."""
+    """Return the displacements (3 nodes, m) of all nodes by the m free motions of a rigid body."""
     motions = rigid_motions(points[body.nodes], body.point, 2.0)
     moving = sparse.coo_array(motions[:, ~body.held])
     node = body.nodes[moving.row // 3]
@@ -157,7 +157,9 @@ def supports_of_design(design: MeshDesign, mesh: StructureMesh) -> Supports:
     return supports(mesh.points, nodal.held, nodal.springs, rigid_sets)
 
 
-def _check_no_shared_nodes(mesh: StructureMesh, nodal: _NodeSupports, bodies: dict[str, RigidSet]) -> None:
+def _check_no_shared_nodes(
+    mesh: StructureMesh, nodal: _NodeSupports, bodies: dict[str, RigidSet]
+) -> None:
     """Raise `MeshError` if a node of a rigid set, by its label, belongs to another support, too."""
     is_supported = np.any(nodal.resists, axis=1)
     for label, body in bodies.items():
@@ -165,8 +167,8 @@ def _check_no_shared_nodes(mesh: StructureMesh, nodal: _NodeSupports, bodies: di
         if len(shared):
             place = mesh.place(mesh.points[shared[0]])
             raise MeshError(
-                f"{label}: {len(shared)} nodes of the rigid set belong to another support, too, such as that "
-                f"at {place}; say what holds it in its own table."
+                f"{label}: {len(shared)} nodes of the rigid set belong to another support, too, "
+                f"such as that at {place}; say what holds it in its own table."
             )
         is_supported[body.nodes] = True
 
@@ -178,7 +180,8 @@ def _rigid_set(support: Support, mesh: StructureMesh, nodes: IntArray, label: st
     rank = np.linalg.matrix_rank(motions, _FREE * np.linalg.norm(motions))
     if rank < len(MOTIONS):
         raise MeshError(
-            f"{label}: the nodes of the rigid set {support.set!r} lie on a line, about which it could turn."
+            f"{label}: the nodes of the rigid set {support.set!r} lie on a line, about which it "
+            "could turn."
         )
     springs = np.zeros(len(MOTIONS))
     if support.springs is not None:
@@ -211,10 +214,13 @@ def rigid_motions(points: FloatArray, centre: FloatArray, size: float) -> FloatA
     return motions.reshape(-1, 6)
 
 
-def _check_rigid_motions(mesh: StructureMesh, nodal: _NodeSupports, bodies: tuple[RigidSet, ...]) -> None:
+def _check_rigid_motions(
+    mesh: StructureMesh, nodal: _NodeSupports, bodies: tuple[RigidSet, ...]
+) -> None:
     """Raise `MeshError` if supports resist fewer than six rigid motions; it says which one is free.
 
-    Every resisting displacement counts alike: what matters is whether it resists, not how stiff it is.
+    Every resisting displacement counts alike: what matters is whether it resists, not how stiff it
+    is.
     """
     # what each rigid motion of the structure does to the displacements that are resisted
     centre = mesh.points.mean(axis=0)
@@ -233,8 +239,8 @@ def _check_rigid_motions(mesh: StructureMesh, nodal: _NodeSupports, bodies: tupl
     free = directions[values <= _FREE * max(float(values[0]), 1e-300)]
     if len(free):
         raise MeshError(
-            f"{mesh.source}: the supports leave {len(free)} of the six rigid motions free, among them "
-            f"{_motion_in_words(free[0], mesh, centre)}; hold further directions."
+            f"{mesh.source}: the supports leave {len(free)} of the six rigid motions free, among "
+            f"them {_motion_in_words(free[0], mesh, centre)}; hold further directions."
         )
 
 

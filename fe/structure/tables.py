@@ -1,6 +1,6 @@
-"""The tables that every structure file has, whether its structure comes from a mesh or from matrices.
+"""The tables that every structure file has, for a mesh as for matrices.
 
-Also how well its reduced model is to hold.
+They also say how accurate its reduced model must be, and where.
 """
 
 from collections.abc import Iterator
@@ -10,7 +10,6 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, ConfigDict, Field, field_validator, model_validator
 
 from fe.runtime.state import MOST_REGIONS
-from fe.sentences import said
 from reporting.toml_file import Fault, Section
 
 Vector = tuple[float, float, float]
@@ -20,11 +19,11 @@ Modulus = Annotated[float, Field(ge=1e6, le=1e13, description="Pa")]
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 """Units of length and their size [m]."""
 MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
-"""Of a rigid set: along the axes, then about them."""
+"""Motions of a rigid set of nodes: along the axes, then about them."""
 
 
-class Part(Section):
-    """Section of a design file: unknown keys, non-finite numbers and booleans for numbers are refused."""
+class DesignSection(Section):
+    """Section of a design file; unknown keys and non-finite numbers are refused."""
 
     model_config = ConfigDict(allow_inf_nan=False)
 
@@ -37,8 +36,10 @@ class Part(Section):
 
 
 def _tuples(item: object) -> object:
-    """Return the lists of a file as the tuples that a strict section takes."""
-    return tuple(map(_tuples, item)) if isinstance(item, list) else item
+    """Return a value of a TOML file with its lists as tuples, which a strict section takes."""
+    if isinstance(item, list):
+        return tuple(_tuples(entry) for entry in item)
+    return item
 
 
 def _points_somewhere(vector: Vector) -> Vector:
@@ -50,59 +51,66 @@ def _points_somewhere(vector: Vector) -> Vector:
 Direction = Annotated[Vector, AfterValidator(_points_somewhere)]
 
 
-class Named(Part):
-    """Something that is chosen or read by its name."""
+class Named(DesignSection):
+    """A table with a name, by which it is chosen or read."""
 
     name: Name
 
 
-class Given(Part):
-    """A table that is given in one of several ways, each a few keys."""
+class AlternativeKeys(DesignSection):
+    """A table that has one of several alternative groups of keys."""
 
-    ways: ClassVar[tuple[tuple[str, ...], ...]]
+    alternatives: ClassVar[tuple[tuple[str, ...], ...]]
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what is not given in one way."""
+        """Yield a fault if the table has not exactly the keys of one group."""
         yield from super().faults()
-        given = {key for way in self.ways for key in way if getattr(self, key) is not None}
-        ways = ", or ".join(map(" and ".join, self.ways))
-        yield given not in map(set, self.ways), f"either {ways} is expected"
+        keys_present: set[str] = set()
+        for way in self.alternatives:
+            keys_present.update(key for key in way if getattr(self, key) is not None)
+        is_one_way = any(keys_present == set(way) for way in self.alternatives)
+        expected = ", or ".join(" and ".join(way) for way in self.alternatives)
+        yield not is_one_way, f"either {expected} is expected"
 
 
 class Ranged(Named):
-    """A quantity that can be chosen, and from where to where the reduced model is to hold."""
+    """A quantity that can be chosen, with the range in which the reduced model is valid."""
 
     minimum: float | None = None
     maximum: float | None = None
 
     usual: ClassVar[tuple[float, float]]
-    """Ends of the range where none are given, as multiples of the nominal value."""
+    """The default ends of the range, as multiples of the nominal value."""
     nominal_key: ClassVar[str] = "nominal"
-    """Which of its numbers is the nominal value."""
+    """The key that holds the nominal value."""
 
     @property
     def middle(self) -> float:
-        """Nominal value."""
+        """The nominal value."""
         return float(getattr(self, self.nominal_key))
 
     @property
     def range(self) -> tuple[float, float]:
-        """Least and largest value."""
-        low, high = sorted(share * self.middle for share in self.usual)
-        return (
-            low if self.minimum is None else self.minimum,
-            high if self.maximum is None else self.maximum,
-        )
+        """The least and the largest value for which the reduced model is valid."""
+        low, high = sorted(factor * self.middle for factor in self.usual)
+        if self.minimum is not None:
+            low = self.minimum
+        if self.maximum is not None:
+            high = self.maximum
+        return low, high
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a range without the nominal value."""
+        """Yield a fault if the range does not contain the nominal value."""
         low, high = self.range
-        told = said("design.range", middle=self.middle, low=low, high=high)
-        yield not low <= self.middle <= high, told
+        yield (
+            not low <= self.middle <= high,
+            f"its nominal value {self.middle:g} must lie between minimum {low:g} and maximum "
+            f"{high:g}",
+        )
 
 
-class Parameter(Ranged):
-    """Factor on the stiffness of materials, to be calibrated; 1 unless `nominal` says otherwise."""
+class StiffnessParameter(Ranged):
+    """A factor on the stiffness of materials, to be calibrated; by default 1."""
 
     nominal: float = Field(default=1.0, gt=0.0, le=1e3)
     minimum: float | None = Field(default=None, gt=0.0)
@@ -110,8 +118,8 @@ class Parameter(Ranged):
     usual = (0.9, 1.1)
 
 
-class Control(Ranged):
-    """What commands loads; a load is its numbers times the value of its control."""
+class LoadControl(Ranged):
+    """A control, which scales loads: a load is its numbers times the value of its control."""
 
     unit: str = Field(default="1", pattern=r"^\S+$")
     nominal: float = 1.0
@@ -119,12 +127,16 @@ class Control(Ranged):
     usual = (-10.0, 10.0)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a range that it cannot have, and one of zero."""
+        """Yield faults of the range: without the nominal value, or of zero alone."""
         yield from super().faults()
-        yield not any(self.range), said("design.always_zero")
+        yield (
+            not any(self.range),
+            "with its nominal value 0 it would be 0 always; give the `minimum` and `maximum` it "
+            "takes",
+        )
 
 
-class Commanded(Named):
+class ControlledLoad(Named):
     """A load, constant or times the value of a control."""
 
     control: Name | None = None
@@ -132,18 +144,18 @@ class Commanded(Named):
 
 
 class Region(Named):
-    """Region that may lose stiffness, up to `largest_loss`; `name` is that of its loss."""
+    """A region that may lose stiffness, up to `largest_loss`; its loss has its name."""
 
     largest_loss: float = Field(default=0.8, gt=0.0, le=0.95)
 
     @property
     def range(self) -> tuple[float, float]:
-        """Least and largest loss."""
+        """The least and the largest loss."""
         return (0.0, self.largest_loss)
 
 
 class ChosenMass(Ranged):
-    """Mass [kg]; `free` where it is to be calibrated or chosen later."""
+    """A mass [kg]; a `free` one is calibrated or chosen later."""
 
     mass: float = Field(ge=0.0, lt=1e6)
     free: bool = False
@@ -153,22 +165,22 @@ class ChosenMass(Ranged):
     nominal_key = "mass"
 
 
-class Damping(Part):
+class RayleighDamping(DesignSection):
     """Rayleigh damping V = alpha M + beta K."""
 
     alpha: float = Field(default=0.0, ge=0.0, description="1/s")
     beta: float = Field(default=0.0, ge=0.0, description="s")
 
 
-class ReductionLimits(Part):
-    """How well the reduced model is to hold, and how many full solutions it may take."""
+class ReductionLimits(DesignSection):
+    """The accuracy of the reduced model, and the number of full solutions that it may take."""
 
     tolerance: float = Field(default=6e-4, ge=1e-5, le=0.1, description="of the largest output")
     most_solutions: int = Field(default=401, ge=1, le=2000)
 
 
-class StructureDesign(Part):
-    """A structure: all that decides its model beside the files that it names. Read it with `load_structure`.
+class StructureDesign(DesignSection):
+    """A structure: all that its model depends on beside files; read it with `load_structure`.
 
     Raises
     ------
@@ -178,96 +190,132 @@ class StructureDesign(Part):
 
     name: str = Field(min_length=1)
     length_unit: Literal["m", "cm", "mm", "um", "in", "ft"]
-    parameter: tuple[Parameter, ...] = ()
-    control: tuple[Control, ...] = ()
-    load: tuple[Commanded, ...] = ()
+    parameter: tuple[StiffnessParameter, ...] = ()
+    control: tuple[LoadControl, ...] = ()
+    load: tuple[ControlledLoad, ...] = ()
     damage: tuple[Region, ...] = Field(default=(), max_length=MOST_REGIONS)
     mass: tuple[ChosenMass, ...] = ()
     gauge: tuple[Named, ...] = ()
     displacement: tuple[Named, ...] = ()
     acceleration: tuple[Named, ...] = ()
     port: tuple[Named, ...] = ()
-    damping: Damping = Damping()
+    damping: RayleighDamping = RayleighDamping()
     reduction: ReductionLimits = ReductionLimits()
 
     what: ClassVar[str]
-    """What its files hold."""
+    """The content of its files: "mesh" or "matrix"."""
     scaled_table: ClassVar[str] = ""
-    """Name of the tables that a parameter may scale."""
+    """The tables whose stiffness a parameter may scale."""
     own_names: ClassVar[tuple[str, ...]] = ()
     """Further tables whose names must differ from one another."""
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of the files that it is made of, seen from its own."""
+        """The names of the files with mesh or matrices, relative to the structure file."""
         raise NotImplementedError
 
     @field_validator("name", "mesh", check_fields=False)
     @classmethod
     def _one_line(cls, text: str) -> str:
         if not text.isprintable():
-            raise ValueError("one line of text is expected, without line breaks or other control characters")
+            raise ValueError(
+                "one line of text is expected, without line breaks or other control characters"
+            )
         return text
 
     def faults(self) -> Iterator[Fault]:
-        """Yield names that do not fit together."""
-        # What a state, a control or an output is called by must be one thing.
-        for keys in (
+        """Yield faults of names that do not fit together."""
+        # The names of states and controls are read together, and so are those of outputs.
+        groups_of_tables = [
             ("parameter", "damage", "mass", "control"),
             ("gauge", "displacement", "acceleration", "port"),
             ("load",),
-            *((key,) for key in self.own_names),
-        ):
-            first: dict[str, str] = {}
-            for place, part in (item for key in keys for item in self.numbered(key)):
-                other = first.setdefault(part.name, place)
-                yield other != place, said("design.names", first=other, second=place, name=part.name)
-        if table := self.scaled_table:
-            yield from self.wrong_ties(table, "scaled_by", "parameter", "is scaled by", f"scales no {table}")
-        yield from self.wrong_ties("load", "control", "control", "is tied to the control", "commands no load")
+        ]
+        groups_of_tables += [(key,) for key in self.own_names]
+        for keys in groups_of_tables:
+            yield from self._equal_names(keys)
+        table = self.scaled_table
+        if table:
+            yield from self.wrong_ties(
+                table, "scaled_by", "parameter", tied="is scaled by", untied=f"scales no {table}"
+            )
+        yield from self.wrong_ties(
+            "load",
+            "control",
+            "control",
+            tied="is tied to the control",
+            untied="commands no load",
+        )
 
-    def wrong_ties(self, table: str, key: str, other: str, tied: str, untied: str) -> Iterator[Fault]:
-        """Yield what is tied to a name of another table that is not there, and names that tie nothing."""
-        known = [part.name for part in getattr(self, other)]
-        came = {getattr(part, key): place for place, part in self.numbered(table)}
-        for name, place in came.items():
-            lost = name is not None and name not in known
-            yield lost, f"{place} {tied} {name!r}, but no [[{other}]] has that name"
-        yield from ((name not in came, f"the {other} {name!r} {untied}") for name in known)
+    def _equal_names(self, keys: tuple[str, ...]) -> Iterator[Fault]:
+        """Yield faults of rows with the same name in some tables."""
+        first_place: dict[str, str] = {}
+        for key in keys:
+            for place, row in self.numbered(key):
+                other_place = first_place.setdefault(row.name, place)
+                yield (
+                    other_place != place,
+                    f"{other_place} and {place} are both named {row.name!r}; give each a name of "
+                    "its own",
+                )
+
+    def wrong_ties(
+        self, table: str, key: str, named_table: str, *, tied: str, untied: str
+    ) -> Iterator[Fault]:
+        """Yield faults of ties to names that another table lacks, and of names without a tie.
+
+        Parameters
+        ----------
+        table, key : str
+            The table whose rows are tied, and the key that holds the name.
+        named_table : str
+            The table whose rows have these names.
+        tied, untied : str
+            What messages say of a row that is tied to a name, and of a name to which none is.
+        """
+        known_names = [row.name for row in getattr(self, named_table)]
+        place_of_name = {getattr(row, key): place for place, row in self.numbered(table)}
+        for name, place in place_of_name.items():
+            is_unknown = name is not None and name not in known_names
+            yield is_unknown, f"{place} {tied} {name!r}, but no [[{named_table}]] has that name"
+        for name in known_names:
+            yield name not in place_of_name, f"the {named_table} {name!r} {untied}"
 
     def numbered(self, key: str) -> Iterator[tuple[str, Any]]:
-        """Yield the parts of a table, each behind its place in the file, such as `load[1]`."""
+        """Yield each entry of a table with its place in the file, such as `load[1]`."""
         for number, part in enumerate(getattr(self, key), start=1):
             yield f"{key}[{number}]", part
 
     @property
     def unit(self) -> float:
-        """Metres in the unit of length."""
+        """The unit of length [m]."""
         return UNITS[self.length_unit]
 
     @property
     def ranges(self) -> dict[str, tuple[float, float]]:
-        """Least and largest value for which a reduced model is to hold of all that can be chosen, by name."""
-        free = (part for part in self.mass if part.free)
-        chosen: tuple[Ranged | Region, ...] = (*self.parameter, *self.damage, *free, *self.control)
-        return {part.name: part.range for part in chosen}
+        """Range of validity of the reduced model for everything that can be chosen, by name."""
+        free_masses = [mass for mass in self.mass if mass.free]
+        rows: tuple[Ranged | Region, ...]
+        rows = (*self.parameter, *self.damage, *free_masses, *self.control)
+        return {row.name: row.range for row in rows}
 
 
 @dataclass(frozen=True)
 class StructureSettings:
-    """How well the reduced model of a structure is to hold; where, and both limits, its design says.
+    """The accuracy that the reduced model of a structure must have, and where.
 
     Attributes
     ----------
     bound_tolerance : float
-        The certified bound wanted everywhere on the training set, for each load alone, of strains relative to
-        the largest strain and of displacements relative to the largest of them.
+        The certified bound wanted everywhere on the training set, for each load alone, of strains
+        relative to the largest strain and of displacements relative to the largest of them.
     most_snapshots : int
         Limit of the greedy search.
     mode_count : int
         Modes that the reduced model returns.
     ranges : dict of str to (float, float)
-        Least and largest value where it is to hold elsewhere than the design says, by name.
+        Least and largest values for which the reduced model is valid, by name, where they differ
+        from those of the design.
     """
 
     bound_tolerance: float = ReductionLimits().tolerance

@@ -27,7 +27,7 @@ from fe.runtime.errors import CalculixError
 from fe.runtime.state import DigitalState
 from fe.structure.affine import AffineStructure
 from fe.structure.body import Body
-from fe.structure.design import Load
+from fe.structure.design import MeshLoad
 from fe.structure.operators import Structure
 from fe.wing.operators import AffineOperators, wing_values
 
@@ -338,7 +338,7 @@ def structure_deck(structure: Structure) -> CalculixDeck:
     return CalculixDeck("structure", structure, structure.body, {}, loads)
 
 
-def _load_step(structure: Structure, load: Load) -> Step:
+def _load_step(structure: Structure, load: MeshLoad) -> Step:
     """Return the static step of a load, with the value of `control_value_alone`."""
     factor = structure.control_value_alone(load.name)
     lines = ["*DLOAD, OP=NEW"]

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from fe.runtime.errors import DesignFileError, InvalidDesignError
 from fe.runtime.state import MOST_REGIONS, Geometry, default_region_names, wing_input_names
-from fe.structure.tables import Part, StructureDesign
+from fe.structure.tables import DesignSection, StructureDesign
 from reporting.toml_file import Fault, read_toml, validate
 from reporting.words import brief
 
@@ -50,7 +50,7 @@ RESERVED_NAMES = frozenset((*wing_input_names(()), "skin", "webs", "ribs"))
 """Names that damage regions cannot have, because they mean something else beside these."""
 
 
-class WingDesign(Part):
+class WingDesign(DesignSection):
     """A wing: everything that decides its model. Construct it with `load_design` or `parse_design`.
 
     Raises

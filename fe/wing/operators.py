@@ -23,7 +23,7 @@ from fe.runtime.arrays import FloatArray, IntArray
 from fe.runtime.state import STANDARD_GRAVITY, TIP_FORCE, Losses, losses_of
 from fe.structure.affine import AffineStructure, NaturalModes
 from fe.structure.affine_fields import OutputRows
-from fe.structure.body import Body, PointMass
+from fe.structure.body import Body, MassAtPoints
 from fe.structure.operators import assemble_structure
 from fe.structure.supports import RigidSet, Supports, supports
 
@@ -184,8 +184,8 @@ def wing_body(mesh: WingMesh) -> Body[WingMesh]:
         part=mesh.stiffness_term,
         parts=stiffness_parts(design.regions),
         masses=(
-            PointMass("servo_mass", design.masses.servo, np.vstack(weights_of_servos)),
-            PointMass("pitot_mass", design.masses.pitot, np.vstack(weights_of_pitots)),
+            MassAtPoints("servo_mass", design.masses.servo, np.vstack(weights_of_servos)),
+            MassAtPoints("pitot_mass", design.masses.pitot, np.vstack(weights_of_pitots)),
         ),
         variation=modulus_variation(mesh),
     )

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from fe.runtime.arrays import FloatArray
-from fe.structure.tables import Modulus, Part
+from fe.structure.tables import DesignSection, Modulus
 from reporting.toml_file import Fault
 
 _FOUR_DIGIT_COEFFICIENTS = (0.2969, -0.1260, -0.3516, 0.2843, -0.1015)
@@ -63,7 +63,7 @@ Density = Annotated[float, Field(ge=0.0, le=3e4, description="kg/m^3")]
 Spring = Annotated[float, Field(gt=0.0, le=1e15)]
 
 
-class Planform(Part):
+class Planform(DesignSection):
     """Straight-tapered half-wing; the chord line `straight_chord_line` is the spanwise axis."""
 
     semi_span: float = Field(gt=0.05, lt=60.0, description="m")
@@ -76,27 +76,27 @@ class Planform(Part):
         return self.root_chord + (self.tip_chord - self.root_chord) * station
 
 
-class Airfoil(Part):
+class Airfoil(DesignSection):
     """Symmetric four-digit section."""
 
     thickness_ratio: float = Field(ge=0.02, le=0.4)
 
 
-class SkinBand(Part):
+class SkinBand(DesignSection):
     """Young's modulus [Pa] of the skin from the previous band's end to `end`, in spans."""
 
     end: Fraction
     young_modulus: Modulus
 
 
-class SkinStation(Part):
+class SkinStation(DesignSection):
     """Young's modulus [Pa] of the skin at a fraction of the span."""
 
     station: Fraction
     young_modulus: Modulus
 
 
-class Skin(Part):
+class Skin(DesignSection):
     """Shell of the wing, orthotropic with equal moduli; shear moduli are ratios to Young's modulus.
 
     Young's modulus along the span is given either in `bands`, each of one modulus, or at
@@ -144,7 +144,7 @@ def _rises_from_0_to_1(fractions: Sequence[float]) -> bool:
     return is_rising and fractions[0] == 0.0 and fractions[-1] == 1.0
 
 
-class Wall(Part):
+class Wall(DesignSection):
     """A wall between the skins."""
 
     thickness: Thickness
@@ -166,7 +166,7 @@ class Rib(Wall):
     station: Fraction
 
 
-class Rod(Part):
+class Rod(DesignSection):
     """Solid round rod at mid-height of a web, from the root to `reach`, a fraction of the span.
 
     Its flapwise bending stiffness and its mass are distributed over the cells of that web.
@@ -189,7 +189,7 @@ class Rod(Part):
         return self.density * math.pi * self.diameter**2 / 4.0
 
 
-class AddedDensity(Part):
+class AddedDensity(DesignSection):
     """Density [kg/m^3] of glue, paint or wiring, added between two fractions of the span."""
 
     start: Fraction
@@ -197,7 +197,7 @@ class AddedDensity(Part):
     density: Density
 
 
-class Root(Part):
+class Root(DesignSection):
     """Springs that carry the rigid root rib; its other motions are held."""
 
     transverse_spring: Spring = Field(description="N/m")
@@ -205,7 +205,7 @@ class Root(Part):
     yaw_spring: Spring = Field(description="N m/rad")
 
 
-class PointMassPlace(Part):
+class PointMassPlace(DesignSection):
     """Location of a point mass of a kind; its mass is `masses.<kind>` until it is calibrated."""
 
     kind: Literal["servo", "pitot"]
@@ -213,14 +213,14 @@ class PointMassPlace(Part):
     chord: Fraction
 
 
-class Masses(Part):
+class Masses(DesignSection):
     """Nominal masses [kg] of one servo and of the pitot tube."""
 
     servo: float = Field(ge=0.0, lt=1e3)
     pitot: float = Field(ge=0.0, lt=1e3)
 
 
-class Gauges(Part):
+class Gauges(DesignSection):
     """Strain gauges on the upper skin, along the span.
 
     Positions are (distance from the root [m], chord fraction). A gauge reads the strain averaged
@@ -235,7 +235,7 @@ class Gauges(Part):
     positions: tuple[tuple[float, float], ...] = Field(min_length=1)
 
 
-class Defect(Part):
+class Defect(DesignSection):
     """Region of the upper skin that may lose stiffness, between distances and chord fractions.
 
     Its name is that of its loss everywhere: in states, FMU variables and scenarios. By default it
@@ -249,7 +249,7 @@ class Defect(Part):
     chord_end: Fraction
 
 
-class Lift(Part):
+class Lift(DesignSection):
     """Net load of a level turn, linear in the load factor.
 
     `force` [N] and `forward_force` [N] are the totals on the half-wing at `load_factor`. The lift
@@ -266,14 +266,14 @@ class Lift(Part):
     inertia_relief: bool = False
 
 
-class TipLoad(Part):
+class TipLoad(DesignSection):
     """Point of the static test load: distance from the tip [m] and chord fraction."""
 
     distance_from_tip: float = Field(ge=0.0)
     chord: Fraction
 
 
-class MeshSettings(Part):
+class MeshSettings(DesignSection):
     """Largest cells: along the span [m], along the chord (fraction), beside edges of defects [m].
 
     All are divided by `refinement`. Without `edge_size` the cells beside the edges are like the

@@ -1,4 +1,8 @@
-"""What an FMU declares in its model description, as plain records for all FMI versions."""
+"""The records of what an FMU declares in its model description, alike for all versions of FMI.
+
+`model_description` makes them from what fmpy has read of the XML. Everything else in the package,
+from the binding to the coupling of FMUs, works on these records and not on fmpy's.
+"""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -7,23 +11,26 @@ from difflib import get_close_matches
 from functools import cached_property
 from itertools import product
 from pathlib import Path
-from typing import Any
-from xml.etree.ElementTree import Element
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from fmu_asset.errors import BindingError, FmuInputError, FmuUnsupportedError, said, visible
-from fmu_asset.instances.plan import FmuIdentity, Interface
-from reporting.units import BASE_UNITS
+from fmu_asset.errors import BindingError, FmuInputError, visible
+from fmu_asset.instances.plan import FmuIdentity
 
 NUMERIC_KINDS = frozenset(
     {"Real", "Integer", "Enumeration", "Boolean", "Float32", "Float64"}
     | {f"{sign}{bits}" for sign in ("Int", "UInt") for bits in (8, 16, 32, 64)}
 )
-_LARGEST_ARRAY = 10_000_000
+"""Base types of FMI whose values are numbers."""
+
 FLOAT_KINDS = frozenset({"Real", "Float32", "Float64"})
+"""Base types of FMI whose values are real numbers."""
+
 READABLE = ("output", "local", "calculatedParameter")
-"""Causalities of what can be the source of a connection."""
+"""Causalities of variables that can be the source of a connection."""
+
+_MOST_ARRAY_ELEMENTS = 10_000_000
 
 
 @dataclass(frozen=True)
@@ -33,29 +40,33 @@ class VariableInfo:
     Attributes
     ----------
     name, description : str
-        As declared.
+        The name and the description in the model description.
     reference : int
-        Value reference.
+        The value reference.
     kind : str
-        FMI base type: Real, Integer, Enumeration, Boolean, String; in FMI 3 Float64, Int32, Binary, ...
+        The base type of FMI: Real, Integer, Enumeration, Boolean, String; in FMI 3 Float64, Int32,
+        Binary, ...
     causality, variability : str
-        As declared.
+        The causality and variability in the words of FMI.
     unit, display_unit : str or None
-        As declared, or by the declared type.
+        The units that the variable declares, or else its declared type.
     minimum, maximum : float or None
-        Declared range in `unit`.
+        The declared range, in `unit`.
     start : str or None
-        Declared start value; of an array, its elements.
+        The declared start value; the start values of all elements of an array, with blanks between.
     shape : tuple of int
-        Of an array of FMI 3, with the start values of its structural parameters; empty for a scalar.
+        The lengths of an array of FMI 3, with the start values of its structural parameters; empty
+        for a scalar.
     dimensions : tuple of str or None
-        For each number of the shape the name of the structural parameter that it is, if it is one.
+        For each length of the shape the name of the structural parameter that sets it; None if it
+        is fixed.
     clocked : bool
-        Whether it changes with a clock of FMI 3 only.
+        Whether the variable changes with a clock of FMI 3 only.
     items : dict of str to int
-        Of an enumeration.
+        The values of an enumeration by the names of its items.
     dependencies : tuple of str or None
-        Names of the variables that an output depends on directly; None if that is not declared.
+        The names of the variables that an output depends on directly; None if they are not
+        declared.
     """
 
     name: str
@@ -77,47 +88,69 @@ class VariableInfo:
 
     @property
     def size(self) -> int:
-        """Number of values."""
+        """The number of values: 1 for a scalar."""
         return math.prod(self.shape)
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names of the elements of an array, row by row and from 1; the name itself of a scalar."""
+        """The names of an array's elements, row by row and from 1; of a scalar its own name."""
         if not self.shape:
             return (self.name,)
         ranges = [range(1, length + 1) for length in self.shape]
-        return tuple(f"{self.name}[{','.join(map(str, index))}]" for index in product(*ranges))
+        names = []
+        for index in product(*ranges):
+            numbers = ",".join(str(number) for number in index)
+            names.append(f"{self.name}[{numbers}]")
+        return tuple(names)
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Declared range, within that of the type: C would wrap what does not fit."""
-        low, high = (0.0, 1.0) if self.kind == "Boolean" else (-math.inf, math.inf)
-        if self.base_type in ("Integer", "Enumeration"):
-            sized = self.kind not in ("Integer", "Enumeration")
-            limits = np.iinfo(self.kind.lower() if sized else "int32")
-            low, high = float(limits.min), float(limits.max)
-        return (
-            low if self.minimum is None else max(low, self.minimum),
-            high if self.maximum is None else min(high, self.maximum),
-        )
+        """The declared range, within the range of the type: C would wrap what does not fit."""
+        low, high = self._bounds_of_type()
+        if self.minimum is not None:
+            low = max(low, self.minimum)
+        if self.maximum is not None:
+            high = min(high, self.maximum)
+        return low, high
+
+    def _bounds_of_type(self) -> tuple[float, float]:
+        """Return the least and largest value that the base type can hold."""
+        if self.kind == "Boolean":
+            return 0.0, 1.0
+        if self.base_type not in ("Integer", "Enumeration"):
+            return -math.inf, math.inf
+        has_declared_size = self.kind not in ("Integer", "Enumeration")
+        limits = np.iinfo(self.kind.lower() if has_declared_size else "int32")
+        return float(limits.min), float(limits.max)
 
     @property
     def in_unit(self) -> str:
-        """Unit with a blank before it, for a sentence; nothing if it has none."""
+        """The unit with a blank before it, for a message; empty if the variable has no unit."""
         return "" if self.unit in (None, "1") else f" {self.unit}"
 
     def resized(self, lengths: Mapping[str | None, int]) -> "VariableInfo":
-        """Return the variable with other values of structural parameters; one start value stands for all.
+        """Return the variable with the shape that other values of structural parameters give it.
+
+        A start value that all elements share holds for the new elements too.
+
+        Parameters
+        ----------
+        lengths : mapping of str to int
+            The values of structural parameters, by name.
 
         Raises
         ------
         FmuInputError
-            If it would be an array of too many elements.
+            If the array would have too many elements.
         """
-        shape = [lengths.get(name, length) for name, length in zip(self.dimensions, self.shape, strict=True)]
-        start = {*(self.start or "").split()}
-        alike = start.pop() if len(start) == 1 else self.start
-        return replace(self, shape=_checked(self.name, shape), start=alike)
+        shape = []
+        for parameter, length in zip(self.dimensions, self.shape, strict=True):
+            shape.append(lengths.get(parameter, length))
+        start = self.start
+        different_values = set((start or "").split())
+        if len(different_values) == 1:
+            start = different_values.pop()
+        return replace(self, shape=checked_shape(self.name, shape), start=start)
 
     @property
     def numeric(self) -> bool:
@@ -126,86 +159,108 @@ class VariableInfo:
 
     @property
     def base_type(self) -> str:
-        """Its type in the words of FMI 2 and SSP 1.0, which have one size of reals and one of integers."""
+        """The type in the words of FMI 2 and SSP 1.0, which know reals and integers of one size."""
         if self.kind in FLOAT_KINDS:
             return "Real"
         return "Integer" if self.kind.lstrip("U").startswith("Int") else self.kind
 
     @property
     def single(self) -> bool:
-        """Whether it is one number that is there at any time: no text, array or clocked variable."""
+        """Whether it is a single number at any time: not a text, an array or a clocked variable."""
         return self.numeric and not self.shape and not self.clocked
 
     @property
     def is_text_parameter(self) -> bool:
-        """Whether it is a parameter that is one text."""
-        return self.kind == "String" and self.causality == "parameter" and not (self.shape or self.clocked)
+        """Whether it is a parameter with one text as its value."""
+        is_one_value = not self.shape and not self.clocked
+        return self.kind == "String" and self.causality == "parameter" and is_one_value
 
     @property
     def item_list(self) -> str:
-        """The items of an enumeration with their values, for a sentence or a table; empty for other types."""
+        """The items of an enumeration with their values, for a message; empty for other types."""
         return ", ".join(f"{name} = {value}" for name, value in self.items.items())
 
     @property
     def startable(self) -> bool:
-        """Whether it is an output or local variable with a start value, to be set before initialisation."""
-        free = self.causality in ("output", "local") and self.variability != "constant"
-        return free and self.start is not None
+        """Whether it is an output or local variable whose start value initialisation may set."""
+        is_result = self.causality in ("output", "local")
+        return is_result and self.variability != "constant" and self.start is not None
 
     @property
     def continuous(self) -> bool:
-        """Whether it is a real number that changes at any time."""
+        """Whether it is a real number that may change at any time."""
         return self.kind in FLOAT_KINDS and self.variability == "continuous"
+
+
+class DisplayUnit(NamedTuple):
+    """A display unit: displayed value = `factor` * value + `offset`."""
+
+    name: str
+    factor: float
+    offset: float
 
 
 @dataclass(frozen=True)
 class UnitInfo:
-    """A unit as the FMU defines it: exponents of `BASE_UNITS` (or None), factor, offset, display units."""
+    """A unit as the FMU defines it: value in SI = `factor` * value + `offset`.
+
+    Attributes
+    ----------
+    name : str
+        The text of the unit.
+    exponents : tuple of int or None
+        The exponents of `BASE_UNITS`; None if the FMU does not define the unit by them.
+    factor, offset : float
+        The conversion to SI.
+    displays : tuple of DisplayUnit
+        The display units of the unit.
+    """
 
     name: str
     exponents: tuple[int, ...] | None
     factor: float
     offset: float
-    displays: tuple[tuple[str, float, float], ...] = ()
+    displays: tuple[DisplayUnit | tuple[str, float, float], ...] = ()
 
 
 @dataclass(frozen=True)
 class FmuDescription(FmuIdentity):
-    """What an FMU file is and declares; plain values only, so that it can be listed or sent.
+    """What an FMU file is and declares, in plain values that a process can be sent.
 
     Attributes
     ----------
     path : Path
-        The file.
+        The FMU file.
     shown_as : str
-        What sentences call it, where that is not the path: the FMU of an SSP file lies in a folder of ours.
+        The name of the FMU in messages, where that is not the path: the FMU of an SSP file lies in
+        a temporary folder.
     sha256 : str
-        Hash of the file.
+        The hash of the file.
     file_size : int
-        Bytes.
+        The size of the file [bytes].
     model_name, description, generation_tool : str
-        As declared.
+        The texts that the model description declares.
     platforms : tuple of str
-        Folders of binaries, such as linux64.
+        The folders of binaries, such as linux64.
     can_get_and_set_state, can_serialise_state, can_vary_step : bool
-        Declared capabilities of `interface`.
+        The declared capabilities of `interface`.
     variables : tuple of VariableInfo
-        In the order of the model description.
+        The variables, in the order of the model description.
     units : tuple of UnitInfo
         The unit definitions.
     interfaces : tuple of str
-        All that it offers.
+        All interfaces that the FMU offers.
     needs_tool : bool
-        Whether it needs its authoring tool.
+        Whether the FMU needs its authoring tool.
     once_per_process : bool
         Whether a process can make one instance only.
     start_time, stop_time, step_size, tolerance : float or None
-        Of the default experiment.
+        The values of the default experiment; times in s.
     fixed_step : float or None
-        Internal step size that FMI 3 declares [s].
+        The internal step size that FMI 3 declares [s].
     can_interpolate_inputs : bool
-        Whether inputs can move in straight lines between communication points: in model exchange, and where
-        co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
+        Whether inputs can move in straight lines between communication points: in model exchange,
+        and where co-simulation declares `canInterpolateInputs` (FMI 1 and 2).
     """
 
     path: Path
@@ -233,26 +288,27 @@ class FmuDescription(FmuIdentity):
 
     @property
     def label(self) -> str:
-        """What sentences call it."""
+        """The name of the FMU in messages."""
         return self.shown_as or str(self.path)
 
     @property
     def identity(self) -> FmuIdentity:
-        """What of it an instance has to know."""
-        return FmuIdentity(**{item.name: getattr(self, item.name) for item in fields(FmuIdentity)})
+        """The values that an instance of the FMU needs."""
+        values = {entry.name: getattr(self, entry.name) for entry in fields(FmuIdentity)}
+        return FmuIdentity(**values)
 
     @cached_property
-    def _by_name(self) -> dict[str, VariableInfo]:
+    def _variable_by_name(self) -> dict[str, VariableInfo]:
         return {variable.name: variable for variable in self.variables}
 
     def variable(self, name: str) -> VariableInfo | None:
         """Return the variable of that name, or None."""
-        return self._by_name.get(name)
+        return self._variable_by_name.get(name)
 
     def hint(self, name: str) -> str:
-        """Return the end of a sentence on a name that is none: the nearest of its variables, if any is."""
-        near = get_close_matches(name, [variable.name for variable in self.variables], 1)
-        return f"; did you mean {near[0]!r}?" if near else "."
+        """Return the end of a message on an unknown name: the most similar variable, if any."""
+        similar = get_close_matches(name, [variable.name for variable in self.variables], 1)
+        return f"; did you mean {similar[0]!r}?" if similar else "."
 
     @cached_property
     def feedthrough(self) -> dict[str, frozenset[str]]:
@@ -260,24 +316,41 @@ class FmuDescription(FmuIdentity):
 
         An output without declared dependencies depends on all inputs, as FMI says.
         """
-        inputs = frozenset(v.name for v in self.variables if v.causality == "input")
-        return {
-            v.name: inputs if v.dependencies is None else inputs & {*v.dependencies}
-            for v in self.variables
-            if v.causality in READABLE
-        }
+        names = [variable.name for variable in self.variables if variable.causality == "input"]
+        all_inputs = frozenset(names)
+        direct_inputs: dict[str, frozenset[str]] = {}
+        for variable in self.variables:
+            if variable.causality not in READABLE:
+                continue
+            if variable.dependencies is None:
+                direct_inputs[variable.name] = all_inputs
+            else:
+                direct_inputs[variable.name] = all_inputs.intersection(variable.dependencies)
+        return direct_inputs
 
-    def step_of(self, given: float | None) -> float | None:
-        """Return a communication step size that is given, or the FMU's own; None where nothing says one.
+    def step_of(self, step_size: float | None) -> float | None:
+        """Return the communication step size: the one asked for, or else the FMU's own.
+
+        Parameters
+        ----------
+        step_size : float or None
+            The step size that a user asks for [s].
+
+        Returns
+        -------
+        float or None
+            The step size [s]; None if neither the user nor the FMU says one.
 
         Raises
         ------
         BindingError
-            If it is no positive number.
+            If it is not a positive number.
         """
-        if given is not None and not (math.isfinite(given) and given > 0.0):
-            raise BindingError(f"The step size must be a positive number of seconds, and {given:g} came.")
-        return given or self.fixed_step or self.step_size
+        if step_size is not None and not (math.isfinite(step_size) and step_size > 0.0):
+            raise BindingError(
+                f"The step size must be a positive number of seconds, and {step_size:g} came."
+            )
+        return step_size or self.fixed_step or self.step_size
 
     def units_of(self, variable: VariableInfo) -> tuple[UnitInfo, ...]:
         """Return the definitions of units that hold for a variable."""
@@ -290,156 +363,29 @@ class FmuDescription(FmuIdentity):
         return "Int64" if self.major_version == 3 else "Integer"
 
 
-def read_declared(
-    declared: Any, root: Element, archive: Mapping[str, Any], wanted: Interface | None
-) -> FmuDescription:
-    """Return the description of an FMU from what fmpy has read.
-
-    Parameters
-    ----------
-    declared : fmpy.model_description.ModelDescription
-        As fmpy reads it.
-    root : Element
-        The XML itself, for what fmpy leaves out.
-    archive : mapping
-        `path`, `sha256`, `file_size` and `platforms`.
-    wanted : {"co-simulation", "model-exchange"} or None
-        How it is to be run; co-simulation if it has that.
-
-    Raises
-    ------
-    FmuUnsupportedError
-        If it does not offer that.
-    """
-    offered = _offered(declared, archive["path"], wanted)
-    interface = next(iter(offered)) if wanted is None else wanted
-    chosen = offered[interface]
-    experiment = declared.defaultExperiment
-    # fmpy does not read the capabilities of FMI 1.
-    capabilities = root.find("Implementation//Capabilities")
-    vary = getattr(chosen, "canHandleVariableCommunicationStepSize", True)
-    lines = interface == "model-exchange" or getattr(chosen, "canInterpolateInputs", False)
-    if capabilities is not None:
-        vary = capabilities.get("canHandleVariableCommunicationStepSize") in ("true", "1")
-        lines = lines or capabilities.get("canInterpolateInputs") in ("true", "1")
-    # FMI 1 always wants it.
-    completed = bool(getattr(chosen, "needsCompletedIntegratorStep", False)) or declared.fmiVersion == "1.0"
-
-    # fmpy 0.3.32 passes over the range of unsigned integers.
-    unsigned = {e.get("name"): e for e in root.iterfind("ModelVariables/*") if e.tag.startswith("UInt")}
-    for variable in declared.modelVariables:
-        if (element := unsigned.get(variable.name)) is not None:
-            variable.min, variable.max = element.get("min"), element.get("max")
-    # And takes a display unit of FMI 3 that is one over the value, as s of Hz, for one that is not.
-    inverse = {shown.get("name") for shown in root.iterfind(".//DisplayUnit[@inverse='true']")}
-    for unit in declared.unitDefinitions:
-        unit.displayUnits = [shown for shown in unit.displayUnits if shown.name not in inverse]
-    known = {
-        unknown.variable.name: tuple(str(variable.name) for variable in unknown.dependencies)
-        for unknown in declared.outputs
-        if unknown.variable is not None and unknown.dependencies is not None
-    }
-    return FmuDescription(
-        **archive,
-        fmi_version=str(declared.fmiVersion),
-        model_name=str(declared.modelName),
-        model_identifier=str(chosen.modelIdentifier),
-        guid=str(declared.guid),
-        description=str(declared.description or ""),
-        generation_tool=str(declared.generationTool or ""),
-        can_get_and_set_state=bool(chosen.canGetAndSetFMUstate),
-        can_serialise_state=bool(chosen.canSerializeFMUstate),
-        can_vary_step=bool(vary),
-        can_interpolate_inputs=bool(lines),
-        variables=tuple(_variable(each, known.get(each.name)) for each in declared.modelVariables),
-        units=tuple(_unit(unit) for unit in declared.unitDefinitions),
-        interface=interface,
-        interfaces=tuple(offered),
-        needs_tool=bool(chosen.needsExecutionTool)
-        or root.find("Implementation/CoSimulation_Tool") is not None,
-        once_per_process=bool(getattr(chosen, "canBeInstantiatedOnlyOncePerProcess", False)),
-        start_time=_number(experiment, "startTime"),
-        stop_time=_number(experiment, "stopTime"),
-        step_size=_number(experiment, "stepSize"),
-        tolerance=_number(experiment, "tolerance"),
-        fixed_step=_number(chosen, "fixedInternalStepSize"),
-        states=int(declared.numberOfContinuousStates),
-        event_indicators=int(declared.numberOfEventIndicators),
-        completed_step=completed,
-    )
-
-
-def _checked(name: str, shape: Sequence[int]) -> tuple[int, ...]:
-    if any(length < 0 for length in shape) or math.prod(shape) > _LARGEST_ARRAY:
-        came = " x ".join(map(str, shape))
-        raise FmuInputError(said("archive.array_too_large", name=name, shape=came, most=_LARGEST_ARRAY))
+def checked_shape(name: str, shape: Sequence[int]) -> tuple[int, ...]:
+    """Return the shape of an array; refuse one that would fill the memory."""
+    if any(length < 0 for length in shape) or math.prod(shape) > _MOST_ARRAY_ELEMENTS:
+        lengths = " x ".join(str(length) for length in shape)
+        raise FmuInputError(
+            f"{name!r} is an array of {lengths} elements; {_MOST_ARRAY_ELEMENTS} are the most."
+        )
     return tuple(shape)
 
 
-def _offered(declared: Any, file: Path, wanted: Interface | None) -> dict[Interface, Any]:
-    """Return what an FMU says of the interfaces that it offers, the one that is wanted among them."""
-    there: dict[Interface, Any] = {
-        "co-simulation": declared.coSimulation, "model-exchange": declared.modelExchange
-    }  # fmt: skip
-    there = {name: given for name, given in there.items() if given is not None}
-    if not there:
-        raise FmuUnsupportedError(said("archive.no_interface", file=file))
-    if wanted is not None and wanted not in there:
-        raise FmuUnsupportedError(said("archive.other_interface", file=file, there=there, wanted=wanted))
-    return there
-
-
-def _number(owner: Any, attribute: str) -> float | None:
-    value = getattr(owner, attribute, None)
-    return None if value is None else float(value)
-
-
-def _variable(declared: Any, dependencies: tuple[str, ...] | None) -> VariableInfo:
-    declared_type = declared.declaredType
-
-    def owner(attribute: str) -> Any:
-        """Return who says something: the variable, or else its type."""
-        return declared_type if getattr(declared, attribute) is None else declared
-
-    return VariableInfo(
-        name=str(declared.name),
-        reference=int(declared.valueReference),
-        kind=str(declared.type),
-        causality=str(declared.causality or "local"),
-        variability=str(declared.variability or "continuous"),
-        description=str(declared.description or ""),
-        unit=getattr(owner("unit"), "unit", None),
-        display_unit=getattr(owner("displayUnit"), "displayUnit", None),
-        minimum=_number(owner("min"), "min"),
-        maximum=_number(owner("max"), "max"),
-        start=None if declared.start is None else str(declared.start),
-        shape=_checked(declared.name, declared.shape or ()),
-        dimensions=tuple(d.variable and str(d.variable.name) for d in declared.dimensions or ()),
-        clocked=bool(declared.clocks),
-        items={str(item.name): int(item.value) for item in getattr(declared_type, "items", None) or ()},
-        dependencies=dependencies,
-    )
-
-
-def _unit(declared: Any) -> UnitInfo:
-    base = declared.baseUnit
-    exponents = None if base is None else tuple(int(getattr(base, symbol)) for symbol in BASE_UNITS)
-    return UnitInfo(
-        name=str(declared.name),
-        exponents=exponents,
-        factor=1.0 if base is None else float(base.factor),
-        offset=0.0 if base is None else float(base.offset),
-        displays=tuple((str(d.name), float(d.factor), float(d.offset)) for d in declared.displayUnits),
-    )
-
-
-def _visible(record: dict[str, Any]) -> dict[str, Any]:
-    return {name: visible(value) if isinstance(value, str) else value for name, value in record.items()}
-
-
 def describe_fmu(description: FmuDescription) -> dict[str, Any]:
-    """Return an FMU's description as plain records, JSON-serialisable."""
-    record: dict[str, Any] = _visible(asdict(description))
+    """Return an FMU's description as a record for JSON, as `uav-twin fmu info` prints it."""
+    record = _with_visible_texts(asdict(description))
     record["path"] = str(description.path)
-    record["variables"] = [_visible(variable) for variable in record["variables"]]
+    record["variables"] = [
+        _with_visible_texts(asdict(variable)) for variable in description.variables
+    ]
     return record
+
+
+def _with_visible_texts(record: Mapping[str, object]) -> dict[str, Any]:
+    """Return a record whose texts have no control characters that a terminal would obey."""
+    visible_record = {}
+    for name, value in record.items():
+        visible_record[name] = visible(value) if isinstance(value, str) else value
+    return visible_record

@@ -1,4 +1,9 @@
-"""An FMU file from outside: sound, safe to extract, of a kind that can be flown, and what it declares."""
+"""Checking FMU files from outside, reading what they declare, and extracting them.
+
+An FMU is a ZIP archive of foreign code. Before anything of it is written to disk or run, its
+structure, names, sizes and checksums are checked, and its model description is read without
+expanding entities.
+"""
 
 import json
 import lzma
@@ -14,43 +19,57 @@ from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 from fmpy import platform as fmi_platform
 from fmpy import platform_tuple, read_model_description, sharedLibraryExtension
 
-from fmu_asset.errors import FmuFileError, FmuUnsupportedError, said
+from fmu_asset.errors import FmuFileError, FmuUnsupportedError
 from fmu_asset.folders import plain_folder, remove_folder
 from fmu_asset.instances.plan import Interface
 from reporting.files import hash_file
 from reporting.words import one_line
 
-from .declared import FmuDescription, read_declared
+from .declared import FmuDescription
+from .model_description import FmuFileFacts, read_declared
 
-# A model FMU of hundreds of megabytes exists; one that unpacks to more than this is a mistake or an attack.
 LARGEST_EXTRACTED_BYTES = 4 * 1024**3
-_LARGEST_RATIO = 200
-_SMALL_ENOUGH = 256 * 1024**2
-_MOST_ENTRIES = 100_000
-_DEEPEST = 100
-DESIGN_RECORD = "design.json"
-"""Name of the file in the folder `resources` that says of which design an FMU of ours was made."""
-_LONGEST_RECORD = 10_000
-_LARGEST_DESCRIPTION = 256 * 1024**2
-_DOTTED = (
-    "FMI has the names of entries without './' in front. Pack it again, such as by `zip -r model.fmu *` in "
-    "its folder."
-)
-_UNREADABLE = (OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError)
+"""The largest FMU that is extracted; some of hundreds of megabytes exist."""
 
-# A hyphen is none of C, but tools put one there, and the folder of the binary has no harm of it.
+_LARGEST_COMPRESSION_RATIO = 200
+_ANY_RATIO_UP_TO_BYTES = 256 * 1024**2
+_MOST_ENTRIES = 100_000
+_MOST_FOLDER_LEVELS = 100
+
+DESIGN_RECORD = "design.json"
+"""The file in the folder `resources` of our FMUs that says which design they were made of."""
+
+_LARGEST_DESIGN_RECORD_BYTES = 10_000
+_LARGEST_DESCRIPTION_BYTES = 256 * 1024**2
+_PACK_WITHOUT_DOT = (
+    "FMI has the names of entries without './' in front. Pack it again, such as by `zip -r "
+    "model.fmu *` in its folder."
+)
+_ARCHIVE_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, lzma.LZMAError)
+
+# C has no hyphen in its names, but some tools put one there, and it does no harm to the binary's
+# folder.
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 
 
 def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -> FmuDescription:
     """Check an FMU file and return what it declares, without extracting it.
 
-    Parameters and errors are those of `inspect_fmu`.
+    Parameters
+    ----------
+    path : path-like
+        The FMU.
+    interface : {"co-simulation", "model-exchange"}, optional
+        The interface to be used; by default co-simulation where the FMU offers it.
 
     Raises
     ------
+    FmuFileError
+        If the file is missing, no archive, damaged or unsafe, or its model description cannot be
+        read.
     FmuUnsupportedError
-        Also if it has no binary for this platform.
+        If the FMU is not of FMI 1, 2 or 3, does not offer the interface, or has no binary for this
+        platform.
     """
     description, obstacle = inspect_fmu(path, interface)
     if obstacle:
@@ -61,84 +80,122 @@ def read_fmu(path: str | os.PathLike[str], interface: Interface | None = None) -
 def inspect_fmu(
     path: str | os.PathLike[str], interface: Interface | None = None
 ) -> tuple[FmuDescription, str]:
-    """Check an FMU file of any platform; return what it declares, and why it cannot be flown here.
+    """Check an FMU file of any platform; return what it declares, and why it cannot run here.
 
     Parameters
     ----------
     path : path-like
         The FMU.
     interface : {"co-simulation", "model-exchange"}, optional
-        How it is to be run; co-simulation where it offers that.
+        The interface to be used; by default co-simulation where the FMU offers it.
 
     Returns
     -------
-    tuple of FmuDescription and str
-        The sentence is empty where there is a binary for this platform.
+    description : FmuDescription
+        What the FMU declares.
+    obstacle : str
+        A sentence that says why it has no binary for this platform; empty if it has one.
 
     Raises
     ------
     FmuFileError
-        If the file is missing, no archive, damaged, unsafe, or its model description cannot be read.
+        If the file is missing, no archive, damaged or unsafe, or its model description cannot be
+        read.
     FmuUnsupportedError
-        If it is not of FMI 1, 2 or 3, or offers neither co-simulation nor model exchange (or not the one that
-        is asked for).
+        If the FMU is not of FMI 1, 2 or 3, or does not offer the interface.
     """
     file = Path(path)
     size, sha256 = _size_and_hash(file)
-    names = check_archive(file, size)
-    if "modelDescription.xml" not in names:
-        raise FmuFileError(_without_description(file, names))
-    root = _model_description(file)
+    entry_names = check_archive(file, size)
+    if "modelDescription.xml" not in entry_names:
+        raise FmuFileError(_missing_description_sentence(file, entry_names))
+    root = _parsed_model_description(file)
     version = root.get("fmiVersion") or ""
     if version not in ("1.0", "2.0") and not version.startswith("3."):
-        raise FmuUnsupportedError(said("archive.fmi_version", file=file, version=version or "(not said)"))
+        raise FmuUnsupportedError(
+            f"{file} is an FMU of FMI {version or '(not said)'}; FMI 1.0, 2.0 or 3.0 is needed: "
+            "export it as such."
+        )
+    platforms = _platforms(entry_names)
     try:
         declared = read_model_description(str(file), validate=False)
-        platforms = tuple(
-            sorted({PurePosixPath(name).parts[1] for name in names if re.match(r"binaries/[^/]+/.+", name)})
-        )
-        archive = {"path": file, "sha256": sha256, "file_size": size, "platforms": platforms}
-        description = read_declared(declared, root, archive, interface)
+        facts = FmuFileFacts(path=file, sha256=sha256, file_size=size, platforms=platforms)
+        description = read_declared(declared, root, facts, interface)
     except FmuUnsupportedError:
         raise
-    except Exception as error:
-        raise FmuFileError(f"The model description of {file} cannot be read ({one_line(error)}).") from error
+    except Exception as error:  # fmpy raises errors of many kinds
+        raise FmuFileError(
+            f"The model description of {file} cannot be read ({one_line(error)})."
+        ) from error
     if not _IDENTIFIER.fullmatch(description.model_identifier):
-        raise FmuFileError(said("archive.identifier", file=file, description=description))
-    here = platform_tuple if description.major_version == 3 else fmi_platform
-    binary = f"binaries/{here}/{description.model_identifier}{sharedLibraryExtension}"
-    if binary in names:
+        raise FmuFileError(
+            f"The model identifier of {file}, {description.model_identifier!r}, is no name of a C "
+            "function; the FMU is damaged or unsafe."
+        )
+    platform_folder = platform_tuple if description.major_version == 3 else fmi_platform
+    file_name = f"{description.model_identifier}{sharedLibraryExtension}"
+    binary = f"binaries/{platform_folder}/{file_name}"
+    if binary in entry_names:
         return description, ""
-    return description, _without_binary(file, names, binary, platforms)
+    return description, _missing_binary_sentence(file, entry_names, binary, platforms)
 
 
-def _without_description(file: Path, names: set[str]) -> str:
-    """Return the sentence on an archive in which modelDescription.xml is not where FMI has it."""
+def _platforms(entry_names: set[str]) -> tuple[str, ...]:
+    """Return the names of the folders that hold binaries, such as linux64."""
+    platforms = set()
+    for name in entry_names:
+        if re.match(r"binaries/[^/]+/.+", name):
+            platforms.add(PurePosixPath(name).parts[1])
+    return tuple(sorted(platforms))
+
+
+def _missing_description_sentence(file: Path, entry_names: set[str]) -> str:
+    """Return the message on an archive in which modelDescription.xml is not where FMI has it."""
     lacking = f"{file} is an archive without modelDescription.xml"
-    if "./modelDescription.xml" in names:
-        return f"{lacking}, but with './modelDescription.xml': {_DOTTED}"
-    nested = sorted(name for name in names if name.endswith("/modelDescription.xml"))
+    if "./modelDescription.xml" in entry_names:
+        return f"{lacking}, but with './modelDescription.xml': {_PACK_WITHOUT_DOT}"
+    nested = sorted(name for name in entry_names if name.endswith("/modelDescription.xml"))
     if nested:
-        return f"{lacking} at its top: it has {nested[0]!r}. Pack the content of that folder, not the folder."
+        return (
+            f"{lacking} at its top: it has {nested[0]!r}. Pack the content of that folder, not the "
+            "folder."
+        )
     return f"{lacking}, so it is not an FMU."
 
 
-def _without_binary(file: Path, names: set[str], binary: str, platforms: tuple[str, ...]) -> str:
-    """Return the sentence on an FMU whose binary for this platform is not where FMI has it."""
-    if f"./{binary}" in names:
-        return f"{file} has no binary {binary}, but one named './{binary}': {_DOTTED}"
-    folder, _, _ = binary.rpartition("/")
-    suffix = PurePosixPath(binary).suffix
-    others = sorted(n for n in names if n.rpartition("/")[0] == folder and n.endswith(suffix))
-    if others:
+def _missing_binary_sentence(
+    file: Path, entry_names: set[str], binary: str, platforms: tuple[str, ...]
+) -> str:
+    """Return the message on an FMU whose binary for this platform is not where FMI has it.
+
+    Parameters
+    ----------
+    file : Path
+        The FMU.
+    entry_names : set of str
+        The names of the files in it.
+    binary : str
+        The name that the binary should have.
+    platforms : tuple of str
+        The platforms that it has binaries for.
+    """
+    if f"./{binary}" in entry_names:
+        return f"{file} has no binary {binary}, but one named './{binary}': {_PACK_WITHOUT_DOT}"
+    path = PurePosixPath(binary)
+    misnamed = []
+    for name in sorted(entry_names):
+        in_same_folder = name.rpartition("/")[0] == str(path.parent)
+        if in_same_folder and name.endswith(path.suffix):
+            misnamed.append(name)
+    if misnamed:
         return (
-            f"{file} has the binary {', '.join(others[:3])}, but its model description asks for {binary}: "
-            "the name must be its `modelIdentifier`. Rename the binary, or export the FMU again."
+            f"{file} has the binary {', '.join(misnamed[:3])}, but its model description asks for "
+            f"{binary}: the name must be its `modelIdentifier`. Rename the binary, or export the "
+            "FMU again."
         )
-    here = PurePosixPath(folder).name
     return (
         f"{file} has no binary for this platform ({binary} is not in it; binaries there: "
-        f"{', '.join(platforms) or 'none'}); export it for {here}."
+        f"{', '.join(platforms) or 'none'}); export it for {path.parent.name}."
     )
 
 
@@ -160,25 +217,35 @@ def extract_fmu(description: FmuDescription) -> Path:
     FmuFileError
         If the file has changed, cannot be extracted, or no folder with a plain path can be made.
     """
-    if _size_and_hash(description.path)[1] != description.sha256:
+    _, sha256 = _size_and_hash(description.path)
+    if sha256 != description.sha256:
         raise FmuFileError(f"{description.label} has changed since it was checked; start again.")
     folder = plain_folder()
     try:
         with zipfile.ZipFile(description.path) as archive:
-            needed = sum(entry.file_size for entry in archive.infolist())
-            free = shutil.disk_usage(folder).free
-            if needed > free:
-                raise OSError(f"it needs {needed // 1024**2} MiB, and {free // 1024**2} MiB are free")
+            needed_bytes = sum(entry.file_size for entry in archive.infolist())
+            free_bytes = shutil.disk_usage(folder).free
+            if needed_bytes > free_bytes:
+                raise OSError(
+                    f"it needs {needed_bytes // 1024**2} MiB, and {free_bytes // 1024**2} MiB are "
+                    "free"
+                )
             archive.extractall(folder)
-    except _UNREADABLE as error:
+    except _ARCHIVE_ERRORS as error:
         remove_folder(folder)
-        raise FmuFileError(f"{description.label} could not be extracted to {folder} ({error}).") from error
+        raise FmuFileError(
+            f"{description.label} could not be extracted to {folder} ({error})."
+        ) from error
     return folder
 
 
 def _size_and_hash(file: Path) -> tuple[int, str]:
+    """Return the size in bytes and the SHA-256 of an FMU file."""
     if not file.exists():
-        raise FmuFileError(said("archive.absent", file=file))
+        raise FmuFileError(
+            f"There is no FMU {file}; check the path, or make it: `uav-twin fmu build` packs a "
+            "wing or a script, `uav-twin structure fmu` a structure."
+        )
     if not file.is_file():
         raise FmuFileError(f"{file} is a folder, not an FMU file.")
     try:
@@ -187,98 +254,146 @@ def _size_and_hash(file: Path) -> tuple[int, str]:
         raise FmuFileError(f"{file} cannot be read ({error.strerror}).") from error
 
 
-def check_archive(file: Path, size: int, what: str = "FMU", again: str = "build") -> set[str]:
+def check_archive(
+    file: Path, size: int, archive_kind: str = "FMU", remedy: str = "build"
+) -> set[str]:
     """Check structure, checksums, names and sizes of an archive; return the names of its files.
+
+    Parameters
+    ----------
+    file : Path
+        The archive.
+    size : int
+        Its size [bytes].
+    archive_kind : str
+        What the archive should be, for the message.
+    remedy : str
+        How a user makes it again, as a verb for the message.
 
     Raises
     ------
     FmuFileError
-        If it is damaged or unsafe; the sentence says `what` it should be and how to get it `again`.
+        If the archive is damaged or unsafe.
     """
     try:
         with zipfile.ZipFile(file) as archive:
             entries = archive.infolist()
             for entry in entries:
-                _check_entry(file, entry)
-            names = [entry.filename for entry in entries if not entry.is_dir()]
-            if len(entries) > _MOST_ENTRIES:
-                raise FmuFileError(said("archive.entries", file=file, count=len(entries), most=_MOST_ENTRIES))
-            extracted = sum(entry.file_size for entry in entries)
-            if extracted > min(LARGEST_EXTRACTED_BYTES, max(_SMALL_ENOUGH, _LARGEST_RATIO * size)):
-                mebibytes = size / 1024**2, extracted / 1024**2
-                raise FmuFileError(said("archive.too_large", file=file, mebibytes=mebibytes))
-            broken = archive.testzip()
-            if broken is not None:
-                raise FmuFileError(f"{file} is damaged: the checksum of {broken} is wrong; fetch it again.")
-            _refuse_unequal_twins(file, archive)
-            return {*names}
-    except (*_UNREADABLE, EOFError, NotImplementedError, RuntimeError) as error:
-        raise FmuFileError(said("archive.unsound", file=file, what=what, error=error, again=again)) from error
+                _check_entry_name(file, entry)
+            _check_extracted_size(file, size, entries)
+            broken_entry = archive.testzip()
+            if broken_entry is not None:
+                raise FmuFileError(
+                    f"{file} is damaged: the checksum of {broken_entry} is wrong; fetch it again."
+                )
+            _check_duplicate_entries(file, archive)
+    except (*_ARCHIVE_ERRORS, EOFError, NotImplementedError, RuntimeError) as error:
+        raise FmuFileError(
+            f"{file} is not a sound {archive_kind} archive ({error}); fetch or {remedy} it again."
+        ) from error
+    return {entry.filename for entry in entries if not entry.is_dir()}
 
 
-def _refuse_unequal_twins(file: Path, archive: zipfile.ZipFile) -> None:
-    """Refuse two entries of one name unless they are equal: readers differ in which one they take."""
-    first: dict[str, zipfile.ZipInfo] = {}
+def _check_extracted_size(file: Path, size: int, entries: list[zipfile.ZipInfo]) -> None:
+    """Refuse archives that would fill the disk: too many entries, or too large when extracted."""
+    if len(entries) > _MOST_ENTRIES:
+        raise FmuFileError(
+            f"{file} holds {len(entries)} entries, more than {_MOST_ENTRIES}; no tool exports "
+            "that, and it was refused."
+        )
+    extracted_bytes = sum(entry.file_size for entry in entries)
+    most_bytes = max(_ANY_RATIO_UP_TO_BYTES, _LARGEST_COMPRESSION_RATIO * size)
+    if extracted_bytes > min(LARGEST_EXTRACTED_BYTES, most_bytes):
+        raise FmuFileError(
+            f"{file} has {size / 1024**2:.3g} MiB and would extract to "
+            f"{extracted_bytes / 1024**2:.0f} MiB, which looks like an archive made to fill the "
+            "disk; it was refused."
+        )
+
+
+def _check_duplicate_entries(file: Path, archive: zipfile.ZipFile) -> None:
+    """Refuse unequal entries of one name: readers of archives differ in which one they take."""
+    first_entries: dict[str, zipfile.ZipInfo] = {}
     for entry in archive.infolist():
-        twin = first.setdefault(entry.filename, entry)
-        if twin is entry:
+        first_entry = first_entries.setdefault(entry.filename, entry)
+        if first_entry is entry:
             continue
-        equal = (twin.CRC, twin.file_size) == (entry.CRC, entry.file_size)
-        if not equal or archive.read(twin) != archive.read(entry):
-            raise FmuFileError(said("archive.twice", file=file, entry=entry))
+        same_checksum = first_entry.CRC == entry.CRC and first_entry.file_size == entry.file_size
+        if not same_checksum or archive.read(first_entry) != archive.read(entry):
+            raise FmuFileError(
+                f"{file} holds the entry {entry.filename!r} twice with different content; nobody "
+                "can say which is meant, and it was refused."
+            )
 
 
-def _check_entry(file: Path, entry: zipfile.ZipInfo) -> None:
+def _check_entry_name(file: Path, entry: zipfile.ZipInfo) -> None:
+    """Refuse an entry that would be extracted outside its folder, or has too many folders."""
     name = entry.orig_filename
-    slashed = name.replace("\\", "/")
-    parts = PurePosixPath(slashed).parts
-    outside = not name or slashed.startswith("/") or ".." in parts or not {*name}.isdisjoint(":\0")
-    if outside or stat.S_ISLNK(entry.external_attr >> 16):
-        raise FmuFileError(said("archive.outside", file=file, name=name))
+    with_slashes = name.replace("\\", "/")
+    parts = PurePosixPath(with_slashes).parts
+    has_forbidden_characters = ":" in name or "\0" in name
+    leads_outside = not name or with_slashes.startswith("/") or ".." in parts
+    is_symbolic_link = stat.S_ISLNK(entry.external_attr >> 16)
+    if leads_outside or has_forbidden_characters or is_symbolic_link:
+        raise FmuFileError(
+            f"{file} holds the entry {name!r}, which would be extracted outside its folder; it was "
+            "refused."
+        )
     if "\\" in name:
         raise FmuFileError(
-            f"{file} holds the entry {name!r}, whose folders are separated by backslashes; ZIP files "
-            "separate them by '/' on every system (some packers on Windows do not). Pack it again with "
-            "another tool."
+            f"{file} holds the entry {name!r}, whose folders are separated by backslashes; ZIP "
+            "files separate them by '/' on every system (some packers on Windows do not). Pack it "
+            "again with another tool."
         )
-    if len(parts) > _DEEPEST:
-        raise FmuFileError(said("archive.deep", file=file, deep=len(parts), most=_DEEPEST))
+    if len(parts) > _MOST_FOLDER_LEVELS:
+        raise FmuFileError(
+            f"{file} holds an entry {len(parts)} folders deep; no tool exports that (at most "
+            f"{_MOST_FOLDER_LEVELS} are taken), and it was refused."
+        )
 
 
-class _WithoutDocumentType(TreeBuilder):
-    """Elements of a file in any encoding, up to a document type, before its entities are defined."""
+class _NoDocumentTypeBuilder(TreeBuilder):
+    """A builder of XML trees that stops at a document type, before its entities are defined."""
 
     def doctype(self, name: str, public: str | None, system: str | None) -> None:
-        raise FmuFileError(said("archive.document_type"))
+        raise FmuFileError(
+            "defines a document type or entities, which FMI does not provide for and which can be "
+            "made to fill the memory; it was refused"
+        )
 
 
-def _model_description(file: Path) -> Element:
-    """Return the XML of the model description, which must not define entities that grow or read files."""
+def _parsed_model_description(file: Path) -> Element:
+    """Return the XML of the model description; refuse entities, which can grow or read files."""
     try:
         with zipfile.ZipFile(file) as archive:
-            if archive.getinfo("modelDescription.xml").file_size > _LARGEST_DESCRIPTION:
-                raise FmuFileError(f"is larger than {_LARGEST_DESCRIPTION // 1024**2} MiB; it was refused")
-            parser = XMLParser(target=_WithoutDocumentType())
+            entry = archive.getinfo("modelDescription.xml")
+            if entry.file_size > _LARGEST_DESCRIPTION_BYTES:
+                raise FmuFileError(
+                    f"is larger than {_LARGEST_DESCRIPTION_BYTES // 1024**2} MiB; it was refused"
+                )
+            parser = XMLParser(target=_NoDocumentTypeBuilder())
             parser.feed(archive.read("modelDescription.xml"))
         root: Element = parser.close()
         if root.tag != "fmiModelDescription":
             raise FmuFileError(f"begins with <{root.tag}>; it is damaged")
     except (ParseError, ValueError, LookupError, zipfile.BadZipFile, OSError) as error:
-        why = error.sentence if isinstance(error, FmuFileError) else f"cannot be read ({error})"
-        raise FmuFileError(f"The model description of {file} {why}.") from error
+        # FmuFileError is a ValueError, too; raised above, it holds the end of the sentence below.
+        unread = f"cannot be read ({error})"
+        reason = error.sentence if isinstance(error, FmuFileError) else unread
+        raise FmuFileError(f"The model description of {file} {reason}.") from error
     return root
 
 
 def design_record(design_hash: str) -> bytes:
-    """Return the content of the file."""
+    """Return the content of `DESIGN_RECORD`, which tells later which design an FMU was made of."""
     return (json.dumps({"design_hash": design_hash}) + "\n").encode()
 
 
 def packed_design_hash(path: str | os.PathLike[str]) -> str:
-    """Return the hash of the design that an FMU was made of; empty where it does not tell."""
+    """Return the hash of the design that an FMU of ours was made of; empty if the FMU has none."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"resources/{DESIGN_RECORD}") as file:
-            found = json.loads(file.read(_LONGEST_RECORD))["design_hash"]
+            design_hash = json.loads(file.read(_LARGEST_DESIGN_RECORD_BYTES))["design_hash"]
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, zipfile.BadZipFile):
         return ""
-    return found if isinstance(found, str) else ""
+    return design_hash if isinstance(design_hash, str) else ""

@@ -5,14 +5,15 @@ This file is copied into the FMU: standard library only.
 The loss of a region is the sum of three parts, kept below a ceiling:
 
 - a script: at each mark of time between `first` and `last` of an entry, the entry's gain;
-- growth with the load, as in crack growth (Paris and Erdogan 1963), dz/dt = rate (|n| / n_ref)^exponent;
-- chance: at each mark but the first, one level more with probability min(1, p (|n| / n_ref)^exponent), where
-  n is the load factor that was held before the mark.
+- growth with the load, as in crack growth (Paris and Erdogan 1963):
+  dz/dt = rate (|n| / n_ref)^exponent;
+- chance: at each mark but the first, one level more with probability
+  min(1, p (|n| / n_ref)^exponent), where n is the load factor that was held before the mark.
 
-A mark is a multiple of `period` after the start. What happens at a mark belongs to the step that begins at
-it, so that the damage that a step does is felt from the next step on. The numbers of a mark follow from the
-seed, the region and the mark alone: they do not depend on the step size, on the other region or on earlier
-marks.
+A mark is a multiple of `period` after the start. What happens at a mark belongs to the step that
+begins at it, so that the damage that a step does is felt from the next step on. The numbers of a
+mark follow from the seed, the region and the mark alone: they do not depend on the step size, on
+the other region or on earlier marks.
 """
 
 from __future__ import annotations
@@ -20,87 +21,147 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 REGIONS = ("z1", "z2")
 SCRIPT_LENGTH = 8
 _DECIMALS = 12
-"""Losses are given rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
+"""Losses are rounded to this many digits, so that ten times 2 % and 40 % are 60 %."""
+
+_RELATIVE_TIME_TOLERANCE = 1e-9
+"""The tolerance of times against marks, as a fraction of the period."""
 
 
-class DamageGrowth:
-    """The growing damage; see the module."""
+class ScriptEntry(NamedTuple):
+    """An entry of the script.
+
+    Attributes
+    ----------
+    first, last : float
+        The times after the start between which its marks lie [s].
+    gains : tuple of float
+        What each region loses at each of these marks.
+    """
+
+    first: float
+    last: float
+    gains: tuple[float, ...]
+
+
+class DamageGrowthBehaviour:
+    """The behaviour of the FMU of growing damage, called by its slave; see the module."""
 
     def __init__(self) -> None:
-        self._loss = [0.0, 0.0]
-        self._begin = 0.0
-        self._mark = 0
-        self._last_load = 0.0
+        self._losses = [0.0, 0.0]
+        self._start_time = 0.0
+        self._next_mark = 0
+        self._previous_load_factor = 0.0
 
-    def _take(self, parameters: Mapping[str, float]) -> None:
-        """Keep the parameters in the form in which a step needs them."""
+    def _set_parameters(self, parameters: Mapping[str, float]) -> None:
+        """Store the parameters in the form that a step needs."""
         self._ceiling = parameters["ceiling"]
         self._period = parameters["period"]
-        self._reference = parameters["reference_load_factor"]
+        self._reference_load_factor = parameters["reference_load_factor"]
         self._exponent = parameters["exponent"]
-        self._level, self._seed = parameters["level"], int(parameters["seed"])
-        self._rate = [parameters[f"rate.{region}"] for region in REGIONS]
-        self._chance = [parameters[f"probability.{region}"] for region in REGIONS]
-        entries = [
-            [parameters[f"script[{entry}].{key}"] for key in ("first", "last", *REGIONS)]
-            for entry in range(1, SCRIPT_LENGTH + 1)
-        ]
-        self._script = [entry for entry in entries if any(entry[2:])]
+        self._level = parameters["level"]
+        self._seed = int(parameters["seed"])
+        self._rates = [parameters[f"rate.{region}"] for region in REGIONS]
+        self._probabilities = [parameters[f"probability.{region}"] for region in REGIONS]
+        self._script = []
+        for number in range(1, SCRIPT_LENGTH + 1):
+            prefix = f"script[{number}]"
+            gains = tuple(parameters[f"{prefix}.{region}"] for region in REGIONS)
+            if any(gains):
+                first, last = parameters[f"{prefix}.first"], parameters[f"{prefix}.last"]
+                self._script.append(ScriptEntry(first, last, gains))
 
-    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> list[float]:
-        """Begin with the initial losses."""
-        self._take(parameters)
-        self._loss = [parameters[f"initial.{region}"] for region in REGIONS]
-        self._begin, self._mark, self._last_load = time, 0, inputs[0]
+    def start(
+        self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]
+    ) -> list[float]:
+        """Begin with the initial losses, and return the outputs."""
+        self._set_parameters(parameters)
+        self._losses = [parameters[f"initial.{region}"] for region in REGIONS]
+        self._start_time = time
+        self._next_mark = 0
+        self._previous_load_factor = inputs[0]
         return self._outputs()
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
-        """Let the damage of one step happen."""
-        load, period = inputs[0], self._period
-        tolerance = 1e-9 * period
+        """Add the damage of one step, and return the outputs at its end.
+
+        Parameters
+        ----------
+        time, duration : float
+            Begin and length of the step [s].
+        inputs : sequence of float
+            The load factor that is held over the step.
+        """
+        load_factor = inputs[0]
+        period = self._period
+        tolerance = _RELATIVE_TIME_TOLERANCE * period
         end = time + duration - tolerance
-        if not (self._script or any(self._chance)):
-            self._mark = max(self._mark, math.ceil((end - self._begin) / period))
-        while self._begin + self._mark * period < end:
-            moment = self._begin + self._mark * period
-            self._pass_mark(moment - self._begin, self._last_load if moment <= time + tolerance else load)
-            self._mark += 1
-        for index, rate in enumerate(self._rate):
+        # Nothing happens at marks: all of them are passed at once.
+        if not self._script and not any(self._probabilities):
+            self._next_mark = max(self._next_mark, math.ceil((end - self._start_time) / period))
+        # script and chance, mark by mark
+        while self._start_time + self._next_mark * period < end:
+            mark_time = self._start_time + self._next_mark * period
+            at_begin = mark_time <= time + tolerance
+            load_before_mark = self._previous_load_factor if at_begin else load_factor
+            self._pass_mark(mark_time - self._start_time, load_before_mark)
+            self._next_mark += 1
+        # growth with the load
+        for region, rate in enumerate(self._rates):
             if rate:
-                grown = self._loss[index] + rate * self._severity(load) * duration
-                self._loss[index] = min(grown, self._ceiling)
-        self._last_load = load
+                loss = self._losses[region] + rate * self._severity(load_factor) * duration
+                self._losses[region] = min(loss, self._ceiling)
+        self._previous_load_factor = load_factor
         return self._outputs()
 
-    def _pass_mark(self, elapsed: float, load: float) -> None:
-        tolerance = 1e-9 * self._period
-        for index, region in enumerate(REGIONS):
+    def _pass_mark(self, elapsed: float, load_factor: float) -> None:
+        """Add the damage of the next mark.
+
+        Parameters
+        ----------
+        elapsed : float
+            Time of the mark after the start [s].
+        load_factor : float
+            The load factor that was held before the mark.
+        """
+        tolerance = _RELATIVE_TIME_TOLERANCE * self._period
+        for region, name in enumerate(REGIONS):
             gain = 0.0
             for entry in self._script:
-                if entry[0] - tolerance <= elapsed <= entry[1] + tolerance:
-                    gain += entry[2 + index]
-            if self._chance[index] and self._mark > 0:
-                uniform = random.Random(f"{self._seed}:{region}:{self._mark}").random()
-                if uniform < self._chance[index] * self._severity(load):
+                if entry.first - tolerance <= elapsed <= entry.last + tolerance:
+                    gain += entry.gains[region]
+            probability = self._probabilities[region]
+            if probability and self._next_mark > 0:
+                uniform = random.Random(f"{self._seed}:{name}:{self._next_mark}").random()
+                if uniform < probability * self._severity(load_factor):
                     gain += self._level
-            self._loss[index] = max(0.0, min(self._loss[index] + gain, self._ceiling))
+            self._losses[region] = max(0.0, min(self._losses[region] + gain, self._ceiling))
 
-    def _severity(self, load: float) -> float:
-        return float((abs(load) / self._reference) ** self._exponent)
+    def _severity(self, load_factor: float) -> float:
+        """Return the factor (|n| / n_ref)^exponent on rates and probabilities."""
+        return float((abs(load_factor) / self._reference_load_factor) ** self._exponent)
 
     def _outputs(self) -> list[float]:
-        return [round(loss, _DECIMALS) for loss in self._loss]
+        return [round(loss, _DECIMALS) for loss in self._losses]
 
     def state(self) -> list[float]:
-        """Return losses, start time, number of the next mark, last load factor."""
-        return [*self._loss, self._begin, float(self._mark), self._last_load]
+        """Return losses, start time, number of the next mark, and last load factor."""
+        return [
+            *self._losses,
+            self._start_time,
+            float(self._next_mark),
+            self._previous_load_factor,
+        ]
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
-        """Take back what `state` returned."""
-        self._take(parameters)
-        self._loss = list(state[:2])
-        self._begin, self._mark, self._last_load = state[2], int(state[3]), state[4]
+        """Return to a state that the method `state` returned."""
+        self._set_parameters(parameters)
+        *losses, start_time, next_mark, load_factor = state
+        self._losses = losses
+        self._start_time = start_time
+        self._next_mark = int(next_mark)
+        self._previous_load_factor = load_factor

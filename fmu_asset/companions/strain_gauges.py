@@ -2,11 +2,11 @@
 
 This file is copied into the FMU: standard library only.
 
-At time t, a gauge reads gain * strain + offset + drift_rate * max(0, t - drift_start) + noise. It is lost
-where dropout_start < t <= dropout_end, where blackout.start < t <= blackout.end (all gauges), and by chance
-with `dropout_probability`: then it reads 0 and `received` is false. A step that begins at `dropout_start` is
-therefore the first one that is lost. The random numbers of a reading follow from the seed and the number of
-the reading alone.
+At time t, a gauge reads gain * strain + offset + drift_rate * max(0, t - drift_start) + noise. It
+is lost where dropout_start < t <= dropout_end, where blackout.start < t <= blackout.end (all
+gauges), and by chance with `dropout_probability`: then it reads 0 and `received` is false. A step
+that begins at `dropout_start` is therefore the first one that is lost. The random numbers of a
+reading follow from the seed and the number of the reading alone.
 """
 
 from __future__ import annotations
@@ -14,72 +14,111 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 
-class StrainGauges:
-    """The gauges, as many as there are gains; see the module."""
+class Drift(NamedTuple):
+    """The drift of a gauge (counted from 0): its rate [1/s] from a start time on [s]."""
 
-    _samples = 0
+    gauge: int
+    rate: float
+    start: float
 
-    def _take(self, parameters: Mapping[str, float]) -> None:
-        """Keep the parameters in the form in which a reading needs them."""
-        gauges = range(1, sum(name.startswith("gain[") for name in parameters) + 1)
 
-        def each(name: str) -> list[float]:
-            return [parameters[f"{name}[{gauge}]"] for gauge in gauges]
+class LossWindow(NamedTuple):
+    """The times between which a gauge (counted from 0) is lost [s]."""
 
-        self._gain, self._offset = each("gain"), each("offset")
-        self._drift = [
-            (index, rate, parameters[f"drift_start[{index + 1}]"])
-            for index, rate in enumerate(each("drift_rate"))
-            if rate
-        ]
-        windows = zip(each("dropout_start"), each("dropout_end"), strict=True)
-        self._windows = [(index, *window) for index, window in enumerate(windows) if window[1] > window[0]]
-        self._blackout = (parameters["blackout.start"], parameters["blackout.end"])
-        self._noise, self._seed = parameters["noise"], int(parameters["seed"])
-        self._chance = parameters["dropout_probability"]
+    gauge: int
+    start: float
+    end: float
 
-    def start(self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]) -> list[float]:
-        """Give the first readings."""
-        self._take(parameters)
-        self._samples = 0
-        return self._read(time, inputs)
+
+class StrainGaugesBehaviour:
+    """The behaviour of the FMU of strain gauges, called by its slave; see the module."""
+
+    _reading_number = 0
+
+    def _set_parameters(self, parameters: Mapping[str, float]) -> None:
+        """Store the parameters in the form that a reading needs."""
+        gauge_count = sum(name.startswith("gain[") for name in parameters)
+
+        def values_of_gauges(name: str) -> list[float]:
+            return [parameters[f"{name}[{number}]"] for number in range(1, gauge_count + 1)]
+
+        self._gains = values_of_gauges("gain")
+        self._offsets = values_of_gauges("offset")
+        drift_starts = values_of_gauges("drift_start")
+        self._drifts = []
+        for gauge, rate in enumerate(values_of_gauges("drift_rate")):
+            if rate:
+                self._drifts.append(Drift(gauge, rate, drift_starts[gauge]))
+        loss_ends = values_of_gauges("dropout_end")
+        self._loss_windows = []
+        for gauge, start in enumerate(values_of_gauges("dropout_start")):
+            if loss_ends[gauge] > start:
+                self._loss_windows.append(LossWindow(gauge, start, loss_ends[gauge]))
+        self._blackout_start = parameters["blackout.start"]
+        self._blackout_end = parameters["blackout.end"]
+        self._noise = parameters["noise"]
+        self._loss_probability = parameters["dropout_probability"]
+        self._seed = int(parameters["seed"])
+
+    def start(
+        self, parameters: Mapping[str, float], time: float, inputs: Sequence[float]
+    ) -> list[float]:
+        """Return the first readings."""
+        self._set_parameters(parameters)
+        self._reading_number = 0
+        return self._outputs(time, inputs, reading_number=0)
 
     def advance(self, time: float, duration: float, inputs: Sequence[float]) -> list[float]:
-        """Give the readings at the end of the step."""
-        outputs = self._read(time + duration, inputs, self._samples + 1)
-        self._samples += 1
+        """Return the readings at the end of a step.
+
+        Parameters
+        ----------
+        time, duration : float
+            Begin and length of the step [s].
+        inputs : sequence of float
+            The true strains.
+        """
+        outputs = self._outputs(time + duration, inputs, self._reading_number + 1)
+        self._reading_number += 1
         return outputs
 
-    def _read(self, time: float, strains: Sequence[float], sample: int = 0) -> list[float]:
-        readings = [
-            gain * strain + offset
-            for gain, strain, offset in zip(self._gain, strains, self._offset, strict=True)
-        ]
-        for index, rate, begin in self._drift:
-            readings[index] += rate * max(0.0, time - begin)
+    def _outputs(self, time: float, strains: Sequence[float], reading_number: int) -> list[float]:
+        """Return the readings, then for each gauge 1 if it is received and 0 if it is lost."""
+        # systematic errors
+        readings = []
+        for gain, strain, offset in zip(self._gains, strains, self._offsets, strict=True):
+            readings.append(gain * strain + offset)
+        for drift in self._drifts:
+            readings[drift.gauge] += drift.rate * max(0.0, time - drift.start)
+        # noise, and loss by chance
         received = [1.0] * len(strains)
-        if self._noise or self._chance:
-            generator = random.Random(f"{self._seed}:{sample}")
-            readings = [value + self._noise * normal(generator) for value in readings]
-            if self._chance:
-                received = [float(generator.random() >= self._chance) for _ in received]
-        for index, begin, end in self._windows:
-            if begin < time <= end:
-                received[index] = 0.0
-        if self._blackout[0] < time <= self._blackout[1]:
+        if self._noise or self._loss_probability:
+            generator = random.Random(f"{self._seed}:{reading_number}")
+            readings = [reading + self._noise * normal(generator) for reading in readings]
+            if self._loss_probability:
+                received = [float(generator.random() >= self._loss_probability) for _ in strains]
+        # loss by the clock
+        for window in self._loss_windows:
+            if window.start < time <= window.end:
+                received[window.gauge] = 0.0
+        if self._blackout_start < time <= self._blackout_end:
             received = [0.0] * len(strains)
-        return [v if there else 0.0 for v, there in zip(readings, received, strict=True)] + received
+        for gauge, is_received in enumerate(received):
+            if not is_received:
+                readings[gauge] = 0.0
+        return readings + received
 
     def state(self) -> list[float]:
         """Return the number of the last reading."""
-        return [float(self._samples)]
+        return [float(self._reading_number)]
 
     def restore(self, parameters: Mapping[str, float], state: Sequence[float]) -> None:
-        """Take back what `state` returned."""
-        self._take(parameters)
-        self._samples = int(state[0])
+        """Return to a state that the method `state` returned."""
+        self._set_parameters(parameters)
+        self._reading_number = int(state[0])
 
 
 def normal(generator: random.Random) -> float:

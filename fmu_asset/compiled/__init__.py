@@ -1,1 +1,1 @@
-"""A wing or structure as a compiled FMU: the reduced model evaluated in C, its sources inside the FMU."""
+"""A wing or structure as a compiled FMU: its C sources, and the files made of its model."""

@@ -1,23 +1,37 @@
-"""A system of FMUs as data: components, connectors of the system, connections; no file is opened here."""
+"""The records of a system of FMUs: components, connectors of the system, and connections.
+
+They hold what a scenario or an SSP file says; no FMU is opened here. `wiring` checks them against
+the FMUs.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from fmu_asset.archive.declared import UnitInfo
 from fmu_asset.client.bound_variables import expand
 from fmu_asset.client.units import IDENTITY, Conversion
-from fmu_asset.errors import CouplingError, said
+from fmu_asset.errors import CouplingError
 from fmu_asset.instances.plan import Interface
+from reporting.words import comma_list
 
 CONNECTOR_KINDS = ("input", "output", "parameter")
-"""What a connector of a system can be."""
+"""The kinds of connectors of a system."""
+
 SettingValue = float | bool | str | bytes
 
 
 class Endpoint(NamedTuple):
-    """An end of a connection: a variable of a component, or (`component` empty) a connector of the system."""
+    """An end of a connection.
+
+    Attributes
+    ----------
+    component : str
+        The name of the component; empty for a connector of the system.
+    variable : str
+        The name of the variable, or of the connector.
+    """
 
     component: str
     variable: str
@@ -27,20 +41,20 @@ class Endpoint(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Setting:
-    """The value of a parameter, or the start value of an input.
+class ComponentSetting:
+    """The value of a parameter, or the start value of an input, of an FMU in a system.
 
     Attributes
     ----------
     value : float, bool, str or bytes
-        The value. A text is that of a parameter that is one, or names an item of an enumeration; nothing
-        takes bytes, which are refused where a variable would.
+        The value. A text is the value of a text parameter, or names an item of an enumeration.
+        Bytes are binary values of SSP, which are refused where a variable would take them.
     unit : str or None
-        Its unit; that of the variable if None.
+        The unit of the value; None for the unit of the variable.
     scale : Conversion
-        What the value, converted to the variable's unit, is scaled by.
+        The linear transformation of the value, after its conversion to the variable's unit.
     units : tuple of UnitInfo
-        Definitions that go before those of the system: a parameter set brings its own.
+        Definitions of units that go before those of the system: a parameter set brings its own.
     """
 
     value: SettingValue
@@ -56,22 +70,22 @@ class Component:
     Attributes
     ----------
     name : str
-        Unique in the system.
+        A name of its own in the system.
     fmu : Path
-        The file.
-    settings : mapping of str to Setting
+        The FMU file.
+    settings : mapping of str to ComponentSetting
         Parameters and start values by variable name.
     substeps : int
-        Number of steps that the FMU makes in one step of the system, its inputs held.
+        The number of steps that the FMU makes in one step of the system, its inputs held.
     interface : {"co-simulation", "model-exchange"}, optional
-        How it is run; co-simulation where it offers that.
+        The interface to be used; by default co-simulation where the FMU offers it.
     shown_as : str
-        What sentences call the FMU, where that is not its path.
+        The name of the FMU in messages, where that is not its path.
     """
 
     name: str
     fmu: Path
-    settings: Mapping[str, Setting] = field(default_factory=dict)
+    settings: Mapping[str, ComponentSetting] = field(default_factory=dict)
     substeps: int = 1
     interface: Interface | None = None
     shown_as: str = field(default="", compare=False)
@@ -79,16 +93,18 @@ class Component:
 
 @dataclass(frozen=True)
 class Connector:
-    """A connector of a system, or what its file says of one of a component.
+    """A connector of a system, or a connector of a component as a file declares it.
 
     Attributes
     ----------
-    name, kind : str
-        That of a system is of one of `CONNECTOR_KINDS`.
+    name : str
+        The name of the connector.
+    kind : str
+        The kind; for a connector of the system one of `CONNECTOR_KINDS`.
     unit : str or None
-        If None, that of what it is connected to.
+        The unit; None for the unit of what the connector is connected to.
     type : str or None
-        In the words of SSP 1.0, where a file says it.
+        The type in the words of SSP 1.0; None if no file says it.
     """
 
     name: str
@@ -99,19 +115,21 @@ class Connector:
 
 @dataclass(frozen=True)
 class Connection:
-    """What flows from one end to another: target = factor * source + offset.
+    """A value that goes from one end to another: target = factor * source + offset.
 
     Attributes
     ----------
     source, target : Endpoint
-        An output of a component or an input of the system; an input of a component or an output of the
-        system.
+        The source is an output of a component or an input of the system; the target is an input of
+        a component or an output of the system.
     factor, offset : float
-        The linear transformation, of the source converted to the unit of the target (SSP 1.0, section 4.4).
+        The linear transformation, after the conversion to the unit of the target (SSP 1.0, section
+        4.4).
     convert_units : bool
         Whether the value is converted where the units of the ends differ.
     delayed : bool
-        Whether the value is that of the beginning of the step, whatever the order of the components.
+        Whether the target gets the value at the begin of the step, whatever the order of the
+        components.
     """
 
     source: Endpoint
@@ -134,23 +152,23 @@ class SystemStructure:
     Attributes
     ----------
     name : str
-        For people.
+        The name of the system, for people.
     components : tuple of Component
-        At least one.
+        The FMUs, at least one.
     connectors : tuple of Connector
-        What the system shows to the outside.
+        The inputs, outputs and parameters of the system as a whole.
     connections : tuple of Connection
-        Between components, and between them and the connectors.
+        The connections between components, and between them and the connectors.
     units : tuple of UnitInfo
-        Definitions of the units of connectors and settings; common units need none.
+        The definitions of units of connectors and settings; common units need none.
     declared : mapping of Endpoint to Connector
-        Connectors of the components, as a file declares them.
+        The connectors of components that a file declares.
     span : (float or None, float or None)
-        Start and end of the default experiment [s], where a file says them.
+        Start and end of the default experiment [s]; None where a file does not say them.
     base_step : float or None
-        Step of the system that a file declares [s].
+        The step of the system that a file declares [s].
     unused : tuple of str
-        Names of parameters that a file sets, but that are of no element of the system.
+        The names of parameters that a file sets, but no element of the system has.
     """
 
     name: str
@@ -174,68 +192,115 @@ class SystemStructure:
         for component in self.components:
             if component.name == name:
                 return component
-        known = [component.name for component in self.components]
-        raise CouplingError(said("coupling.no_component", self=self, name=name, known=known))
+        names = comma_list(component.name for component in self.components)
+        raise CouplingError(f"The system {self.name} has no component {name!r}; it has {names}.")
 
     def delayed(self, targets: Iterable[str]) -> "SystemStructure":
-        """Return the system with the connections to these ends delayed.
+        """Return the system with the connections to some ends delayed by a step.
+
+        Parameters
+        ----------
+        targets : iterable of str
+            The ends, as `component.variable`.
 
         Raises
         ------
         CouplingError
-            If no connection ends there.
+            If no connection goes to one of them.
         """
-        wanted = set(targets)
-        ends = [str(connection.target) for connection in self.connections]
-        if missing := wanted - {*ends}:
-            raise CouplingError(said("coupling.no_delay", self=self, names=sorted(missing), known=ends))
-        delayed = [replace(c, delayed=c.delayed or str(c.target) in wanted) for c in self.connections]
-        return replace(self, connections=tuple(delayed))
+        delayed_targets = set(targets)
+        all_targets = [str(connection.target) for connection in self.connections]
+        unknown_targets = sorted(delayed_targets.difference(all_targets))
+        if unknown_targets:
+            raise CouplingError(
+                f"No connection of the system {self.name} ends at {comma_list(unknown_targets)}, "
+                f"so none can be delayed there; connections end at {comma_list(all_targets)}."
+            )
+        connections = []
+        for connection in self.connections:
+            is_delayed = connection.delayed or str(connection.target) in delayed_targets
+            connections.append(replace(connection, delayed=is_delayed))
+        return replace(self, connections=tuple(connections))
 
 
 def parse_endpoint(text: str, components: Sequence[str]) -> Endpoint:
-    """Return the end that a scenario file names: `component.variable`; without a dot, a system connector.
+    """Return the end that a scenario file names.
+
+    Parameters
+    ----------
+    text : str
+        `component.variable`, or the name of a connector of the system, which has no dot.
+    components : sequence of str
+        The names of the components.
 
     Raises
     ------
     CouplingError
-        If what stands before the dot is no component.
+        If the text before the dot is not a component.
     """
-    owners = [name for name in components if text.startswith(f"{name}.")]
-    if owners:
-        owner = max(owners, key=len)
-        return Endpoint(owner, text[len(owner) + 1 :])
+    matches = [name for name in components if text.startswith(f"{name}.")]
+    if matches:
+        component = max(matches, key=len)
+        return Endpoint(component, text[len(component) + 1 :])
     if "." in text:
-        raise CouplingError(said("coupling.no_dot", text=text, components=components))
+        raise CouplingError(
+            f"The connection end {text!r} begins with no component; the components are "
+            f"{comma_list(components)}. A connector of the system itself is written without a dot."
+        )
     return Endpoint("", text)
 
 
 def expand_connection(
-    source: str, target: str, components: Sequence[str], **options: Any
+    source: str,
+    target: str,
+    components: Sequence[str],
+    *,
+    factor: float = 1.0,
+    offset: float = 0.0,
+    convert_units: bool = True,
+    delayed: bool = False,
 ) -> tuple[Connection, ...]:
-    """Return the connections that two patterns stand for, such as `wing.strain[{1..24}]`, pair by pair.
+    """Return the connections between two patterns of ends, such as `wing.strain[{1..24}]`.
 
     Parameters
     ----------
     source, target : str
-        The patterns.
+        The patterns of the ends.
     components : sequence of str
-        Names of the components.
-    **options
-        What `Connection` has beside its ends.
+        The names of the components.
+    factor, offset, convert_units, delayed
+        As for `Connection`.
 
     Raises
     ------
     CouplingError
-        If the patterns are of unequal length, or an end begins with no component.
+        If the patterns stand for unequal numbers of ends, or an end begins with no component.
     """
-    before = f"A connection from {source!r} to {target!r} cannot be read: "
-    with CouplingError.instead_of(ValueError, before=before, after="."):
+    unread = f"A connection from {source!r} to {target!r} cannot be read: "
+    with CouplingError.instead_of(ValueError, before=unread, after="."):
         sources, targets = expand(source), expand(target)
     if len(sources) != len(targets):
-        counts = len(sources), len(targets)
-        raise CouplingError(said("coupling.patterns", source=source, target=target, counts=counts))
-    return tuple(
-        Connection(parse_endpoint(a, components), parse_endpoint(b, components), **options)
-        for a, b in zip(sources, targets, strict=True)
+        raise CouplingError(
+            f"The connection from {source!r} to {target!r} joins {len(sources)} ends to "
+            f"{len(targets)}; the two patterns must stand for equally many."
+        )
+    connections = []
+    for source_name, target_name in zip(sources, targets, strict=True):
+        connection = Connection(
+            source=parse_endpoint(source_name, components),
+            target=parse_endpoint(target_name, components),
+            factor=factor,
+            offset=offset,
+            convert_units=convert_units,
+            delayed=delayed,
+        )
+        connections.append(connection)
+    return tuple(connections)
+
+
+def two_sources_sentence(target: object, first_source: object, second_source: object) -> str:
+    """Return the message on a target that two connections lead to."""
+    return (
+        f"{target} has two sources, {first_source} and {second_source}; keep one of the two "
+        "connections."
     )

@@ -1,33 +1,41 @@
-"""A system of FMUs as the description of one, and as its components see it."""
+"""A system of FMUs described as if it were one FMU, and its components as the system steps them.
+
+A binding names variables of a system as it names variables of an FMU. For that,
+`system_description` lists the connectors of the system and all variables of its components.
+`stepped_components` then turns a binding of the system into one binding for each component.
+"""
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple, cast
 
 from fmu_asset.archive.declared import FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.client.binding import Binding, BindingHeader
 from fmu_asset.client.bound_variables import InputBinding, ParameterBinding, VectorBinding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.client.units import IDENTITY
-from fmu_asset.errors import BindingError, CouplingError, said
+from fmu_asset.errors import BindingError, CouplingError
 from fmu_asset.instances.plan import InitialValues
 
-from .structure import Component, Endpoint
+from .structure import Component, Connector, Endpoint
 from .wiring import ConnectedVariable, Wiring
+
+_START_OF_FREE_INPUT = "nan"
+"""Start value of a system's inputs: one that nobody gives keeps the start value of its FMU."""
 
 
 @dataclass(frozen=True)
 class SystemDescription(FmuDescription):
-    """What a system offers.
+    """The description of a system of FMUs as one FMU.
 
     Attributes
     ----------
     ends : dict of str to tuple of ConnectedVariable
-        For each variable where it goes, or where it comes from.
+        For each variable of the system the variables of components that it goes to, or comes from.
     definitions : dict of str to tuple of UnitInfo
-        For each variable the definitions that its unit is one of: FMUs may differ in them.
+        For each variable the unit definitions that hold for it: FMUs may differ in them.
     """
 
     ends: dict[str, tuple[ConnectedVariable, ...]] = field(default_factory=dict)
@@ -37,70 +45,66 @@ class SystemDescription(FmuDescription):
         """Return the definitions of units that hold for a variable."""
         return self.definitions[variable.name]
 
-    def of_components(self, settings: InitialValues) -> dict[str, dict[str, float]]:
-        """Return what is set in the system by component and variable, in the FMUs' units."""
-        found: dict[str, dict[str, float]] = {}
+    def settings_of_components(self, settings: InitialValues) -> dict[str, dict[str, float]]:
+        """Return values of the system's variables by component and variable, in the FMUs' units.
+
+        Parameters
+        ----------
+        settings : InitialValues
+            Values of variables of the system, by value reference.
+        """
+        by_component: dict[str, dict[str, float]] = {}
         for _, reference, (value,) in settings:
             number = float(value)
             for port in self.ends[self.variables[reference].name]:
-                own = found.setdefault(port.end.component, {})
-                own[port.end.variable] = port.conversion.to_fmu(number)
-        return found
+                values = by_component.setdefault(port.end.component, {})
+                values[port.end.variable] = port.conversion.to_fmu(number)
+        return by_component
+
+
+class _SystemVariable(NamedTuple):
+    """A variable of a system: its declaration, and its entries in `SystemDescription`."""
+
+    info: VariableInfo
+    ends: tuple[ConnectedVariable, ...]
+    definitions: tuple[UnitInfo, ...]
 
 
 def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
     """Return a system as the description of one FMU, all of whose variables are real numbers.
 
-    Outputs of components that a connector shows are local variables; the ranges and types of inputs are
-    those of the components, which see to them.
+    Outputs of components that a connector shows are local variables. The ranges and types of inputs
+    are those of the components, which check them.
 
     Parameters
     ----------
     wiring : Wiring
         The system.
     sha256 : str
-        Stands for all that the meaning of a state depends on.
+        A hash of everything that the meaning of a saved state depends on.
     """
     structure = wiring.structure
-    variables = list[VariableInfo]()
+    system_variables = [
+        _connector_variable(wiring, connector) for connector in structure.connectors
+    ]
+    shown_ends: set[Endpoint] = set()
+    for connector in structure.connectors:
+        if connector.kind == "output":
+            shown_ends.update(port.end for port in wiring.ends[connector.name])
+    for component, description in wiring.declared.items():
+        for info in description.variables:
+            if info.single:
+                end = Endpoint(component, info.name)
+                variable = _component_variable(wiring, end, info, is_shown=end in shown_ends)
+                system_variables.append(variable)
+    variables = []
     ends: dict[str, tuple[ConnectedVariable, ...]] = {}
     definitions: dict[str, tuple[UnitInfo, ...]] = {}
-
-    def offer(name: str, causality: str, unit: str | None, **said: Any) -> None:
-        # An input that nobody gives keeps the start value of its FMU.
-        start = "nan" if causality == "input" else None
-        variable = VariableInfo(name, len(variables), causality=causality, unit=unit, start=start, **said)
-        variables.append(variable)
-
-    for connector in structure.connectors:
-        name, own = connector.name, wiring.ends[connector.name]
-        causalities = {wiring.variable(port.end).causality for port in own} or {"connected to nothing"}
-        causality = "output" if own and connector.kind == "output" else " and ".join(sorted(causalities))
-        # An enumeration, where all ends of the connector are the same one.
-        enumerations = [wiring.variable(port.end).items for port in own] or [{}]
-        alike = enumerations.count(enumerations[0]) == len(enumerations)
-        offer(name, causality, wiring.units[name], items=enumerations[0] if alike else {})
-        units = (unit for port in own for unit in wiring.declared[port.end.component].units)
-        ends[name], definitions[name] = own, (*structure.units, *units)
-    shown = {port.end for item in structure.connectors if item.kind == "output" for port in ends[item.name]}
-    for component, declared in wiring.declared.items():
-        for variable in filter(lambda variable: variable.single, declared.variables):
-            end, causality = Endpoint(component, variable.name), variable.causality
-            if end in wiring.feeds:
-                causality = "an input that is fed by a connection already"
-            elif end in shown:
-                causality = "local"
-            offer(
-                str(end),
-                causality,
-                variable.unit,
-                variability=variable.variability,
-                description=variable.description,
-                items=variable.items,
-            )
-            ends[str(end)] = (ConnectedVariable(end, IDENTITY, False),)
-            definitions[str(end)] = declared.units
-    steps = [declared.fixed_step or declared.step_size for declared in wiring.declared.values()]
+    for reference, variable in enumerate(system_variables):
+        variables.append(replace(variable.info, reference=reference))
+        ends[variable.info.name] = variable.ends
+        definitions[variable.info.name] = variable.definitions
+    start_time, stop_time = structure.span
     return SystemDescription(
         path=Path(f"the system {structure.name}"),
         sha256=sha256,
@@ -108,53 +112,140 @@ def system_description(wiring: Wiring, sha256: str = "") -> SystemDescription:
         can_get_and_set_state=True,
         can_serialise_state=True,
         variables=tuple(variables),
-        start_time=structure.span[0],
-        stop_time=structure.span[1],
-        step_size=structure.base_step or min((size for size in steps if size is not None), default=None),
+        start_time=start_time,
+        stop_time=stop_time,
+        step_size=structure.base_step or _smallest_step(wiring),
         ends=ends,
         definitions=definitions,
     )
 
 
+def _connector_variable(wiring: Wiring, connector: Connector) -> _SystemVariable:
+    """Return a connector of the system as a variable of the system."""
+    ports = wiring.ends[connector.name]
+    infos = [wiring.variable(port.end) for port in ports]
+    if connector.kind == "output" and ports:
+        causality = "output"
+    elif ports:
+        causality = " and ".join(sorted({info.causality for info in infos}))
+    else:
+        causality = "connected to nothing"
+    # It is an enumeration if all its ends are the same one.
+    items: dict[str, int] = {}
+    if infos and all(info.items == infos[0].items for info in infos):
+        items = infos[0].items
+    definitions = list(wiring.structure.units)
+    for port in ports:
+        definitions += wiring.declared[port.end.component].units
+    info = VariableInfo(
+        name=connector.name,
+        reference=0,  # given later
+        causality=causality,
+        unit=wiring.units[connector.name],
+        start=_START_OF_FREE_INPUT if causality == "input" else None,
+        items=items,
+    )
+    return _SystemVariable(info, ports, tuple(definitions))
+
+
+def _component_variable(
+    wiring: Wiring, end: Endpoint, info: VariableInfo, *, is_shown: bool
+) -> _SystemVariable:
+    """Return a variable of a component as a variable of the system.
+
+    Parameters
+    ----------
+    wiring : Wiring
+        The system.
+    end : Endpoint
+        The component and its variable.
+    info : VariableInfo
+        The variable as its FMU declares it.
+    is_shown : bool
+        Whether it is an output that a connector of the system shows.
+    """
+    causality = info.causality
+    if end in wiring.feeds:
+        causality = "an input that is fed by a connection already"
+    elif is_shown:
+        causality = "local"
+    system_info = VariableInfo(
+        name=str(end),
+        reference=0,  # given later
+        causality=causality,
+        variability=info.variability,
+        description=info.description,
+        unit=info.unit,
+        start=_START_OF_FREE_INPUT if causality == "input" else None,
+        items=info.items,
+    )
+    port = ConnectedVariable(end, IDENTITY, delayed=False)
+    return _SystemVariable(system_info, (port,), wiring.declared[end.component].units)
+
+
+def _smallest_step(wiring: Wiring) -> float | None:
+    """Return the smallest step size that a component declares [s]; None if none does."""
+    step_sizes = []
+    for description in wiring.declared.values():
+        step_size = description.fixed_step or description.step_size
+        if step_size is not None:
+            step_sizes.append(step_size)
+    return min(step_sizes, default=None)
+
+
 def wiring_hash(wiring: Wiring, binding: Binding, *algorithm: str | float) -> str:
-    """Return the SHA-256 of all that the meaning of a state depends on; places of files do not count."""
-    components = [
-        (
-            c.name,
-            wiring.declared[c.name].sha256,
-            sorted(wiring.settings[c.name].items()),  # files sort them
-            c.substeps,
-            c.interface,
+    """Return the SHA-256 of everything that the meaning of a saved state depends on.
+
+    Where the files of the FMUs lie does not count.
+
+    Parameters
+    ----------
+    wiring : Wiring
+        The system.
+    binding : Binding
+        A binding of it.
+    *algorithm : str or float
+        The algorithm, its iterations and its tolerance.
+    """
+    components = []
+    for component in wiring.structure.components:
+        # Sorted, because files sort settings, too.
+        settings = sorted(wiring.settings[component.name].items())
+        sha256 = wiring.declared[component.name].sha256
+        components.append(
+            (component.name, sha256, settings, component.substeps, component.interface)
         )
-        for c in wiring.structure.components
-    ]
-    bound = binding.model_dump(mode="json", exclude={"limits"})
-    record = (components, wiring.feeds, wiring.ends, bound, algorithm)
+    bound_variables = binding.model_dump(mode="json", exclude={"limits"})
+    record = (components, wiring.feeds, wiring.ends, bound_variables, algorithm)
     return hashlib.sha256(repr(record).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
-class Part:
-    """A component as it is stepped.
+class SteppedComponent:
+    """A component of a system as the system steps it.
 
     Attributes
     ----------
     name : str
         The component.
     ends : tuple of Endpoint
-        Its outputs that are read, in the order of its binding; at least one, to see that it is alive.
+        The outputs that are read, in the order of its binding; at least one, to see that it is
+        alive.
     fed : dict of str to ConnectedVariable
-        What feeds its inputs, by their names.
+        The output that feeds each input, by the input's name.
     moving : frozenset of str
-        Those of them with a continuous real number at both ends.
+        The fed inputs with a continuous real number at both ends.
     linear : bool
         Whether its inputs move in straight lines over a step.
     substeps : int
-        Its steps in a step of the system, as calls of its asset: of several with lines, the door makes these.
-    settings, constants : dict of str to float or str, dict of str to float
-        Parameters, and inputs that have a value from the start.
+        The number of calls that step its FMU in a step of the system. With linear inputs one call
+        makes all its steps.
+    settings : dict of str to float or str
+        Parameters.
+    constants : dict of str to float
+        Inputs that have a value from the start.
     binding : Binding
-        Its own names and units.
+        A binding of the FMU by its own names and units.
     """
 
     name: str
@@ -168,8 +259,10 @@ class Part:
     binding: Binding
 
 
-def parts_of(wiring: Wiring, exchange: Exchange, *, linear: bool = False) -> dict[str, Part]:
-    """Return the components of a system as they are stepped, by name.
+def stepped_components(
+    wiring: Wiring, exchange: Exchange, *, linear: bool = False
+) -> dict[str, SteppedComponent]:
+    """Return the components of a system as the system steps them, by name.
 
     Parameters
     ----------
@@ -185,74 +278,124 @@ def parts_of(wiring: Wiring, exchange: Exchange, *, linear: bool = False) -> dic
     CouplingError
         If a component has no output.
     BindingError
-        If lines are wanted, and no input can follow them.
+        If linear inputs are asked for, and no component can follow them.
     """
-    parts = {c.name: _part(wiring, exchange, c, linear=linear) for c in wiring.structure.components}
-    if linear and not any(part.linear for part in parts.values()):
-        raise BindingError(said("coupling.interpolation", exchange=exchange, wiring=wiring))
-    return parts
+    components = {}
+    for component in wiring.structure.components:
+        components[component.name] = _stepped_component(wiring, exchange, component, linear=linear)
+    if linear and not any(component.linear for component in components.values()):
+        raise BindingError(
+            f"The binding {exchange.binding.name} asks for linear interpolation of inputs, but no "
+            f"component of the system {wiring.structure.name} has a continuous input and takes its "
+            "derivatives (`canInterpolateInputs`, or model exchange); leave it out."
+        )
+    return components
 
 
-def _part(wiring: Wiring, exchange: Exchange, component: Component, *, linear: bool) -> Part:
-    name, binding = component.name, exchange.binding
-
-    def bound(variables: Iterable[str]) -> list[Endpoint]:
-        """Return the ends at this component of variables of the system."""
-        ports = [port for variable in variables for port in exchange.description.ends[variable]]  # type: ignore[attr-defined]
-        return [port.end for port in ports if port.end.component == name]
-
-    fed = {target.variable: port for target, port in wiring.feeds.items() if target.component == name}
-    sources = [port.end for port in wiring.feeds.values() if port.end.component == name]
-    ends = tuple(dict.fromkeys([*sources, *bound(variable.name for variable in exchange.read)]))
-    variables = {v.name: v for v in wiring.declared[name].variables}
-    # Of a component of which nothing is asked, any output is looked at.
-    outputs = (v.name for v in variables.values() if v.causality == "output" and v.single)
-    ends = ends or tuple(Endpoint(name, output) for output in outputs)[:1]
-    if not ends:
-        raise CouplingError(said("coupling.no_output", name=name))
-    given = [end.variable for end in bound(variable.name for variable in exchange.sent)]
-    tuned = [end.variable for end in bound(item.variable for item in binding.parameter.values())]
-    moving = frozenset(
-        key for key, port in fed.items() if wiring.variable(port.end).continuous and variables[key].continuous
-    )
-    linear = (
-        linear
-        and wiring.declared[name].can_interpolate_inputs
-        and (bool(moving) or any(variables[key].continuous for key in given))
-    )
-    constants, settings = dict[str, float](), dict[str, float | str]()
-    for key, value in wiring.settings[name].items():
-        if variables[key].causality == "input" and not isinstance(value, str):
-            constants[key] = value
+def _stepped_component(
+    wiring: Wiring, exchange: Exchange, component: Component, *, linear: bool
+) -> SteppedComponent:
+    """Return one component as the system steps it; see `stepped_components`."""
+    name = component.name
+    infos = {info.name: info for info in wiring.declared[name].variables}
+    fed = {}
+    for target, port in wiring.feeds.items():
+        if target.component == name:
+            fed[target.variable] = port
+    output_ends = _read_outputs(wiring, exchange, name)
+    # variables of the system that the binding sets, at this component
+    sent_names = [variable.name for variable in exchange.sent]
+    sent_inputs = [end.variable for end in _ends_at(exchange, name, sent_names)]
+    parameter_names = [parameter.variable for parameter in exchange.binding.parameter.values()]
+    tuned_parameters = [end.variable for end in _ends_at(exchange, name, parameter_names)]
+    # inputs that move in straight lines
+    moving = []
+    for variable, port in fed.items():
+        if wiring.variable(port.end).continuous and infos[variable].continuous:
+            moving.append(variable)
+    has_moving_inputs = bool(moving) or any(infos[variable].continuous for variable in sent_inputs)
+    can_interpolate = wiring.declared[name].can_interpolate_inputs
+    is_linear = linear and can_interpolate and has_moving_inputs
+    # start values of inputs, and parameters
+    constants: dict[str, float] = {}
+    settings: dict[str, float | str] = {}
+    for variable, value in wiring.settings[name].items():
+        if infos[variable].causality == "input" and not isinstance(value, str):
+            constants[variable] = value
         else:
-            settings[key] = value
-
-    def units(*groups: Iterable[str]) -> dict[str, str]:
-        """Return the units of variables, each once."""
-        return {key: variables[key].unit or "1" for group in groups for key in group}
-
-    own = Binding(
-        binding=BindingHeader(
-            name=name,
-            step_size=binding.step_size / component.substeps,
-            decimation=component.substeps if linear else 1,
-            interpolation="linear" if linear else "zero-order",
-            start_time=binding.binding.start_time,
-            stop_time=binding.binding.stop_time,
-            interface=component.interface,
-            tolerance=binding.binding.tolerance,
-        ),
-        limits=binding.limits,
+            settings[variable] = value
+    units = {info.name: info.unit or "1" for info in infos.values()}
+    binding = Binding(
+        binding=_component_header(exchange.binding, component, is_linear=is_linear),
+        limits=exchange.binding.limits,
         load={
-            key: InputBinding(variable=key, unit=unit) for key, unit in units(fed, given, constants).items()
+            variable: InputBinding(variable=variable, unit=units[variable])
+            for variable in (*fed, *sent_inputs, *constants)
         },
         parameter={
-            key: ParameterBinding(variable=key, unit=unit) for key, unit in units(settings, tuned).items()
+            variable: ParameterBinding(variable=variable, unit=units[variable])
+            for variable in (*settings, *tuned_parameters)
         },
         observation={
-            key: VectorBinding(variables=(key,), unit=unit)
-            for key, unit in units(end.variable for end in ends).items()
+            end.variable: VectorBinding(variables=(end.variable,), unit=units[end.variable])
+            for end in output_ends
         },
     )
-    substeps = 1 if linear else component.substeps
-    return Part(name, ends, fed, moving, linear, substeps, settings, constants, own)
+    return SteppedComponent(
+        name=name,
+        ends=output_ends,
+        fed=fed,
+        moving=frozenset(moving),
+        linear=is_linear,
+        substeps=1 if is_linear else component.substeps,
+        settings=settings,
+        constants=constants,
+        binding=binding,
+    )
+
+
+def _component_header(binding: Binding, component: Component, *, is_linear: bool) -> BindingHeader:
+    """Return the head of a component's binding, from the binding of its system."""
+    return BindingHeader(
+        name=component.name,
+        step_size=binding.step_size / component.substeps,
+        decimation=component.substeps if is_linear else 1,
+        interpolation="linear" if is_linear else "zero-order",
+        start_time=binding.binding.start_time,
+        stop_time=binding.binding.stop_time,
+        interface=component.interface,
+        tolerance=binding.binding.tolerance,
+    )
+
+
+def _ends_at(exchange: Exchange, component: str, variables: Iterable[str]) -> list[Endpoint]:
+    """Return the ends at a component of variables of the system, in their order."""
+    description = cast("SystemDescription", exchange.description)
+    ends = []
+    for variable in variables:
+        for port in description.ends[variable]:
+            if port.end.component == component:
+                ends.append(port.end)
+    return ends
+
+
+def _read_outputs(wiring: Wiring, exchange: Exchange, component: str) -> tuple[Endpoint, ...]:
+    """Return the outputs of a component that others or the binding read, or else any one output.
+
+    Raises
+    ------
+    CouplingError
+        If it has no output of a single number.
+    """
+    ends = [port.end for port in wiring.feeds.values() if port.end.component == component]
+    read_names = [variable.name for variable in exchange.read]
+    ends += _ends_at(exchange, component, read_names)
+    if ends:
+        return tuple(dict.fromkeys(ends))
+    for info in wiring.declared[component].variables:
+        if info.causality == "output" and info.single:
+            return (Endpoint(component, info.name),)
+    raise CouplingError(
+        f"The component {component!r} has no output of a single number, so it takes no part; leave "
+        "it out."
+    )

@@ -1,184 +1,26 @@
-"""A system of FMUs checked against the FMUs themselves: every end exists, fits, and has one source.
-
-First in which order they are evaluated, and where the order must break, by two graphs. In the graph of
-*components*, a connection leads from one to another. In the graph of *variables*, a connection leads from an
-output to an input, and direct feedthrough from an input to an output of the same FMU; a circle in it is an
-algebraic loop. A circle of components alone is none: somewhere on it stands a state, whose value at the
-beginning of the step can be used.
-"""
+"""Checking a system of FMUs against its FMUs: every end exists, fits, and has one source."""
 
 import math
-from collections.abc import Collection, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from graphlib import TopologicalSorter
-from heapq import heappop, heappush
-from typing import NamedTuple, TypeVar
-
-import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from dataclasses import replace
+from typing import NamedTuple
 
 from fmu_asset.archive.declared import READABLE, FmuDescription, UnitInfo, VariableInfo
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.client.units import IDENTITY, Conversion, between
-from fmu_asset.errors import CouplingError, FmuError, said
+from fmu_asset.errors import CouplingError, FmuError
+from reporting.words import comma_list
 
-from .structure import Component, Connection, Endpoint, Setting, SystemStructure
+from .schedule import Schedule, schedule
+from .structure import (
+    Component,
+    ComponentSetting,
+    Connection,
+    Endpoint,
+    SystemStructure,
+    two_sources_sentence,
+)
 
-Node = TypeVar("Node", bound=Hashable)
-Feedthrough = Mapping[str, Mapping[str, Collection[str]]]
-"""For each component, for each output, the inputs that it depends on directly."""
-
-
-@dataclass(frozen=True)
-class Schedule:
-    """How a step goes through the components.
-
-    Attributes
-    ----------
-    groups : tuple of tuple of str
-        The components: each one after those that it depends on directly, as far as that is possible; cut into
-        what depends on itself in a circle (more than one name, or one that is connected to itself) and what
-        does not.
-    circles : frozenset of tuple of str
-        Those of the groups that are such a circle.
-    held : tuple of Connection
-        Connections that, in one pass in this order, carry the value of the beginning of the step.
-    loops : tuple of tuple of Endpoint
-        Algebraic loops, each as a shortest circle of variables.
-    """
-
-    groups: tuple[tuple[str, ...], ...]
-    circles: frozenset[tuple[str, ...]]
-    held: tuple[Connection, ...]
-    loops: tuple[tuple[Endpoint, ...], ...]
-
-    @property
-    def order(self) -> tuple[str, ...]:
-        """The components in their order."""
-        return tuple(name for group in self.groups for name in group)
-
-
-def schedule(names: Sequence[str], links: Sequence[Connection], feedthrough: Feedthrough) -> Schedule:
-    """Return the order of components, and the algebraic loops.
-
-    Equal cases keep the order of `names`.
-
-    Parameters
-    ----------
-    names : sequence of str
-        The components.
-    links : sequence of Connection
-        Connections between them that are not delayed.
-    feedthrough : mapping
-        Direct dependencies of outputs on inputs.
-    """
-    follows: dict[str, set[str]] = {name: set() for name in names}
-    directly: dict[str, set[str]] = {name: set() for name in names}
-    for link in links:
-        a, b = link.source.component, link.target.component
-        follows[a].add(b)
-        if any(link.target.variable in inputs for inputs in feedthrough[b].values()):
-            directly[a].add(b)
-    groups = []
-    for group in strong_components(follows):
-        inside = {name: [other for other in directly[name] if other in group] for name in group}
-        # What even direct feedthrough joins in a circle stays in the order of the names.
-        groups.append(tuple(name for part in strong_components(inside) for name in part))
-    place = {name: index for index, name in enumerate(name for group in groups for name in group)}
-    return Schedule(
-        groups=tuple(groups),
-        circles=frozenset(group for group in groups if len(group) > 1 or group[0] in follows[group[0]]),
-        held=tuple(link for link in links if place[link.source.component] >= place[link.target.component]),
-        loops=algebraic_loops(links, feedthrough),
-    )
-
-
-def algebraic_loops(
-    links: Sequence[Connection], feedthrough: Feedthrough
-) -> tuple[tuple[Endpoint, ...], ...]:
-    """Return one shortest circle of variables for each set of variables that depend on each other."""
-    graph = {end: set[Endpoint]() for link in links for end in (link.source, link.target)}
-    for link in links:
-        graph[link.source].add(link.target)
-    for name, outputs in feedthrough.items():
-        for output, inputs in outputs.items():
-            end = Endpoint(name, output)
-            for begin in (Endpoint(name, variable) for variable in inputs) if end in graph else ():
-                if begin in graph:
-                    graph[begin].add(end)
-    return tuple(filter(None, (shortest_circle(graph, part) for part in strong_components(graph))))
-
-
-def strong_components(graph: Mapping[Node, Collection[Node]]) -> list[tuple[Node, ...]]:
-    """Return the strongly connected components of a graph in topological order.
-
-    Nodes that may stand in any order keep that of the mapping.
-
-    Parameters
-    ----------
-    graph : mapping
-        Successors by node; every successor is a node of the mapping.
-    """
-    number = {node: index for index, node in enumerate(graph)}
-    edges = [(number[node], number[successor]) for node, others in graph.items() for successor in others]
-    begins, ends = zip(*edges, strict=True) if edges else ((), ())
-    matrix = coo_array((np.ones(len(edges)), (begins, ends)), shape=(len(number), len(number)))
-    parts: dict[int, list[Node]] = {}
-    labels = connected_components(matrix, connection="strong")[1].tolist()
-    for node, label in zip(graph, labels, strict=True):
-        parts.setdefault(label, []).append(node)
-    place = {label: index for index, label in enumerate(parts)}  # by their first nodes
-    sorter = TopologicalSorter[int](dict.fromkeys(place.values(), ()))
-    for begin, end in edges:
-        if labels[begin] != labels[end]:
-            sorter.add(place[labels[end]], place[labels[begin]])
-    sorter.prepare()
-    found, ready, order = list(parts.values()), list[int](), []
-    while sorter.is_active():  # in the order of the mapping, and so a heap
-        for index in sorter.get_ready():
-            heappush(ready, index)
-        index = heappop(ready)
-        order.append(tuple(found[index]))
-        sorter.done(index)
-    return order
-
-
-def shortest_circle(graph: Mapping[Node, Collection[Node]], part: Sequence[Node]) -> tuple[Node, ...]:
-    """Return a shortest circle inside a strongly connected component, its first node repeated at the end.
-
-    Empty for a node alone that has no connection to itself.
-    """
-    inside = set(part)
-    position = {node: index for index, node in enumerate(graph)}
-    best: tuple[Node, ...] = ()
-    for start in part:
-        trails: list[tuple[Node, ...]] = [(start,)]
-        seen: set[Node] = set()
-        for trail in trails:  # to which longer ones are added on the way
-            if best and len(trail) + 1 >= len(best):
-                break
-            if start in graph[trail[-1]]:
-                best = (*trail, start)
-            following = sorted(inside.intersection(graph[trail[-1]]) - seen, key=position.__getitem__)
-            seen.update(following)
-            trails += [(*trail, node) for node in following]
-    return best
-
-
-def loop_sentence(loops: Sequence[Sequence[Endpoint]]) -> str:
-    """Return the sentence that reports algebraic loops."""
-    shown = "; ".join(" -> ".join(str(end) for end in loop) for loop in loops[:3])
-    more = f" and {len(loops) - 3} more" if len(loops) > 3 else ""
-    return (
-        "The connections close "
-        f"{'an algebraic loop' if len(loops) == 1 else f'{len(loops)} algebraic loops'} ({shown}{more}): "
-        "every value in it depends on itself at the same moment; delay one of its connections, allow "
-        "iterations, or take the algorithm jacobi, which delays all of them."
-    )
-
-
-_FITS = {
+_TARGET_TYPES = {
     "Real": {"Real"},
     "Integer": {"Integer", "Real", "Enumeration"},
     "Boolean": {"Boolean"},
@@ -188,10 +30,18 @@ _FITS = {
 
 
 class ConnectedVariable(NamedTuple):
-    """A variable of a component as it is seen elsewhere, its units resolved.
+    """A variable of a component at a connection, with the conversion of its value.
 
-    variable = factor * connector + offset for inputs and parameters, and the other way round for outputs and
-    what feeds other components.
+    Attributes
+    ----------
+    end : Endpoint
+        The component and its variable.
+    conversion : Conversion
+        variable = factor * connector + offset for inputs and parameters, connector = factor *
+        variable + offset for outputs, and target = factor * variable + offset for what feeds
+        another component.
+    delayed : bool
+        Whether the value is that of the beginning of the step.
     """
 
     end: Endpoint
@@ -200,7 +50,7 @@ class ConnectedVariable(NamedTuple):
 
 
 def read_component(component: Component) -> FmuDescription:
-    """Return what the FMU of a component declares; sentences call it as the component does.
+    """Return what the FMU of a component declares; messages name it as the component does.
 
     Raises
     ------
@@ -230,21 +80,21 @@ class Wiring:
     Attributes
     ----------
     structure : SystemStructure
-        As given.
+        The system.
     left_out : list of str
-        The names of these settings.
+        The names of the settings that were left out.
     declared : dict of str to FmuDescription
-        The FMUs by component.
+        The descriptions of the FMUs by component.
     feeds : dict of Endpoint to ConnectedVariable
-        Connections between components.
+        The source of each connection between components, by its target.
     ends : dict of str to tuple of ConnectedVariable
-        For each input and parameter of the system where it goes, for each output where it comes from.
+        For each input and parameter of the system its targets, for each output its source.
     units : dict of str to (str or None)
-        Unit of each connector: its own, or that of what it is connected to.
+        The unit of each connector: its own, or that of what it is connected to.
     settings : dict of str to (dict of str to float or str)
-        Parameters and start values of each component, in the FMU's units; a text of a parameter that is one.
+        Parameters and start values of each component, in the FMU's units; texts of text parameters.
     schedule : Schedule
-        Order of the components, and algebraic loops.
+        The order of the components, and the algebraic loops.
 
     Raises
     ------
@@ -257,37 +107,56 @@ class Wiring:
     def __init__(self, structure: SystemStructure, *, leave_out_unknown: bool = False) -> None:
         names = [component.name for component in structure.components]
         if not names:
-            raise CouplingError(f"The system {structure.name} has no component; name at least one FMU.")
+            raise CouplingError(
+                f"The system {structure.name} has no component; name at least one FMU."
+            )
         for name in names:
             if names.count(name) > 1:
-                raise CouplingError(said("coupling.two_names", structure=structure, name=name))
-        self.declared: dict[str, FmuDescription] = {
-            component.name: read_component(component) for component in structure.components
-        }
-        self.left_out: list[str] = []
+                raise CouplingError(
+                    f"The system {structure.name} has two components named {name!r}; each needs a "
+                    "name of its own."
+                )
         self.structure = structure
-        self.settings = {c.name: self._settings(c, leave_out_unknown) for c in structure.components}
-        self._kinds = {connector.name: connector.kind for connector in structure.connectors}
-        self.units: dict[str, str | None] = {c.name: c.unit for c in structure.connectors}
-        self.feeds: dict[Endpoint, ConnectedVariable] = {}
-        self.ends: dict[str, tuple[ConnectedVariable, ...]] = dict.fromkeys(self._kinds, ())
-        taken: dict[Endpoint, Endpoint] = {}
-        for connection in structure.connections:
-            self._connect(connection, taken)
-        links = [Connection(port.end, target) for target, port in self.feeds.items() if not port.delayed]
-        self.schedule: Schedule = schedule(names, links, self._feedthrough())
-
-    def _feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return the direct dependencies that count: those of outputs, and of other variables in use."""
-        used = {connection.source for connection in self.structure.connections}
-        return {
-            name: {
-                output: inputs
-                for output, inputs in declared.feedthrough.items()
-                if self.variable(end := Endpoint(name, output)).causality == "output" or end in used
-            }
-            for name, declared in self.declared.items()
+        # components
+        self.declared: dict[str, FmuDescription] = {}
+        for component in structure.components:
+            self.declared[component.name] = read_component(component)
+        self.left_out: list[str] = []
+        self.settings: dict[str, dict[str, float | str]] = {}
+        for component in structure.components:
+            self.settings[component.name] = self._settings(component, leave_out_unknown)
+        # connections
+        self._connector_kinds = {
+            connector.name: connector.kind for connector in structure.connectors
         }
+        self.units: dict[str, str | None] = {
+            connector.name: connector.unit for connector in structure.connectors
+        }
+        self.feeds: dict[Endpoint, ConnectedVariable] = {}
+        self.ends: dict[str, tuple[ConnectedVariable, ...]] = dict.fromkeys(
+            self._connector_kinds, ()
+        )
+        source_of_target: dict[Endpoint, Endpoint] = {}
+        for connection in structure.connections:
+            self._connect(connection, source_of_target)
+        # order
+        immediate = []
+        for target, source in self.feeds.items():
+            if not source.delayed:
+                immediate.append(Connection(source.end, target))
+        self.schedule: Schedule = schedule(names, immediate, self._used_feedthrough())
+
+    def _used_feedthrough(self) -> dict[str, dict[str, frozenset[str]]]:
+        """Return the direct inputs of outputs, and of other variables that a connection reads."""
+        sources = {connection.source for connection in self.structure.connections}
+        used: dict[str, dict[str, frozenset[str]]] = {}
+        for component, description in self.declared.items():
+            used[component] = {}
+            for variable, inputs in description.feedthrough.items():
+                end = Endpoint(component, variable)
+                if end in sources or self.variable(end).causality == "output":
+                    used[component][variable] = inputs
+        return used
 
     # ------------------------------------------------------------------ ends
 
@@ -299,87 +168,185 @@ class Wiring:
         CouplingError
             If there is no such component or variable.
         """
-        self.structure.component(end.component)
-        declared = self.declared[end.component]
-        variable = declared.variable(end.variable)
+        self.structure.component(end.component)  # refuses an unknown one
+        description = self.declared[end.component]
+        variable = description.variable(end.variable)
         if variable is None:
-            hint = declared.hint(end.variable)
-            file = declared.shown_as or declared.path.name
-            raise CouplingError(said("coupling.no_variable", end=end, file=file, hint=hint))
+            file = description.shown_as or description.path.name
+            raise CouplingError(
+                f"The component {end.component!r} ({file}) has no variable "
+                f"{end.variable!r}{description.hint(end.variable)}"
+            )
         return variable
 
-    def _connector(self, end: Endpoint, kinds: tuple[str, ...], verb: str) -> VariableInfo:
-        """Return a connector of the system, which has one of these kinds and fits any type."""
-        kind = self._kinds.get(end.variable)
-        if kind is None:
-            raise CouplingError(said("coupling.no_connector", self=self, end=end, known=self._kinds))
-        if kind not in kinds:
-            raise CouplingError(said("coupling.connector_kind", end=end, kind=kind, verb=verb))
-        return VariableInfo(end.variable, 0, kind="", causality=kind, unit=self.units[end.variable])
+    def _connector(self, end: Endpoint, kinds: tuple[str, ...], role: str) -> VariableInfo:
+        """Return a connector of the system as a variable without type.
 
-    def _connect(self, connection: Connection, taken: dict[Endpoint, Endpoint]) -> None:
+        Parameters
+        ----------
+        end : Endpoint
+            The end that names the connector.
+        kinds : tuple of str
+            The kinds of connectors that may stand there.
+        role : str
+            The role of the end in its connection, for the message.
+        """
+        kind = self._connector_kinds.get(end.variable)
+        if kind is None:
+            raise CouplingError(
+                f"The system {self.structure.name} has no connector {end.variable!r}; it has "
+                f"{comma_list(self._connector_kinds)}."
+            )
+        if kind not in kinds:
+            raise CouplingError(
+                f"The connector {end.variable!r} of the system is of the kind {kind} and cannot be "
+                f"{role} of a connection."
+            )
+        unit = self.units[end.variable]
+        return VariableInfo(end.variable, 0, kind="", causality=kind, unit=unit)
+
+    def _connect(self, connection: Connection, source_of_target: dict[Endpoint, Endpoint]) -> None:
+        """Check a connection and add it to `feeds` or `ends`.
+
+        Parameters
+        ----------
+        connection : Connection
+            The connection.
+        source_of_target : dict of Endpoint to Endpoint
+            The sources of the connections before it, by target; it is added to them.
+        """
         source, target = connection.source, connection.target
-        if target in taken:
-            raise CouplingError(said("coupling.two_sources", target=target, given=(taken[target], source)))
-        taken[target] = source
+        if target in source_of_target:
+            raise CouplingError(two_sources_sentence(target, source_of_target[target], source))
+        source_of_target[target] = source
         if not (math.isfinite(connection.factor) and math.isfinite(connection.offset)):
             raise CouplingError(f"The transformation from {source} to {target} must be finite.")
-        if not (source.component or target.component):
-            raise CouplingError(said("coupling.two_connectors", source=source, target=target))
-        causalities: tuple[str, ...] = ("input",)
+        if not source.component and not target.component:
+            raise CouplingError(
+                f"The connection from {source} to {target} joins two connectors of the system; one "
+                "end must be a component."
+            )
+        source_info = self._source(connection)
+        target_info = self._target(connection, source_info)
+        conversion = self._conversion(connection, source_info, target_info)
+        if source.component and target.component:
+            self.feeds[target] = ConnectedVariable(source, conversion, connection.delayed)
+            return
+        if source.component:
+            connector, component_end = target.variable, source
+        else:
+            connector, component_end = source.variable, target
+        port = ConnectedVariable(component_end, conversion, connection.delayed)
+        self.ends[connector] += (port,)
+        if self.units[connector] is None:
+            unit = target_info.unit if source_info.unit is None else source_info.unit
+            self.units[connector] = unit
+
+    def _source(self, connection: Connection) -> VariableInfo:
+        """Return the variable or connector at the source of a connection, if it can be one."""
+        source = connection.source
         if source.component:
             needed = "an output of a single number is needed"
-            gives = self._single(source, READABLE, "the source of a connection", needed)
-        else:
-            gives = self._connector(source, ("input", "parameter"), "the source")
-            causalities = tuple(dict.fromkeys([gives.causality, "input"]))
-            if connection.delayed:
-                raise CouplingError(f"The connection from the input {source} cannot be delayed.")
-        if target.component:
-            needed = f"a single number is needed as {' or '.join(causalities)}"
-            takes = self._single(target, causalities, "the target of this connection", needed)
-        else:
-            takes = self._connector(target, ("output",), "the target")
-        own, other = (source, target) if source.component else (target, source)
-        port = ConnectedVariable(own, self._converted(connection, gives, takes), connection.delayed)
-        if other.component:
-            self.feeds[target] = port
-            return
-        self.ends[other.variable] += (port,)
-        if self.units[other.variable] is None:
-            self.units[other.variable] = takes.unit if gives.unit is None else gives.unit
+            return self._single(source, READABLE, "the source of a connection", needed)
+        connector = self._connector(source, ("input", "parameter"), "the source")
+        if connection.delayed:
+            raise CouplingError(f"The connection from the input {source} cannot be delayed.")
+        return connector
 
-    def _single(self, end: Endpoint, causalities: tuple[str, ...], what: str, needed: str) -> VariableInfo:
-        """Return the variable at an end, which must be a single number of one of these causalities."""
+    def _target(self, connection: Connection, source_info: VariableInfo) -> VariableInfo:
+        """Return the variable or connector at the target of a connection, if it can be one.
+
+        A parameter of the system may go to parameters and inputs, everything else to inputs.
+        """
+        target = connection.target
+        if not target.component:
+            return self._connector(target, ("output",), "the target")
+        causalities: tuple[str, ...] = ("input",)
+        if not connection.source.component and source_info.causality != "input":
+            causalities = (source_info.causality, "input")
+        needed = f"a single number is needed as {' or '.join(causalities)}"
+        return self._single(target, causalities, "the target of this connection", needed)
+
+    def _single(
+        self, end: Endpoint, causalities: tuple[str, ...], role: str, needed: str
+    ) -> VariableInfo:
+        """Return the variable at an end, which must be a single number of one of these causalities.
+
+        Parameters
+        ----------
+        end : Endpoint
+            The end.
+        causalities : tuple of str
+            The causalities that the variable may have.
+        role, needed : str
+            The role of the end, and what is needed there, for the message.
+        """
         variable = self.variable(end)
         if variable.causality not in causalities or not variable.single:
-            raise CouplingError(said("coupling.causality", end=end, what=what, found=variable, needed=needed))
+            raise CouplingError(
+                f"{end} cannot be {role}: it is declared as {variable.causality} of the type "
+                f"{variable.kind}, and {needed}."
+            )
         return variable
 
-    def _converted(self, connection: Connection, gives: VariableInfo, takes: VariableInfo) -> Conversion:
-        """Return what becomes of a value on its way, if the types of both ends fit."""
-        source, target, own = connection.source, connection.target, connection.scale
-        if gives.kind and takes.kind:
-            if takes.base_type not in _FITS[gives.base_type]:
-                ends = f"{source} is of the type {gives.kind} and cannot feed {target}"
-                raise CouplingError(said("coupling.types", ends=ends, takes=takes))
-            if own != IDENTITY and takes.base_type != "Real":
-                raise CouplingError(said("coupling.scaled", source=source, target=target, takes=takes))
-        if not connection.convert_units:
-            return own
-        unit = between(gives.unit, self._definitions(source), takes.unit, self._definitions(target))
-        if unit is None:
-            raise CouplingError(said("coupling.units", source=source, gives=gives, to=target, takes=takes))
-        return unit.then(own)
+    def _conversion(
+        self, connection: Connection, source_info: VariableInfo, target_info: VariableInfo
+    ) -> Conversion:
+        """Return the conversion of a value between the ends of a connection.
 
-    def _definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
+        Raises
+        ------
+        CouplingError
+            If their types or units do not fit.
+        """
+        source, target, scale = connection.source, connection.target, connection.scale
+        both_have_types = source_info.kind != "" and target_info.kind != ""  # connectors have none
+        if both_have_types:
+            if target_info.base_type not in _TARGET_TYPES[source_info.base_type]:
+                raise CouplingError(
+                    f"{source} is of the type {source_info.kind} and cannot feed {target}, which "
+                    f"is of the type {target_info.kind}."
+                )
+            if scale != IDENTITY and target_info.base_type != "Real":
+                raise CouplingError(
+                    f"The connection from {source} to {target} has a linear transformation, but "
+                    f"{target} is of the type {target_info.kind}; only real numbers can be scaled."
+                )
+        if not connection.convert_units:
+            return scale
+        unit_conversion = between(
+            source_info.unit,
+            self._unit_definitions(source),
+            target_info.unit,
+            self._unit_definitions(target),
+        )
+        if unit_conversion is None:
+            raise CouplingError(
+                f"{source} is in {source_info.unit!r} and {target} in {target_info.unit!r}, and "
+                "there is no conversion between the two; correct the connection, or suppress the "
+                "conversion of units."
+            )
+        return unit_conversion.then(scale)
+
+    def _unit_definitions(self, end: Endpoint) -> tuple[UnitInfo, ...]:
         return self.declared[end.component].units if end.component else self.structure.units
 
     # ------------------------------------------------------------------ parameters
 
     def _settings(self, component: Component, leave_out_unknown: bool) -> dict[str, float | str]:
+        """Return the checked parameters and start values of a component, in the FMU's units.
+
+        Parameters
+        ----------
+        component : Component
+            The component.
+        leave_out_unknown : bool
+            Whether those of unknown variables are added to `left_out` instead of refused.
+        """
         if component.substeps < 1:
-            raise CouplingError(said("coupling.substeps", component=component))
+            raise CouplingError(
+                f"The component {component.name!r} needs at least one step in a step of the system."
+            )
         settings: dict[str, float | str] = {}
         for name, setting in component.settings.items():
             if leave_out_unknown and self.declared[component.name].variable(name) is None:
@@ -388,8 +355,15 @@ class Wiring:
                 settings[name] = self.start_value(Endpoint(component.name, name), setting)
         return settings
 
-    def start_value(self, end: Endpoint, setting: Setting) -> float | str:
-        """Return a parameter or start value: a number in the FMU's unit, or the text of a text parameter.
+    def start_value(self, end: Endpoint, setting: ComponentSetting) -> float | str:
+        """Return a parameter or start value, as a number in the FMU's unit or as a text.
+
+        Parameters
+        ----------
+        end : Endpoint
+            The component and its variable.
+        setting : ComponentSetting
+            The value that a user gives.
 
         Raises
         ------
@@ -401,38 +375,76 @@ class Wiring:
             return self._start_number(end, variable, setting)
         if not isinstance(setting.value, str):
             raise CouplingError(
-                said("coupling.setting", end=end, value=setting.value, found=variable, wanted="a text")
+                f"{end} cannot be set to {setting.value!r}: it is of the type {variable.kind}, and "
+                "takes a text."
             )
         return setting.value
 
-    def _start_number(self, end: Endpoint, variable: VariableInfo, setting: Setting) -> float:
-        """Return a parameter or start value as a number in the FMU's unit."""
-        if variable.causality not in ("parameter", "input") and not variable.startable:
-            raise CouplingError(f"{end} cannot be set: it is declared as {variable.causality}.")
-        if not variable.single:
-            text = f"is of the type {variable.kind}"
-            what = "is an array" if variable.shape else "changes with a clock" if variable.clocked else text
-            raise CouplingError(f"{end} cannot be set: it {what}; only single numbers are set in a system.")
-        value, own = setting.value, self.declared[end.component].units
+    def _start_number(
+        self, end: Endpoint, variable: VariableInfo, setting: ComponentSetting
+    ) -> float:
+        """Return a parameter or start value as a number in the FMU's unit; see `start_value`."""
+        _check_settable_number(end, variable)
+        value = setting.value
+        if isinstance(value, str) and value in variable.items:
+            return float(variable.items[value])
         if isinstance(value, str | bytes):
-            if isinstance(value, str) and value in variable.items:
-                return float(variable.items[value])
-            wanted = variable.items or "a number"
-            raise CouplingError(said("coupling.setting", end=end, value=value, found=variable, wanted=wanted))
-        units = (*setting.units, *self.structure.units, *own)
-        conversion = between(setting.unit, units, variable.unit, own)
+            accepted = comma_list(variable.items) if variable.items else "a number"
+            raise CouplingError(
+                f"{end} cannot be set to {value!r}: it is of the type {variable.kind}, and takes "
+                f"{accepted}."
+            )
+        fmu_units = self.declared[end.component].units
+        known_units = (*setting.units, *self.structure.units, *fmu_units)
+        conversion = between(setting.unit, known_units, variable.unit, fmu_units)
         if conversion is None:
-            raise CouplingError(said("coupling.setting_unit", end=end, setting=setting, variable=variable))
+            raise CouplingError(
+                f"{end} is given in {setting.unit!r}, but it is in {variable.unit!r}, and there is "
+                "no conversion between the two."
+            )
         number = conversion.then(setting.scale).to_fmu(float(value))
-        if variable.kind == "Boolean":
-            fits = value in (0, 1)
-        else:
-            whole = variable.base_type == "Real" or number.is_integer()
-            fits = whole and math.isfinite(number) and not isinstance(value, bool)
-        if not fits:
-            raise CouplingError(f"{end} cannot be set to {value!r}: it is of the type {variable.kind}.")
+        if not _fits_type(variable, value, number):
+            raise CouplingError(
+                f"{end} cannot be set to {value!r}: it is of the type {variable.kind}."
+            )
         if variable.items and number not in variable.items.values():
             raise CouplingError(
                 f"{end} cannot be set to {value!r}: it is an enumeration of {variable.item_list}."
             )
         return number
+
+
+def _check_settable_number(end: Endpoint, variable: VariableInfo) -> None:
+    """Refuse a variable that cannot be set before the start, or is not a single number."""
+    if variable.causality not in ("parameter", "input") and not variable.startable:
+        raise CouplingError(f"{end} cannot be set: it is declared as {variable.causality}.")
+    if variable.single:
+        return
+    if variable.shape:
+        obstacle = "is an array"
+    elif variable.clocked:
+        obstacle = "changes with a clock"
+    else:
+        obstacle = f"is of the type {variable.kind}"
+    raise CouplingError(
+        f"{end} cannot be set: it {obstacle}; only single numbers are set in a system."
+    )
+
+
+def _fits_type(variable: VariableInfo, value: float | bool, number: float) -> bool:
+    """Return whether a value is of the type of a variable.
+
+    Parameters
+    ----------
+    variable : VariableInfo
+        The variable.
+    value : float or bool
+        The value that a user gives.
+    number : float
+        The value in the unit of the variable.
+    """
+    if variable.kind == "Boolean":
+        return value in (0, 1)
+    if isinstance(value, bool) or not math.isfinite(number):
+        return False
+    return variable.base_type == "Real" or number.is_integer()

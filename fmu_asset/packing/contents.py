@@ -1,17 +1,8 @@
-"""What all FMUs that are built here have in common, and packing one of a Python script for pythonfmu.
+"""The parts that all FMUs built here have in common.
 
-The files of an FMU are first written with a placeholder wherever its content hash will stand (identifier,
-GUID, module names). The hash is taken over them, and then fills the places.
-
-pythonfmu's own builder takes the same scripts, but leaves out units and ranges, and stamps a time and a
-random GUID, so that no two builds are alike. Here equal scripts give equal bytes. A script may say more in
-two class attributes, both optional:
-
-- `unit_table`: for each unit its exponents of `kg, m, s, A, K, mol, cd, rad`, a `factor` and an `offset` to
-  them (1 and 0 by default), and `displays`, the factors of display units;
-- `variable_table`: for each variable causality, unit, least, largest and start value (or None), and meaning.
-
-The script runs once in this process, to be asked for its variables.
+The files of an FMU are first written with a placeholder wherever its content hash will stand
+(identifier, GUID, module names). The hash is taken over them, and then takes the place of the
+placeholder.
 """
 
 import os
@@ -20,32 +11,35 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, distribution, version
 from importlib.resources import files
 from pathlib import Path
-from runpy import run_path
-from typing import Any
+from typing import NamedTuple
 from uuid import UUID
-from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from fe.runtime.arrays import archive_bytes
 from fmu_asset.description import PLACEHOLDER, Declaration, description_members, rendered
-from fmu_asset.errors import FmuBuildError, FmuError, said
+from fmu_asset.errors import FmuBuildError, FmuError
 from fmu_asset.slaves.variables import FmuVariable
 from reporting.files import atomic_write_bytes, hash_members, read_members
-from reporting.text_file import read_bytes
-from reporting.units import BASE_UNITS
 
 PYTHONFMU_VERSION = "0.7.0"
-"""The only version whose wrapper these FMUs were tried with; its conventions are not a public interface."""
+"""The only version whose wrapper these FMUs were tried with; its conventions are not public."""
 
 BASE_CLASS_FILES = (
-    "_version.py", "default_experiment.py", "enums.py", "fmi2slave.py", "logmsg.py", "variables.py",
-)  # fmt: skip
+    "_version.py",
+    "default_experiment.py",
+    "enums.py",
+    "fmi2slave.py",
+    "logmsg.py",
+    "variables.py",
+)
 """Files of pythonfmu that its base class needs."""
+
 _TEXT_SUFFIXES = (".py", ".xml", ".txt", ".html", ".json", ".c", ".h")
-# Where the GUID itself stands, between these two; elsewhere the placeholder stands for the tag.
-_GUID_PLACES = {
+
+_GUID_PATTERNS = {
     "modelDescription.xml": ('guid="{}"', 'instantiationToken="{}"'),
     "sources/structure_variables.h": ('STRUCTURE_GUID "{}"',),
 }
+"""Texts in which the placeholder stands for the GUID; elsewhere it stands for the tag."""
 
 
 @dataclass(frozen=True)
@@ -57,11 +51,11 @@ class FmuInfo:
     path : Path
         The file.
     guid : str
-        GUID, from the content hash.
+        The GUID, which follows from the content.
     design_hash : str
-        Hash of the design that made the reduced model; empty where there is none.
+        The hash of the design that the reduced model was made of; empty if there is none.
     size : int
-        Bytes of the file.
+        The size of the file [bytes].
     """
 
     path: Path
@@ -70,46 +64,94 @@ class FmuInfo:
     size: int
 
 
+class SealedFmu(NamedTuple):
+    """The bytes of an FMU file, and the GUID that follows from its content."""
+
+    content: bytes
+    guid: str
+
+
+class ContentIdentity(NamedTuple):
+    """The two texts that identify the content of an FMU.
+
+    Attributes
+    ----------
+    tag : str
+        The first characters of the content hash, which end the names in the FMU.
+    guid : str
+        The GUID of the FMU.
+    """
+
+    tag: str
+    guid: str
+
+
+UNKNOWN_IDENTITY = ContentIdentity(tag=PLACEHOLDER, guid=PLACEHOLDER)
+"""The identity of files whose content hash is not known yet."""
+
+
 def checked_target(
     path: str | os.PathLike[str],
     *,
     replace: bool,
-    what: str = "An FMU",
+    file_kind: str = "An FMU",
     suffix: str = ".fmu",
     error: type[FmuError] = FmuBuildError,
 ) -> Path:
-    """Return where an FMU, or something else with a suffix of its own, may be written.
+    """Return the path at which an FMU, or a file with another suffix, may be written.
+
+    Parameters
+    ----------
+    path : path-like
+        Where to write.
+    replace : bool
+        Whether an existing file may be replaced.
+    file_kind : str
+        What is written, with its article, for the message.
+    suffix : str
+        The suffix that the path must have.
+    error : type of FmuError
+        The error to raise.
 
     Raises
     ------
-    error
+    FmuError
         If the suffix is wrong, or the file exists and may not be replaced.
     """
     target = Path(path)
     if target.suffix != suffix:
-        raise error(f"{what} must have the suffix {suffix}, but {target} was given.")
+        raise error(f"{file_kind} must have the suffix {suffix}, but {target} was given.")
     if target.exists() and not replace:
-        raise error(said("packing.exists", target=target))
+        raise error(
+            f"{target} exists: choose another --out or give --replace, in Python another path or "
+            "replace."
+        )
     return target
 
 
-def write_fmu(target: Path, packed: tuple[bytes, str], design_hash: str = "") -> FmuInfo:
-    """Write what `sealed` returned, whole or not at all, and say what it is."""
-    content, guid = packed
-    atomic_write_bytes(target, content)
-    return FmuInfo(target, guid, design_hash, len(content))
+def write_fmu(target: Path, fmu: SealedFmu, design_hash: str = "") -> FmuInfo:
+    """Write an FMU to a file, whole or not at all, and return what was written."""
+    atomic_write_bytes(target, fmu.content)
+    return FmuInfo(path=target, guid=fmu.guid, design_hash=design_hash, size=len(fmu.content))
 
 
-def check_start(table: Iterable[FmuVariable]) -> None:
-    """Refuse start values outside their ranges; raises `FmuBuildError`."""
-    for row in table:
-        low = -float("inf") if row.minimum is None else row.minimum
-        high = float("inf") if row.maximum is None else row.maximum
-        if row.start is not None and not low <= row.start <= high:
-            advice = "the reduced model; give another state or build a model with a wider range"
-            if row.variability == "tunable":
-                advice = "that number of an effect; correct the patch"
-            raise FmuBuildError(said("packing.start", row=row, low=low, high=high, advice=advice))
+def check_start_values(table: Iterable[FmuVariable]) -> None:
+    """Refuse variables whose start value lies outside their range; raises `FmuBuildError`."""
+    for variable in table:
+        low = -float("inf") if variable.minimum is None else variable.minimum
+        high = float("inf") if variable.maximum is None else variable.maximum
+        if variable.start is None or low <= variable.start <= high:
+            continue
+        if variable.variability == "tunable":
+            range_and_remedy = "that number of an effect; correct the patch"
+        else:
+            range_and_remedy = (
+                "the reduced model; give another state or build a model with a wider range"
+            )
+        raise FmuBuildError(
+            f"The start value {variable.start:g} of {variable.name} lies outside {low:g} to "
+            f"{high:g}, the range of {range_and_remedy}."
+        )
 
 
 # ---------------------------------------------------------------- pythonfmu
@@ -128,21 +170,24 @@ def pythonfmu_version() -> str:
     except PackageNotFoundError:
         installed = "none"
     if installed != PYTHONFMU_VERSION:
-        raise FmuBuildError(said("packing.pythonfmu", needed=PYTHONFMU_VERSION, installed=installed))
+        raise FmuBuildError(
+            f"Building an FMU needs pythonfmu {PYTHONFMU_VERSION}, but {installed} is installed; "
+            "install the project's requirements."
+        )
     return installed
 
 
 def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[str, bytes]:
-    """Return the files that pythonfmu gives to an FMU, by their places in the archive.
+    """Return the files of pythonfmu that an FMU contains, by their names in the archive.
 
     Parameters
     ----------
     module : str
         The FMU's identifier, also the name of its binaries and of the script that they load.
     folder : str
-        Where the Python files go.
+        The folder of the archive for the Python files.
     names : iterable of str
-        Python files that are needed.
+        The Python files that are needed.
 
     Raises
     ------
@@ -150,233 +195,142 @@ def pythonfmu_members(module: str, folder: str, names: Iterable[str]) -> dict[st
         If a file is missing from the installation.
     """
     # As installed, not as imported: an FMU in this process may have brought a pythonfmu of its own.
-    wrapper = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
-    binaries = wrapper / "resources" / "binaries"
-    return {
-        f"binaries/linux64/{module}.so": (binaries / "linux64/libpythonfmu-export.so").read_bytes(),
-        f"binaries/win64/{module}.dll": (binaries / "win64/pythonfmu-export.dll").read_bytes(),
-        "documentation/licenses/pythonfmu.txt": _licence("pythonfmu"),
+    package_folder = Path(str(distribution("pythonfmu").locate_file("pythonfmu")))
+    binaries = package_folder / "resources" / "binaries"
+    linux_binary = (binaries / "linux64/libpythonfmu-export.so").read_bytes()
+    windows_binary = (binaries / "win64/pythonfmu-export.dll").read_bytes()
+    members = {
+        f"binaries/linux64/{module}.so": linux_binary,
+        f"binaries/win64/{module}.dll": windows_binary,
+        "documentation/licenses/pythonfmu.txt": _license("pythonfmu"),
         "resources/slavemodule.txt": module.encode(),
-        **{f"{folder}/{name}": (wrapper / name).read_bytes() for name in names},
     }
+    for name in names:
+        members[f"{folder}/{name}"] = (package_folder / name).read_bytes()
+    return members
 
 
-def room_members(room: str, folder: str) -> dict[str, bytes]:
-    """Return all Python files of a room of the project, by their places in the archive.
+def package_members(package: str, folder: str) -> dict[str, bytes]:
+    """Return all Python files of a package of the project, by their names in the archive.
 
     Parameters
     ----------
-    room : str
-        A package that imports nothing of the project but itself, rooms packed beside it by `..`, and
-        `fe.runtime`, which is packed beside it as `fe`.
+    package : str
+        A package that imports nothing of the project but itself, packages packed beside it by `..`,
+        and `fe.runtime`, which is packed beside it as `fe`.
     folder : str
-        Where it goes.
+        The folder of the archive for the package.
     """
-    members = read_members(Path(str(files(room))), [".py"])
-    return {
-        f"{folder}/{name}": content.replace(b"from fe.runtime", b"from ..fe")
-        for name, content in members.items()
-    }
+    packed = {}
+    for name, content in read_members(Path(str(files(package))), [".py"]).items():
+        packed[f"{folder}/{name}"] = content.replace(b"from fe.runtime", b"from ..fe")
+    return packed
 
 
-def _licence(package: str) -> bytes:
-    found = [entry for entry in distribution(package).files or () if entry.name == "LICENSE"]
-    if not found:
-        raise FmuBuildError(f"The licence of {package} is missing from its installation; install it again.")
-    return Path(str(found[0].locate())).read_bytes()
+def _license(package: str) -> bytes:
+    """Return the text of an installed package's licence."""
+    for file in distribution(package).files or ():
+        if file.name == "LICENSE":
+            return Path(str(file.locate())).read_bytes()
+    raise FmuBuildError(
+        f"The licence of {package} is missing from its installation; install it again."
+    )
 
 
 def python_members(
-    declared: Declaration,
+    declaration: Declaration,
     class_name: str,
     *,
     imports: str,
     resources: Mapping[str, bytes],
     host: str = "It runs in a Python host that has NumPy.",
 ) -> dict[str, bytes]:
-    """Return the files of the archive, with the placeholder wherever the content hash will stand.
+    """Return the files of a Python FMU, with the placeholder wherever the content hash will stand.
 
     Parameters
     ----------
-    declared : Declaration
+    declaration : Declaration
         The model.
     class_name : str
-        Of the class in the FMU's script, to which the tag is added.
+        The name of the class in the FMU's script, to which the tag is added.
     imports : str
-        Lines that import `load_contents` into the runtime's package.
+        Lines that import `load_contents` into the package that the FMU brings.
     resources : mapping of str to bytes
-        What `load_contents` reads, by its names.
+        The files that `load_contents` reads, by name.
     host : str
-        What the FMU runs in, for its documentation.
+        A sentence on the host that the FMU needs, for its documentation.
     """
-    module = declared.identifier
+    module = declaration.identifier
     runtime = f"resources/{module}_runtime"
-    names = {"module": module, "class_name": f"{class_name}{PLACEHOLDER}", "tag": PLACEHOLDER}
     tool = f"uav-twin with PythonFMU {pythonfmu_version()}"
-    return {
-        **description_members(declared, generation_tool=tool, host=host),
-        **{f"resources/{file}": content for file, content in resources.items()},
-        f"resources/{module}.py": rendered("slave.py", **names),
-        f"{runtime}/__init__.py": b'"""An FMU of uav-twin."""\n',
-        f"{runtime}/entry.py": rendered("entry.py", imports=imports),
-        f"{runtime}/pythonfmu/__init__.py": b'"""The base class of pythonfmu."""\n',
-        **room_members("fmu_asset.slaves", f"{runtime}/slaves"),
-        **pythonfmu_members(module, f"{runtime}/pythonfmu", BASE_CLASS_FILES),
-    }
+    members = description_members(declaration, generation_tool=tool, host=host)
+    for file, content in resources.items():
+        members[f"resources/{file}"] = content
+    members[f"resources/{module}.py"] = rendered(
+        "slave.py", module=module, class_name=f"{class_name}{PLACEHOLDER}", tag=PLACEHOLDER
+    )
+    members[f"{runtime}/__init__.py"] = b'"""An FMU of uav-twin."""\n'
+    members[f"{runtime}/entry.py"] = rendered("entry.py", imports=imports)
+    members[f"{runtime}/pythonfmu/__init__.py"] = b'"""The base class of pythonfmu."""\n'
+    members |= package_members("fmu_asset.slaves", f"{runtime}/slaves")
+    members |= pythonfmu_members(module, f"{runtime}/pythonfmu", BASE_CLASS_FILES)
+    return members
 
 
 # ---------------------------------------------------------------- content hash
 
 
-def guid_of(content_hash: str) -> str:
-    """Return the GUID that a content hash gives."""
+def guid_of_hash(content_hash: str) -> str:
+    """Return the GUID for a content hash, its first 32 hexadecimal digits in braces."""
     return f"{{{UUID(content_hash[:32])}}}"
 
 
 def sealed(
-    template: Mapping[str, bytes], binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None
-) -> tuple[bytes, str]:
-    """Return the archive of the files, tag and GUID in the place of the placeholder, and the GUID.
+    template: Mapping[str, bytes],
+    make_binaries: Callable[[dict[str, bytes], str], dict[str, bytes]] | None = None,
+) -> SealedFmu:
+    """Return an FMU whose tag and GUID follow from its content.
 
-    The hash is over names and contents, the placeholder standing for the hash itself.
+    The hash is over names and contents of the files, the placeholder standing for the hash itself.
 
     Parameters
     ----------
     template : mapping of str to bytes
-        The files, by name.
-    binaries : callable, optional
-        Makes further files of these and of the tag; they are not part of the hash.
+        The files by name, with the placeholder.
+    make_binaries : callable, optional
+        Makes further files from the files and the tag; they are not part of the hash.
     """
     content_hash = hash_members(template)
-    tag, guid = content_hash[: len(PLACEHOLDER)], guid_of(content_hash)
-    members = exchanged(template, (PLACEHOLDER, PLACEHOLDER), (tag, guid))
-    further = {} if binaries is None else binaries(members, tag)
-    return archive_bytes(members | further, "modelDescription.xml"), guid
+    tag = content_hash[: len(PLACEHOLDER)]
+    identity = ContentIdentity(tag=tag, guid=guid_of_hash(content_hash))
+    members = with_identity(template, UNKNOWN_IDENTITY, identity)
+    if make_binaries is not None:
+        members |= make_binaries(members, tag)
+    return SealedFmu(archive_bytes(members, "modelDescription.xml"), identity.guid)
 
 
-def exchanged(members: Mapping[str, bytes], old: tuple[str, str], new: tuple[str, str]) -> dict[str, bytes]:
-    """Return files with the new tag and GUID in the place of the old ones, in names and texts."""
-
-    def text(name: str, data: bytes) -> bytes:
-        if not name.endswith(_TEXT_SUFFIXES):
-            return data
-        for place in _GUID_PLACES.get(name, ()):
-            data = data.replace(place.format(old[1]).encode(), place.format(new[1]).encode())
-        return data.replace(old[0].encode(), new[0].encode())
-
-    return {name.replace(old[0], new[0]): text(name, data) for name, data in members.items()}
-
-
-def build_script_fmu(
-    script: str | os.PathLike[str], path: str | os.PathLike[str], *, replace: bool = False
-) -> FmuInfo:
-    """Pack a script as an FMI 2.0 co-simulation FMU; equal scripts give equal bytes.
+def with_identity(
+    members: Mapping[str, bytes], old: ContentIdentity, new: ContentIdentity
+) -> dict[str, bytes]:
+    """Return the files of an FMU with another tag and GUID, in their names and texts.
 
     Parameters
     ----------
-    script : path-like
-        A Python file with one subclass of pythonfmu's `Fmi2Slave`. It may use the standard library and what
-        is installed where the FMU runs.
-    path : path-like
-        Where to write, with the suffix .fmu.
-    replace : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    FmuBuildError
-        The file exists, the suffix is wrong, or the script cannot be packed; the sentence says why.
+    members : mapping of str to bytes
+        The files by name.
+    old, new : ContentIdentity
+        The tag and GUID in the files, and those to be written instead.
     """
-    return write_fmu(checked_target(path, replace=replace), script_fmu(script))
+    renamed = {}
+    for name, content in members.items():
+        text = content
+        if name.endswith(_TEXT_SUFFIXES):
+            for pattern in _GUID_PATTERNS.get(name, ()):
+                old_guid, new_guid = pattern.format(old.guid), pattern.format(new.guid)
+                text = text.replace(old_guid.encode(), new_guid.encode())
+            text = text.replace(old.tag.encode(), new.tag.encode())
+        renamed[name.replace(old.tag, new.tag)] = text
+    return renamed
 
 
-def script_fmu(script: str | os.PathLike[str]) -> tuple[bytes, str]:
-    """Return the archive of a script and its GUID; see `build_script_fmu`."""
-    file = Path(script)
-    if not file.stem.isidentifier() or file.suffix != ".py":
-        raise FmuBuildError(said("script.name", file=file))
-    source = read_bytes(file, FmuBuildError, what="model script")
-    pythonfmu_version()
-    model = _model_class(file)
-    module, name = f"{file.stem}_{PLACEHOLDER}", model.__name__
-    runtime = f"resources/{module}_runtime"
-    members = {
-        "modelDescription.xml": _description(file, model, module),
-        f"resources/{module}.py": rendered("script.py", module=module, name=name, tag=PLACEHOLDER),
-        f"{runtime}/__init__.py": rendered("script_runtime.py"),
-        f"{runtime}/model.py": source,
-    }
-    names = ("__init__.py", "builder.py", "osutil.py", *BASE_CLASS_FILES)
-    return sealed(members | pythonfmu_members(module, "resources/pythonfmu", names))
-
-
-def _model_class(file: Path) -> type[Any]:
-    """Run the script and return the one slave that it defines."""
-    from pythonfmu import Fmi2Slave
-
-    name = f"_uav_twin_script_{file.stem}"
-    try:
-        content = run_path(str(file), run_name=name)  # which leaves nothing beside the user's script
-    except Exception as error:
-        raise FmuBuildError(f"The model script {file} cannot be run: {error!r}.") from error
-    found = [
-        item
-        for item in content.values()
-        if isinstance(item, type) and issubclass(item, Fmi2Slave) and item.__module__ == name
-    ]
-    if len(found) != 1:
-        names = [item.__name__ for item in found]
-        raise FmuBuildError(said("script.slave", file=file, names=names))
-    return found[0]
-
-
-def _description(file: Path, model: type[Any], identifier: str) -> bytes:
-    """Return pythonfmu's model description with units, ranges and initial unknowns, and without the time."""
-    try:
-        root: Any = model(instance_name="description", resources=str(file.parent)).to_xml()
-    except Exception as error:
-        raise FmuBuildError(f"{model.__name__} of {file} cannot be instantiated: {error!r}.") from error
-    tool = f"uav-twin with {root.get('generationTool')}"
-    root.attrib.update(modelName=file.stem, guid=PLACEHOLDER, generationTool=tool)
-    root.attrib.pop("generationDateAndTime", None)
-    interface, variables = root.find("CoSimulation"), root.find("ModelVariables")
-    interface.set("modelIdentifier", identifier)
-    units: Mapping[str, Mapping[str, Any]] = getattr(model, "unit_table", {})
-    if units:
-        root.insert(list(root).index(interface) + 1, _unit_definitions(file, units))
-    _add_ranges(file, variables, getattr(model, "variable_table", {}), units)
-    unknowns = SubElement(root.find("ModelStructure"), "InitialUnknowns")
-    for index, variable in enumerate(variables, 1):
-        if variable.get("causality") == "output":
-            SubElement(unknowns, "Unknown", index=str(index))
-    indent(root)
-    return bytes(tostring(root, encoding="UTF-8", xml_declaration=True)) + b"\n"
-
-
-def _unit_definitions(file: Path, units: Mapping[str, Mapping[str, Any]]) -> Element:
-    definitions = Element("UnitDefinitions")
-    for name, entry in units.items():
-        unknown = sorted({*entry} - {*BASE_UNITS, "factor", "offset", "displays"})
-        if unknown:
-            raise FmuBuildError(said("script.unit", name=name, file=file, entry=unknown[0], known=BASE_UNITS))
-        unit = SubElement(definitions, "Unit", name=name)
-        base = {symbol: str(int(entry[symbol])) for symbol in BASE_UNITS if symbol in entry}
-        base |= {key: repr(float(entry[key])) for key in ("factor", "offset") if key in entry}
-        SubElement(unit, "BaseUnit", base)
-        for display, factor in entry.get("displays", {}).items():
-            SubElement(unit, "DisplayUnit", name=display, factor=repr(float(factor)))
-    return definitions
-
-
-def _add_ranges(
-    file: Path, variables: Any, table: Mapping[str, tuple[Any, ...]], units: Mapping[str, Any]
-) -> None:
-    inner = {str(variable.get("name")): variable[0] for variable in variables}
-    for name, (_, unit, low, high, _, _) in table.items():
-        if name not in inner:
-            raise FmuBuildError(said("script.variable_table", file=file, name=name))
-        if unit is not None and unit not in units:
-            raise FmuBuildError(f"{file} gives {name} in {unit}, which its unit_table does not have.")
-        for key, value in (("unit", unit), ("min", low), ("max", high)):
-            if value is not None:
-                inner[name].set(key, value if isinstance(value, str) else repr(float(value)))
+# ---------------------------------------------------------------- scripts

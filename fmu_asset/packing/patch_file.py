@@ -1,12 +1,12 @@
 """Patch files as an FMU takes them: effects with an id and primitives, channels named as outputs.
 
-The file may hold more (posterior, data hash); what is read here, in the names of
-`discrepancy.files.verdict` or in shorter ones, is
+A patch file says which physical effects a model lacks. It may hold more (posterior, data hash);
+what is read here, in the names of `discrepancy.files.verdict` or in shorter ones, is
 
 ```json
 {"schema": "uav-twin patch 2",
- "effects": [{"id": "gauge_zero_drift", "primitives": [{"kind": "sensor_drift", "channel": "g17", ...}]}],
- "channels": {"g17": "strain[17]"}}
+ "effects": [{"id": "gauge_zero_drift", "primitives": [{"kind": "sensor_drift", "channel": "g17",
+ ...}]}], "channels": {"g17": "strain[17]"}}
 ```
 
 where `id` may also be called `identifier`, and `primitives` `patch`.
@@ -35,30 +35,35 @@ from fe.runtime.patch import (
     SensorLag,
 )
 from fe.runtime.sensors import check_channels
-from fmu_asset.errors import PatchFileError, said
+from fmu_asset.errors import PatchFileError
 from fmu_asset.slaves.effects import output_channels
 from reporting.json_file import parse_json, read_json
+from reporting.words import small
 
 SCHEMA = "uav-twin patch 2"
-"""Value of `schema` in a patch file; files of number 1 are read too."""
+"""Value of `schema` in a patch file."""
+
 FIRST_SCHEMA = "uav-twin patch 1"
+"""Value of `schema` in files of earlier versions, which are read too."""
 
 QUANTITIES = ("", "strain", "displacement")
 """Quantities of outputs that `channel = "*"` may be restricted to."""
 
 _IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_NO_MEANING = {
-    Clock: "inputs and outputs of an FMU belong to the communication points of its master, so there is no "
-    "second clock that could be wrong",
+_HIGH_PASS_ORDERS = (1.0, 2.0, 3.0, 4.0)
+_REASONS_WITHOUT_MEANING = {
+    Clock: "inputs and outputs of an FMU belong to the communication points of its master, so "
+    "there is no second clock that could be wrong",
     LoggerClock: "what an FMU is given carries the time of its master, and nothing is logged",
     SensorLag: "an output is read at its communication point, and none before is kept",
     RunOffset: "an FMU has no runs between which its zero could have moved; a constant offset is a "
     "sensor_drift with exponent 0",
 }
+"""For kinds of primitives that mean nothing in an FMU, the reason."""
 
 
-class Effect(NamedTuple):
-    """One effect of a patch file: an identifier, and the changes that it stands for."""
+class PatchFileEffect(NamedTuple):
+    """An effect of a patch file: an identifier, and the changes of the model that it stands for."""
 
     id: str
     patch: ModelPatch
@@ -66,17 +71,17 @@ class Effect(NamedTuple):
 
 @dataclass(frozen=True)
 class PatchFile:
-    """What an FMU takes of a patch file.
+    """The effects and channels that an FMU takes from a patch file.
 
     Attributes
     ----------
-    effects : tuple of Effect
-        In the order of the file; an id that comes again has `_2`, `_3`, ... appended.
+    effects : tuple of PatchFileEffect
+        The effects in the order of the file; an id that comes again has `_2`, `_3`, ... appended.
     channels : mapping of str to str
-        Outputs by the names of channels.
+        The names of outputs by the names of channels.
     """
 
-    effects: tuple[Effect, ...]
+    effects: tuple[PatchFileEffect, ...]
     channels: Mapping[str, str]
 
     @property
@@ -86,62 +91,105 @@ class PatchFile:
 
     @property
     def of_structure(self) -> PatchFile:
-        """The same without what changes what is read and not what happens."""
-        rest = (Effect(name, patch.without(*SENSORS)) for name, patch in self.effects)
-        return PatchFile(tuple(effect for effect in rest if len(effect.patch)), self.channels)
+        """The patch without the changes of sensors, which do not act on the structure."""
+        effects = []
+        for effect in self.effects:
+            structural_patch = effect.patch.without(*SENSORS)
+            if len(structural_patch):
+                effects.append(PatchFileEffect(effect.id, structural_patch))
+        return PatchFile(tuple(effects), self.channels)
 
     @property
     def plain(self) -> list[dict[str, Any]]:
         """`id` and `primitives` of each effect, as `fmu_asset.slaves.effects` takes them."""
-        return [{"id": name, "primitives": patch.to_list()} for name, patch in self.effects]
+        return [{"id": effect.id, "primitives": effect.patch.to_list()} for effect in self.effects]
 
-    def for_gauges(self, count: int, where: str = "The patch") -> PatchFile:
-        """Return the same with channels replaced by the outputs that they are.
+    def for_gauges(self, gauge_count: int, patch_label: str = "The patch") -> PatchFile:
+        """Return the patch with the names of outputs in the place of channels.
 
         Parameters
         ----------
-        count : int
+        gauge_count : int
             Number of gauges of the wing.
-        where : str
-            What was read, for the error.
+        patch_label : str
+            The name of the patch in messages.
 
         Raises
         ------
         PatchFileError
-            If a channel is no such output, or a primitive has no meaning in an FMU.
+            If a channel is not an output of the FMU, or a primitive has no meaning in an FMU.
         """
-        outputs, found = output_channels(count), []
-        for name, patch in self.effects:
-            label = f"{where}: the effect {name!r}"
-            items = tuple(self._with_output(item, outputs, label) for item in patch)
-            found.append(Effect(name, ModelPatch(items)))
-        return PatchFile(tuple(found), {})
+        outputs = output_channels(gauge_count)
+        effects = []
+        for effect in self.effects:
+            effect_label = f"{patch_label}: the effect {effect.id!r}"
+            primitives = []
+            for primitive in effect.patch:
+                primitives.append(self._with_output(primitive, outputs, effect_label))
+            effects.append(PatchFileEffect(effect.id, ModelPatch(tuple(primitives))))
+        return PatchFile(tuple(effects), {})
 
-    def _with_output(self, item: Primitive, outputs: Sequence[tuple[str, str]], where: str) -> Primitive:
-        label = f"{where} has the primitive {item.kind!r}"
-        for kind, reason in _NO_MEANING.items():
-            if isinstance(item, kind):
-                raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
-        if isinstance(item, HighPass) and item.order not in (1.0, 2.0, 3.0, 4.0):
-            raise PatchFileError(said("patch.high_pass", label=label, item=item))
-        channel, quantity = getattr(item, "channel", EVERY_CHANNEL), getattr(item, "quantity", "")
+    def _with_output(
+        self, primitive: Primitive, outputs: Sequence[tuple[str, str]], effect_label: str
+    ) -> Primitive:
+        """Return a primitive whose channel is an output of the FMU.
+
+        Parameters
+        ----------
+        primitive : Primitive
+            A change of the model, or of a sensor.
+        outputs : sequence of (str, str)
+            Name and quantity of each output of the FMU.
+        effect_label : str
+            The name of the effect in messages.
+
+        Raises
+        ------
+        PatchFileError
+            If there is no such output, or the primitive has no meaning in an FMU.
+        """
+        label = f"{effect_label} has the primitive {primitive.kind!r}"
+        _check_meaning_in_fmu(primitive, label)
+        channel = getattr(primitive, "channel", EVERY_CHANNEL)
+        quantity = getattr(primitive, "quantity", "")
         if channel == EVERY_CHANNEL:
             if quantity not in QUANTITIES:
-                raise PatchFileError(said("patch.every_channel", label=label, quantity=quantity))
-            return item
-        item = replace(item, channel=self.channels.get(channel, channel))  # type: ignore[call-arg]
+                raise PatchFileError(
+                    f"{label} for every channel of {quantity!r}; the outputs of the FMU are "
+                    "strains and displacements."
+                )
+            return primitive
+        output = self.channels.get(channel, channel)
+        primitive = replace(primitive, channel=output)  # type: ignore[call-arg]
         try:
-            check_channels(ModelPatch((item,)), outputs)
-        except InvalidPatchError as cause:
-            why = said("patch.channel", label=label, channel=channel, known=_listed(outputs))
-            raise PatchFileError(why) from cause
-        return item
+            check_channels(ModelPatch((primitive,)), outputs)
+        except InvalidPatchError as error:
+            raise PatchFileError(
+                f"{label} for the channel {channel!r}, which is no output of the FMU that it can "
+                f"act on ({_listed_outputs(outputs)}); name an output, or map the channel to one "
+                "in `channels`."
+            ) from error
+        return primitive
 
 
-def _listed(outputs: Sequence[tuple[str, str]]) -> str:
-    strains = [name for name, quantity in outputs if quantity == "strain"]
-    others = [name for name, quantity in outputs if quantity != "strain"]
-    return ", ".join([*([f"{strains[0]} to {strains[-1]}"] if strains else []), *others])
+def _check_meaning_in_fmu(primitive: Primitive, label: str) -> None:
+    """Refuse a primitive that has no meaning in an FMU, or that an FMU cannot evaluate."""
+    for kind, reason in _REASONS_WITHOUT_MEANING.items():
+        if isinstance(primitive, kind):
+            raise PatchFileError(f"{label}, which has no meaning inside an FMU: {reason}.")
+    if isinstance(primitive, HighPass) and primitive.order not in _HIGH_PASS_ORDERS:
+        raise PatchFileError(
+            f"{label} of order {primitive.order:g}; an FMU remembers whole stages only, order 1 to "
+            "4."
+        )
+
+
+def _listed_outputs(outputs: Sequence[tuple[str, str]]) -> str:
+    """Return the names of outputs for a message, the gauges as a range."""
+    gauges = [name for name, quantity in outputs if quantity == "strain"]
+    names = [f"{gauges[0]} to {gauges[-1]}"] if gauges else []
+    names += [name for name, quantity in outputs if quantity != "strain"]
+    return ", ".join(names)
 
 
 def load_patch(path: str | os.PathLike[str]) -> PatchFile:
@@ -150,50 +198,86 @@ def load_patch(path: str | os.PathLike[str]) -> PatchFile:
     Raises
     ------
     PatchFileError
-        If it cannot be read, is no patch file, or holds something that no patch can hold.
+        If the file cannot be read, is not a patch file, or holds something that no patch can hold.
     """
-    return _of_record(read_json(Path(path), PatchFileError, what="patch file"), f"The patch file {path}")
+    record = read_json(Path(path), PatchFileError, what="patch file")
+    return _patch_of_record(record, f"The patch file {path}")
 
 
-def parse_patch(content: bytes, where: str = "The patch file") -> PatchFile:
-    """Return what the bytes of a patch file say; see `load_patch`."""
-    return _of_record(parse_json(content, where, PatchFileError), where)
+def parse_patch(content: bytes, file_label: str = "The patch file") -> PatchFile:
+    """Return the patch in the bytes of a patch file; see `load_patch`."""
+    return _patch_of_record(parse_json(content, file_label, PatchFileError), file_label)
 
 
-def _of_record(record: Any, where: str) -> PatchFile:
-    if not isinstance(record, dict) or record.get("schema") not in (SCHEMA, FIRST_SCHEMA):
-        came = record.get("schema") if isinstance(record, dict) else type(record).__name__
-        raise PatchFileError(f'{where} must have "schema": "{SCHEMA}", but has {came!r}.')
-    rows, channels = record.get("effects"), record.get("channels", {})
+def _patch_of_record(record: object, file_label: str) -> PatchFile:
+    """Return the patch in the JSON of a patch file; the label names the file in messages."""
+    schema = record.get("schema") if isinstance(record, dict) else type(record).__name__
+    if not isinstance(record, dict) or schema not in (SCHEMA, FIRST_SCHEMA):
+        raise PatchFileError(f'{file_label} must have "schema": "{SCHEMA}", but has {schema!r}.')
+    rows = record.get("effects")
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
-        raise PatchFileError(f'{where} must have a list of tables "effects".')
+        raise PatchFileError(f'{file_label} must have a list of tables "effects".')
     if not rows:
-        raise PatchFileError(f"{where} names no effect, so there is nothing to add.")
-    if not isinstance(channels, dict) or not all(isinstance(name, str) for name in channels.values()):
-        raise PatchFileError(f'"channels" in {where[:1].lower() + where[1:]} must map names to outputs.')
-    return PatchFile(_effects(rows, where), channels)
+        raise PatchFileError(f"{file_label} names no effect, so there is nothing to add.")
+    channels = record.get("channels", {})
+    is_mapping = isinstance(channels, dict)
+    if not is_mapping or not all(isinstance(output, str) for output in channels.values()):
+        raise PatchFileError(f'"channels" in {small(file_label)} must map names to outputs.')
+    return PatchFile(_read_effects(rows, file_label), channels)
 
 
-def _effects(rows: list[dict[str, Any]], where: str) -> tuple[Effect, ...]:
-    effects: list[Effect] = []
-    taken: set[str] = set()
+def _read_effects(
+    rows: Sequence[Mapping[str, Any]], file_label: str
+) -> tuple[PatchFileEffect, ...]:
+    """Return the effects of a patch file, each under an id of its own."""
+    effects: list[PatchFileEffect] = []
+    taken_ids: set[str] = set()
     for number, row in enumerate(rows, start=1):
-        name = row.get("id", row.get("identifier"))
-        if not isinstance(name, str) or not _IDENTIFIER.fullmatch(name):
-            raise PatchFileError(said("patch.identifier", where=where, number=number, name=name))
-        with PatchFileError.instead_of(InvalidPatchError):
-            patch = ModelPatch.from_list(row.get("primitives", row.get("patch")), f"{where}, effect {name}")
-            for item in patch:
-                if item.windows or item.formula_fields:
-                    raise PatchFileError(said("patch.windows", where=where, name=name, item=item))
-                if isinstance(item, PortForce) and item.magnitude:
-                    item.check()
-        if not len(patch):
-            raise PatchFileError(f"{where}: the effect {name!r} has no primitives.")
-        unique, count = name, 1
-        while unique in taken:
-            count += 1
-            unique = f"{name}_{count}"
-        taken.add(unique)
-        effects.append(Effect(unique, patch))
+        effect = _read_effect(row, number, file_label)
+        unique_id = effect.id
+        occurrence = 1
+        while unique_id in taken_ids:
+            occurrence += 1
+            unique_id = f"{effect.id}_{occurrence}"
+        taken_ids.add(unique_id)
+        effects.append(PatchFileEffect(unique_id, effect.patch))
     return tuple(effects)
+
+
+def _read_effect(row: Mapping[str, Any], number: int, file_label: str) -> PatchFileEffect:
+    """Return an effect of a patch file, under the id that the file gives it.
+
+    Parameters
+    ----------
+    row : mapping
+        The effect in JSON.
+    number : int
+        Its number in the file, from 1.
+    file_label : str
+        The name of the file in messages.
+
+    Raises
+    ------
+    PatchFileError
+        If the effect has no id or no primitives, or an FMU cannot carry one of them.
+    """
+    effect_id = row.get("id", row.get("identifier"))
+    if not isinstance(effect_id, str) or not _IDENTIFIER.fullmatch(effect_id):
+        raise PatchFileError(
+            f'{file_label}: the "id" of effect {number} must be letters, digits and underscores, '
+            f"but is {effect_id!r}."
+        )
+    primitives = row.get("primitives", row.get("patch"))
+    with PatchFileError.instead_of(InvalidPatchError):
+        patch = ModelPatch.from_list(primitives, f"{file_label}, effect {effect_id}")
+        for primitive in patch:
+            if primitive.windows or primitive.formula_fields:
+                raise PatchFileError(
+                    f"{file_label}: the effect {effect_id!r} is bound to the time of trials "
+                    f"({primitive.kind}), which means nothing in an FMU: leave it out."
+                )
+            if isinstance(primitive, PortForce) and primitive.magnitude:
+                primitive.check()
+    if not len(patch):
+        raise PatchFileError(f"{file_label}: the effect {effect_id!r} has no primitives.")
+    return PatchFileEffect(effect_id, patch)

@@ -1,8 +1,8 @@
-"""From a wing design or any reduced model to an FMU of FMI 2.0 or 3.0, reproducible to the byte.
+"""Packing a wing or any reduced structure as an FMU of FMI 2.0 or 3.0, reproducible to the byte.
 
-What goes into the compiled kind is in `compiled`. Of the Python kind, slave base class and binaries are
-pythonfmu's; the archive is packed here and not by its builder, which stamps times, a random GUID and module
-names that two FMUs in one process would share.
+The content of the compiled kind is made in `fmu_asset.compiled`. The Python kind has the slave base
+class and the binaries of pythonfmu; its archive is packed here and not by pythonfmu's builder,
+which stamps times, a random GUID, and module names that two FMUs in one process would share.
 """
 
 import json
@@ -10,7 +10,7 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping, Sequence
-from dataclasses import replace as changed
+from dataclasses import replace as dataclass_copy
 from typing import Any, Literal, TypedDict, Unpack, get_args
 
 from fe.reduction.model_cache import patch_arrays, reduced_model
@@ -23,19 +23,24 @@ from fe.runtime.sensors import needs_structure
 from fe.runtime.state import DigitalState
 from fe.wing.design import WingDesign
 from fmu_asset.archive.fmu_file import DESIGN_RECORD, design_record
-from fmu_asset.compiled.package import (
-    DATA_FILE,
-    PLATFORM,
-    FmiVersion,
-    Platform,
-    binaries_of,
-    compiled_members,
-    find_compiler,
-)
+from fmu_asset.compiled.compiler import PLATFORM, Platform, find_compiler
+from fmu_asset.compiled.package import DATA_FILE, FmiVersion, compiled_binaries, compiled_members
 from fmu_asset.description import PLACEHOLDER, Declaration
-from fmu_asset.errors import FmuBuildError, PatchFileError, said
+from fmu_asset.errors import FmuBuildError, PatchFileError
 from fmu_asset.instances.plan import Interface
-from fmu_asset.packing import contents
+from fmu_asset.packing.contents import (
+    UNKNOWN_IDENTITY,
+    ContentIdentity,
+    FmuInfo,
+    check_start_values,
+    checked_target,
+    guid_of_hash,
+    package_members,
+    python_members,
+    sealed,
+    with_identity,
+    write_fmu,
+)
 from fmu_asset.slaves.effects import effect_rows, switch_name
 from fmu_asset.slaves.table import is_wing, structure_table
 from reporting.choices import require_one_of
@@ -47,18 +52,19 @@ from .patch_file import PatchFile
 FmuKind = Literal["python", "compiled", "source"]
 """Run by Python, compiled for this machine, or the sources of the compiled one alone."""
 
-_OF_THE_WING = (
-    "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite element model "
-    "under load factor and tip force, with regions that can lose stiffness."
+_WING_DESCRIPTION = (
+    "Structure of a UAV half-wing: strains, tip displacement and modes from a reduced finite "
+    "element model under load factor and tip force, with regions that can lose stiffness."
 )
-_OF_A_STRUCTURE = (
-    "Structure {}: strains, displacements, accelerations and modes from a reduced finite element model under "
-    "its loads, with regions that can lose stiffness."
+_STRUCTURE_DESCRIPTION = (
+    "Structure {}: strains, displacements, accelerations and modes from a reduced finite element "
+    "model under its loads, with regions that can lose stiffness."
 )
+_LONGEST_STEM = 40
 
 
 class FmuOptions(TypedDict, total=False):
-    """What may be said of an FMU to be packed, see `build_fmu`."""
+    """Options of an FMU to be packed; see `build_fmu`."""
 
     state: DigitalState | None
     start: Mapping[str, float] | None
@@ -74,98 +80,145 @@ class FmuOptions(TypedDict, total=False):
 
 
 def build_fmu(
-    model: ReducedModel, path: str | os.PathLike[str], *, replace: bool = False, **options: Unpack[FmuOptions]
-) -> contents.FmuInfo:
+    model: ReducedModel,
+    path: str | os.PathLike[str],
+    *,
+    replace: bool = False,
+    **options: Unpack[FmuOptions],
+) -> FmuInfo:
     """Pack a reduced model as an FMU; equal input gives equal bytes.
 
     Parameters
     ----------
     model : ReducedModel
-        The wing or structure.
+        The reduced wing or structure.
     path : path-like
         Where to write, with the suffix .fmu.
     state : DigitalState, optional
         Start values of parameters and health of a wing; the nominal ones if absent.
     start : mapping of str to float, optional
-        Start values by variable name that take the place of these.
+        Start values by variable name, which go before those of `state`.
     kind : {"python", "compiled", "source"}
-        What evaluates the model: Python in the host, C compiled now, or C to be compiled elsewhere.
+        How the model is evaluated: by Python in the host, by C that is compiled now, or by C that
+        is compiled elsewhere.
     note : str
-        Added to the description, such as what the wing was calibrated with; XML text without control
-        characters.
+        Added to the description, such as what the wing was calibrated with; XML text without
+        control characters.
     resources : mapping of str to bytes, optional
         Further files of the archive's folder `resources`, by name.
     patch : PatchFile, optional
-        Missing effects that the FMU is to carry as tunable parameters.
+        Missing effects that the FMU carries as tunable parameters.
     activate : bool
-        Whether these are switched on from the start.
+        Whether these effects are switched on from the start.
     arrays : PatchArrays, optional
-        The wing in the basis for patches (`fe.reduction.model_cache.patch_arrays`); needed where an effect
-        changes structure or loads, or turns a gauge.
+        The wing in the basis for patches (`fe.reduction.model_cache.patch_arrays`); needed where an
+        effect changes structure or loads, or turns a gauge.
     fmi : {2, 3}
         Version of FMI; 3 for the kinds in C.
     interface : {"co-simulation", "model-exchange"}
-        How it is run; model exchange (the modes as states) for the kinds in C.
+        The interface of the FMU; model exchange (the modes are states) for the kinds in C.
     platforms : sequence of {"linux64", "win64"}
-        What the binaries of a compiled one are for; the latter needs a cross compiler.
+        The platforms of a compiled FMU's binaries; win64 needs a cross compiler.
     replace : bool
         Whether an existing file may be replaced.
 
     Raises
     ------
     FmuBuildError
-        If the file exists, the suffix is wrong, a start value is of no variable or lies outside the model's
-        validity box, a name is taken by a variable of the FMU, a resource would take the place of another
-        file, the kind is not of that version of FMI, the wrong pythonfmu is installed, or there is no C
-        compiler for a compiled one.
+        If the file exists, the suffix is wrong, a start value is of no variable or lies outside the
+        model's validity box, a name is taken by a variable of the FMU, a resource would take the
+        place of another file, the kind is not of that version of FMI, the wrong pythonfmu is
+        installed, or there is no C compiler for a compiled one.
     PatchFileError
         If the FMU cannot carry an effect of the patch.
     InvalidChoiceError
-        If a kind, a version of FMI, an interface or a platform is none of those.
+        If a kind, a version of FMI, an interface or a platform is not one of those above.
     """
-    target = contents.checked_target(path, replace=replace)
-    kind, fmi = options.get("kind", "python"), options.get("fmi", 2)
-    interface, platforms = options.get("interface", "co-simulation"), options.get("platforms", (PLATFORM,))
-    patch, state = options.get("patch"), options.get("state")
+    target = checked_target(path, replace=replace)
+    kind = options.get("kind", "python")
+    fmi = options.get("fmi", 2)
+    interface = options.get("interface", "co-simulation")
+    platforms = options.get("platforms", (PLATFORM,))
+    patch = options.get("patch")
     check_form(kind, fmi, interface, patched=patch is not None, platforms=platforms)
-    values = {} if state is None else start_values(model, state)
-    values |= {name: float(value) for name, value in (options.get("start") or {}).items()}
-    before = f"The FMU of the structure {model.name} cannot be built: "
-    with FmuBuildError.instead_of(ValueError, before=before, after="."):
-        table, roles = structure_table(model, values)
-    name, kept = stem_of(model), {}
+    # variables and start values
+    start = _requested_start_values(model, options)
+    build_failure = f"The FMU of the structure {model.name} cannot be built: "
+    with FmuBuildError.instead_of(ValueError, before=build_failure, after="."):
+        table, roles = structure_table(model, start)
+    patch_members: dict[str, bytes] = {}
     if patch is not None:
         effects = patch.for_gauges(len(model.gauges)).plain
-        values |= {switch_name(effect): float(options.get("activate", False)) for effect in effects}
-        table += effect_rows(effects, len(table), values)
-        kept = _patched_members(model, effects, options.get("arrays"))
-    contents.check_start(table)
-    description = _OF_THE_WING if is_wing(model) else _OF_A_STRUCTURE.format(model.name)
-    declared = Declaration(name, f"{description} {options.get('note', '')}".strip(), table)
+        for effect in effects:
+            start[switch_name(effect)] = float(options.get("activate", False))
+        table += effect_rows(effects, len(table), start)
+        patch_members = _patched_members(model, effects, options.get("arrays"))
+    check_start_values(table)
+    description = f"{_model_description(model)} {options.get('note', '')}".strip()
+    declaration = Declaration(stem_of(model), description, table)
+    # files of the archive
     if kind == "python":
-        resources = {
-            "reduced_model.npz": model.to_bytes(),
-            "start.json": (json.dumps(values, sort_keys=True, indent=1) + "\n").encode(),
-        }
-        imports = "from .slaves.structure_contents import load_contents\n"
-        template = kept | contents.python_members(
-            declared, "Structure_", imports=imports, resources=resources
-        )
-        template |= contents.room_members("fe.runtime", f"resources/{declared.identifier}_runtime/fe")
+        template = patch_members | _python_structure_members(model, declaration, start)
     else:
-        template = compiled_members(model, declared, roles, fmi=fmi, interface=interface)
+        template = compiled_members(model, declaration, roles, fmi=fmi, interface=interface)
     template[f"resources/{DESIGN_RECORD}"] = design_record(model.design_hash)
-    for file, content in (options.get("resources") or {}).items():
-        if f"resources/{file}" in template or "/" in file or not file:
-            raise FmuBuildError(f"A resource of an FMU cannot have the name {file!r}; choose another one.")
-        template[f"resources/{file}"] = content
+    _add_resources(template, options.get("resources") or {})
 
-    def binaries(members: dict[str, bytes], tag: str) -> dict[str, bytes]:
-        return binaries_of(members, f"{name}_{tag}", fmi, platforms)
+    def make_binaries(members: dict[str, bytes], tag: str) -> dict[str, bytes]:
+        return compiled_binaries(members, f"{declaration.name}_{tag}", fmi, platforms)
 
-    return contents.write_fmu(
-        target, contents.sealed(template, binaries if kind == "compiled" else None), model.design_hash
+    fmu = sealed(template, make_binaries if kind == "compiled" else None)
+    return write_fmu(target, fmu, model.design_hash)
+
+
+def _requested_start_values(model: ReducedModel, options: FmuOptions) -> dict[str, float]:
+    """Return the start values that the options `state` and `start` give, by variable name."""
+    state = options.get("state")
+    values = {} if state is None else start_values(model, state)
+    for name, value in (options.get("start") or {}).items():
+        values[name] = float(value)
+    return values
+
+
+def _model_description(model: ReducedModel) -> str:
+    """Return the sentence on the model in the model description."""
+    return _WING_DESCRIPTION if is_wing(model) else _STRUCTURE_DESCRIPTION.format(model.name)
+
+
+def _python_structure_members(
+    model: ReducedModel, declaration: Declaration, start: Mapping[str, float]
+) -> dict[str, bytes]:
+    """Return the files of an FMU whose model is evaluated by Python.
+
+    Parameters
+    ----------
+    model : ReducedModel
+        The reduced structure.
+    declaration : Declaration
+        The declaration of its FMU.
+    start : mapping of str to float
+        The start values that differ from the defaults, by variable name.
+    """
+    start_text = json.dumps(start, sort_keys=True, indent=1) + "\n"
+    members = python_members(
+        declaration,
+        "Structure_",
+        imports="from .slaves.structure_contents import load_contents\n",
+        resources={"reduced_model.npz": model.to_bytes(), "start.json": start_text.encode()},
     )
+    runtime_folder = f"resources/{declaration.identifier}_runtime/fe"
+    return members | package_members("fe.runtime", runtime_folder)
+
+
+def _add_resources(template: dict[str, bytes], resources: Mapping[str, bytes]) -> None:
+    """Add a user's files to the folder `resources` of an archive; refuse names that are taken."""
+    for file, content in resources.items():
+        name = f"resources/{file}"
+        if name in template or "/" in file or not file:
+            raise FmuBuildError(
+                f"A resource of an FMU cannot have the name {file!r}; choose another one."
+            )
+        template[name] = content
 
 
 def _patched_members(
@@ -178,37 +231,54 @@ def _patched_members(
     model : ReducedModel
         The wing.
     effects : sequence of dict
-        As `PatchFile.plain` has them.
+        The effects as `PatchFile.plain` has them.
     arrays : PatchArrays or None
-        The same wing in the basis for patches; needed where an effect is of more than sensors.
+        The same wing in the basis for patches; needed if an effect changes more than sensors.
 
     Raises
     ------
     PatchFileError
-        If the arrays are missing or are those of another wing, or the wing cannot carry an effect.
+        If the arrays are missing or belong to another wing, or the wing cannot carry an effect.
     """
     # The order of keys is that of the variables.
     text = json.dumps(effects, indent=1, allow_nan=False)
     members = {"resources/effects.json": f"{text}\n".encode()}
-    patch = ModelPatch.from_list([primitive for effect in effects for primitive in effect["primitives"]])
+    primitives = []
+    for effect in effects:
+        primitives += effect["primitives"]
+    patch = ModelPatch.from_list(primitives)
     if not needs_structure(patch):
         return members
     if arrays is None:
-        raise PatchFileError(said("packing.no_arrays"))
+        raise PatchFileError(
+            "The patch changes structure or loads, for which the FMU needs the wing in the basis "
+            "for patches: give `arrays`, as `fe.reduction.model_cache.patch_arrays` returns them."
+        )
     if arrays.design_hash != model.design_hash:
-        raise PatchFileError(said("packing.other_design", arrays=arrays, model=model))
+        raise PatchFileError(
+            f"The wing for patches is of the design {arrays.design_hash:.12}, and the reduced "
+            f"model of {model.design_hash:.12}; make both of one design."
+        )
+    # The modes of the patched wing show whether the wing can carry the patch.
     with PatchFileError.instead_of(FiniteElementError, before="The wing cannot carry the patch: "):
         _ = PatchedWing(arrays).structure_at(model.nominal, patch).modes
-    if not len(patch.of(LocalStiffnessLoss)):  # strips, which only that needs, are most of the bytes
-        strips = ("strip_stiffness", "strip_of", "term_of")
-        arrays = changed(arrays, **{name: getattr(arrays, name)[:0] for name in strips})
+    # Strips are most of the bytes, and local losses of stiffness alone need them.
+    if not len(patch.of(LocalStiffnessLoss)):
+        arrays = dataclass_copy(
+            arrays,
+            strip_stiffness=arrays.strip_stiffness[:0],
+            strip_of=arrays.strip_of[:0],
+            term_of=arrays.term_of[:0],
+        )
     return {**members, "resources/patch_arrays.npz": arrays.to_bytes()}
 
 
 def stem_of(model: ReducedModel) -> str:
     """Return the name of a structure as an identifier of C."""
-    plain = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:40]
-    return plain if plain[:1].isalpha() else f"structure_{plain}".rstrip("_")
+    plain_name = re.sub(r"[^A-Za-z0-9]+", "_", model.name).strip("_")[:_LONGEST_STEM]
+    if plain_name[:1].isalpha():
+        return plain_name
+    return f"structure_{plain_name}".rstrip("_")
 
 
 def check_form(
@@ -219,75 +289,94 @@ def check_form(
     patched: bool = False,
     platforms: Sequence[Platform] = (PLATFORM,),
 ) -> None:
-    """Refuse an FMU that cannot be made here; asked before a model is reduced, which can take minutes.
+    """Refuse a form of FMU that cannot be made here.
+
+    Commands call this before a model is reduced, which can take minutes.
 
     Parameters
     ----------
     kind, fmi, interface, platforms
-        See `build_fmu`.
+        The form of the FMU; see `build_fmu`.
     patched : bool
-        Whether it is to carry missing effects.
+        Whether the FMU carries missing effects.
 
     Raises
     ------
     FmuBuildError
-        The kind is not of that version of FMI, or a compiler is missing.
+        If the kind does not exist for that version of FMI, or a compiler is missing.
     PatchFileError
-        The kind cannot carry missing effects.
+        If the kind cannot carry missing effects.
     InvalidChoiceError
-        A kind, a version of FMI, an interface or a platform is none of those.
+        If a kind, a version of FMI, an interface or a platform is not one of those of `build_fmu`.
     """
     require_one_of(kind, get_args(FmuKind), "kind")
     require_one_of(fmi, get_args(FmiVersion), "fmi")
     require_one_of(interface, get_args(Interface), "interface")
     for platform in platforms:
         require_one_of(platform, get_args(Platform), "platforms")
-    if kind == "python" and (fmi, interface) != (2, "co-simulation"):
-        raise FmuBuildError(said("packing.python_kind", fmi=fmi, interface=interface))
+    if kind == "python" and (fmi != 2 or interface != "co-simulation"):
+        raise FmuBuildError(
+            f"The FMU of the kind 'python' is of FMI 2.0 for co-simulation, but FMI {fmi}.0 for "
+            f"{interface} was asked for: build the kind 'compiled' or 'source'."
+        )
     if patched and kind != "python":
-        raise PatchFileError(said("packing.patched_kind", kind=kind))
-    for platform in platforms if kind == "compiled" else ():
-        find_compiler(platform)
+        raise PatchFileError(
+            f"The FMU of the kind {kind!r} cannot carry missing effects: build the kind 'python' "
+            "with this patch."
+        )
+    if kind == "compiled":
+        for platform in platforms:
+            find_compiler(platform)
 
 
 def start_values(model: ReducedModel, state: DigitalState) -> dict[str, float]:
     """Return the start values of a wing's FMU that a digital state gives, by variable name."""
-    losses = zip(model.regions, model.losses(state.stiffness_loss), strict=True)
-    return {
+    values = {
         "young_modulus_factor": float(state.young_modulus_factor),
         "damping.alpha": float(state.damping_alpha),
         "damping.beta": float(state.damping_beta),
         "mass.servo": float(state.servo_mass),
         "mass.pitot": float(state.pitot_mass),
-        **{f"health.{name}": float(loss) for name, loss in losses},
     }
+    for region, loss in zip(model.regions, model.losses(state.stiffness_loss), strict=True):
+        values[f"health.{region}"] = float(loss)
+    return values
 
 
 def recorded_content_hash(path: str | os.PathLike[str]) -> tuple[str, str]:
     """Return the GUID that an FMU of ours declares, and the GUID that its content has today.
 
-    The two differ when the file was changed after it was built. A compiled binary is not part of the content,
-    since every compiler makes another one of the same sources.
+    The two differ if the file was changed after it was built. A compiled binary is not part of the
+    content, since every compiler makes another one of the same sources.
+
+    Parameters
+    ----------
+    path : path-like
+        An FMU that was packed here.
 
     Returns
     -------
     declared, actual : str
-        GUIDs.
+        The GUIDs.
     """
     with zipfile.ZipFile(path) as archive:
-        # Archives that other tools have packed again list their folders too.
-        members = {name: archive.read(name) for name in archive.namelist() if not name.endswith("/")}
-    root = members["modelDescription.xml"].decode("utf-8")
+        # Archives that other tools have packed again list their folders, too.
+        names = [name for name in archive.namelist() if not name.endswith("/")]
+        members = {name: archive.read(name) for name in names}
+    description = members["modelDescription.xml"].decode("utf-8")
     if DATA_FILE in members:
-        members = {name: data for name, data in members.items() if not name.startswith("binaries/")}
-        tag = root.split('modelIdentifier="', 1)[1].split('"', 1)[0][-len(PLACEHOLDER) :]
+        for name in names:
+            if name.startswith("binaries/"):
+                members.pop(name, None)
+        identifier = description.split('modelIdentifier="', 1)[1].split('"', 1)[0]
     else:
-        tag = members["resources/slavemodule.txt"].decode("ascii").strip()[-len(PLACEHOLDER) :]
-    found = re.search(r'(?:guid|instantiationToken)="([^"]*)"', root)
-    declared = "" if found is None else found[1]
-    return declared, contents.guid_of(
-        hash_members(contents.exchanged(members, (tag, declared), (PLACEHOLDER, PLACEHOLDER)))
-    )
+        identifier = members["resources/slavemodule.txt"].decode("ascii").strip()
+    tag = identifier[-len(PLACEHOLDER) :]
+    match = re.search(r'(?:guid|instantiationToken)="([^"]*)"', description)
+    declared_guid = "" if match is None else match[1]
+    identity = ContentIdentity(tag=tag, guid=declared_guid)
+    template = with_identity(members, identity, UNKNOWN_IDENTITY)
+    return declared_guid, guid_of_hash(hash_members(template))
 
 
 def pack_wing(
@@ -297,14 +386,14 @@ def pack_wing(
     replace: bool = False,
     progress: Progress | None = None,
     **options: Unpack[FmuOptions],
-) -> contents.FmuInfo:
+) -> FmuInfo:
     """Reduce a wing design and pack it as an FMU; equal input gives equal bytes.
 
     Parameters
     ----------
     design : WingDesign
-        The wing; of a calibrated one its tailored design, with what `calibration.result.file.tailoring`
-        gives among the options.
+        The wing. For a calibrated wing it is the tailored design, with the options that
+        `calibration.result.file.tailoring` gives.
     path : path-like
         Where to write, with the suffix .fmu.
     replace, **options
@@ -315,24 +404,33 @@ def pack_wing(
     Raises
     ------
     FiniteElementError
-        The design cannot be modelled.
+        If the design cannot be modelled.
     FmuBuildError, PatchFileError
         See `fmu_asset.packing.structure_fmu.build_fmu`.
     """
     model = reduced_model(design, progress=progress)
-    options["arrays"] = arrays_for(design, options.get("patch"), progress)
+    options["arrays"] = needed_patch_arrays(design, options.get("patch"), progress)
     return build_fmu(model, path, replace=replace, **options)
 
 
-def arrays_for(
+def needed_patch_arrays(
     design: WingDesign, patch: PatchFile | None, progress: Progress | None = None
 ) -> PatchArrays | None:
-    """Return the wing in the basis for patches; None where the patch does not need it.
+    """Return the wing in the basis for patches; None if the patch does not need it.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The wing.
+    patch : PatchFile or None
+        Missing effects that the FMU carries.
+    progress : Progress, optional
+        Shows what takes long.
 
     Raises
     ------
     FiniteElementError
-        The design cannot be modelled.
+        If the design cannot be modelled.
     """
     if patch is None or not needs_structure(patch.patch):
         return None

@@ -1,4 +1,4 @@
-"""An SSP file against its own FMUs: joined, and tried for one step."""
+"""Checking an SSP file against the FMUs in it: its connections are joined, and one step is made."""
 
 import difflib
 import os
@@ -9,33 +9,41 @@ from pathlib import Path
 from fmu_asset.client.experiment import default_experiment
 from fmu_asset.client.units import IDENTITY, between
 from fmu_asset.coupling.asset import Algorithm, CoupledAsset
-from fmu_asset.coupling.structure import SystemStructure
+from fmu_asset.coupling.schedule import loop_sentence
+from fmu_asset.coupling.structure import Connector, Endpoint, SystemStructure
 from fmu_asset.coupling.system import system_description
-from fmu_asset.coupling.wiring import Wiring, loop_sentence
-from fmu_asset.errors import FmuError, SspError, said
+from fmu_asset.coupling.wiring import Wiring
+from fmu_asset.errors import FmuError, SspError
 from fmu_asset.folders import scratch_folder
+from reporting.words import comma_list
 
 from .reader import read_ssp
+
+_MOST_HINTS = 12
+"""Unused parameters for which a similar name is looked for; messages do not list more."""
+
+_LEAST_SIMILARITY = 0.6
 
 
 @dataclass(frozen=True)
 class SspCheck:
-    """What a check of an SSP file found.
+    """The result of checking an SSP file.
 
     Attributes
     ----------
     path : Path
         The file.
     problems : tuple of str
-        One sentence each; empty if nothing was found.
+        One sentence for each problem; empty if none was found.
     components : tuple of (str, str)
         Name of each component and of its model, in the order in which they are evaluated.
     connections, parameters : int
-        How many there are.
+        The number of connections and of parameters.
     step : float or None
         The step that was made [s]; None where none could be made.
     loops : tuple of str
-        Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to break it.
+        Algebraic loops; a system with one is sound, but `ssp simulate` needs to be told how to
+        break it.
     unused : tuple of str
         Parameters that the file sets and nothing takes, which SSP allows.
     left_out : str
@@ -59,7 +67,7 @@ def join_ssp(structure: SystemStructure, delayed: Iterable[str] = ()) -> Wiring:
     Parameters
     ----------
     structure : SystemStructure
-        As `reader.read_ssp` returns it.
+        The system as `reader.read_ssp` returns it.
     delayed : iterable of str
         Ends whose connections are delayed by a step, whatever the file says.
 
@@ -72,40 +80,93 @@ def join_ssp(structure: SystemStructure, delayed: Iterable[str] = ()) -> Wiring:
     """
     wiring = Wiring(structure.delayed(delayed), leave_out_unknown=True)
     wiring.left_out += structure.unused
-    for end, declared in structure.declared.items():
-        variable, units = wiring.variable(end), wiring.declared[end.component].units
-        same_unit = between(declared.unit, (*structure.units, *units), variable.unit, units) == IDENTITY
-        # SSP 1.0 has no local variables.
-        own_kind = "output" if variable.causality == "local" else variable.causality
-        if declared.kind != own_kind:
-            differs = f"as {declared.kind}, but its FMU has it as {variable.causality}"
-        elif declared.type not in (None, variable.base_type):
-            differs = f"of the type {declared.type}, but its FMU has it as {variable.kind}"
-        elif not same_unit:
-            differs = f"in {declared.unit!r}, but its FMU has it in {variable.unit!r}"
-        else:
-            continue
-        raise SspError(f"The connector {end} is declared {differs}; correct the file.")
+    for end, connector in structure.declared.items():
+        difference = _difference_from_fmu(wiring, end, connector)
+        if difference:
+            raise SspError(f"The connector {end} is declared {difference}; correct the file.")
     return wiring
 
 
+def _difference_from_fmu(wiring: Wiring, end: Endpoint, connector: Connector) -> str:
+    """Return how a component's connector differs from its FMU's variable; empty if it does not.
+
+    Parameters
+    ----------
+    wiring : Wiring
+        The system.
+    end : Endpoint
+        The component and its variable.
+    connector : Connector
+        The connector as the SSP file declares it.
+    """
+    variable = wiring.variable(end)
+    # SSP 1.0 has no local variables.
+    kind_of_fmu = "output" if variable.causality == "local" else variable.causality
+    if connector.kind != kind_of_fmu:
+        return f"as {connector.kind}, but its FMU has it as {variable.causality}"
+    if connector.type is not None and connector.type != variable.base_type:
+        return f"of the type {connector.type}, but its FMU has it as {variable.kind}"
+    fmu_units = wiring.declared[end.component].units
+    known_units = (*wiring.structure.units, *fmu_units)
+    if between(connector.unit, known_units, variable.unit, fmu_units) != IDENTITY:
+        return f"in {connector.unit!r}, but its FMU has it in {variable.unit!r}"
+    return ""
+
+
 def left_out_sentence(wiring: Wiring, file: Path) -> str:
-    """Return what of a file's parameters goes nowhere, with the nearest names; empty if all are used."""
+    """Return the sentence on parameters of a file that nothing takes; empty if all are used.
+
+    Parameters
+    ----------
+    wiring : Wiring
+        The system.
+    file : Path
+        The SSP file that it comes from.
+    """
     if not wiring.left_out:
         return ""
-    known = [item.name for item in wiring.structure.connectors if item.kind != "output"]
-    for component, declared in wiring.declared.items():
-        settable = (v for v in declared.variables if v.causality in ("parameter", "input"))
-        known += [f"{component}.{variable.name}" for variable in settable]
-    names = list(wiring.left_out)
-    for index, name in enumerate(names[:12]):  # more are not listed
-        owner = max((f"{c}." for c in wiring.declared if name.startswith(f"{c}.")), key=len, default="")
-        own = [item.removeprefix(owner) for item in known if item.startswith(owner)]
-        for near in difflib.get_close_matches(name.removeprefix(owner), own, 1, 0.6):
-            right = owner + near
-            hint = "its set lacks the value" if right == name else f"did you mean {right!r}?"
-            names[index] = f"{name} ({hint})"
-    return said("ssp.untaken", file=file, names=names)
+    settable_names = _settable_names(wiring)
+    names = []
+    for index, name in enumerate(wiring.left_out):
+        if index < _MOST_HINTS:
+            names.append(_with_hint(name, settable_names, list(wiring.declared)))
+        else:
+            names.append(name)
+    return (
+        f"{file} sets parameters that nothing takes: {comma_list(names)}; correct or remove them."
+    )
+
+
+def _settable_names(wiring: Wiring) -> list[str]:
+    """Return the names of all parameters and inputs, of the system and of its components."""
+    names = [
+        connector.name for connector in wiring.structure.connectors if connector.kind != "output"
+    ]
+    for component, description in wiring.declared.items():
+        for variable in description.variables:
+            if variable.causality in ("parameter", "input"):
+                names.append(f"{component}.{variable.name}")
+    return names
+
+
+def _with_hint(name: str, settable_names: list[str], components: list[str]) -> str:
+    """Return the name of an unused parameter, with a similar name of its component, if any."""
+    prefixes = [f"{component}." for component in components if name.startswith(f"{component}.")]
+    prefix = max(prefixes, key=len, default="")
+    candidates = [
+        candidate.removeprefix(prefix)
+        for candidate in settable_names
+        if candidate.startswith(prefix)
+    ]
+    similar = difflib.get_close_matches(
+        name.removeprefix(prefix), candidates, n=1, cutoff=_LEAST_SIMILARITY
+    )
+    if not similar:
+        return name
+    correct_name = prefix + similar[0]
+    if correct_name == name:
+        return f"{name} (its set lacks the value)"
+    return f"{name} (did you mean {correct_name!r}?)"
 
 
 def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
@@ -122,29 +183,35 @@ def check_ssp(path: str | os.PathLike[str]) -> SspCheck:
     if not file.is_file():
         raise SspError(f"There is no SSP file {file}.")
     problems: tuple[str, ...] = ()
-    step: float | None = None
+    step_size: float | None = None
     with scratch_folder() as folder:
         try:
             wiring = join_ssp(read_ssp(file, folder))
         except FmuError as error:
             return SspCheck(file, (str(error),))
-        plan = wiring.schedule
-        try:  # with an algebraic loop, too: whether it may be simulated is the user's choice
-            experiment = default_experiment(system_description(wiring))
-            algorithm: Algorithm = "jacobi" if plan.loops else "gauss_seidel"
-            with CoupledAsset(wiring, experiment.binding, algorithm=algorithm) as asset:
-                asset.step()
-            step = experiment.binding.step_size
+        # A system with an algebraic loop is tried too: whether to simulate it is the user's choice.
+        try:
+            step_size = _make_one_step(wiring)
         except FmuError as error:
             problems = (str(error),)
+    order = wiring.schedule
     return SspCheck(
         path=file,
         problems=problems,
-        components=tuple((name, wiring.declared[name].model_name) for name in plan.order),
+        components=tuple((name, wiring.declared[name].model_name) for name in order.order),
         connections=len(wiring.structure.connections),
-        parameters=sum(map(len, wiring.settings.values())),
-        step=step,
-        loops=(loop_sentence(plan.loops),) if plan.loops else (),
+        parameters=sum(len(settings) for settings in wiring.settings.values()),
+        step=step_size,
+        loops=(loop_sentence(order.loops),) if order.loops else (),
         unused=tuple(wiring.left_out),
         left_out=left_out_sentence(wiring, file),
     )
+
+
+def _make_one_step(wiring: Wiring) -> float | None:
+    """Make one step of the default experiment, and return its size [s]."""
+    experiment = default_experiment(system_description(wiring))
+    algorithm: Algorithm = "jacobi" if wiring.schedule.loops else "gauss_seidel"
+    with CoupledAsset(wiring, experiment.binding, algorithm=algorithm) as asset:
+        asset.step()
+    return experiment.binding.step_size

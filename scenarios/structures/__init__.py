@@ -1,1 +1,1 @@
-"""Structures from meshes that are shipped: structure files, meshes, and the script that makes these."""
+"""Shipped structures from meshes: structure files, meshes, and the script that makes them."""

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from fe.runtime.reduced import ReducedModel
-from fmu_asset.compiled.package import find_compiler
+from fmu_asset.compiled.compiler import find_compiler
 from fmu_asset.errors import FmuBuildError
 from tests.fmu_asset.ours import OurFmus, wing_model
 

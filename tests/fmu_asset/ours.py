@@ -17,8 +17,8 @@ from fe.wing.design import load_design
 from fe.wing.operators import assemble
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.companions.build import companion_bytes
-from fmu_asset.packing.contents import build_script_fmu
 from fmu_asset.packing.patch_file import load_patch
+from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from reporting.files import atomic_write_bytes
 from scenarios import asset_scripts

@@ -13,7 +13,8 @@ import uav_twin
 from calibration.dynamics.modal_identification import identify_modes
 from calibration.wing.lab_data import read_lab_folder
 from fmu_asset.client.binding import Binding
-from fmu_asset.compiled.package import binaries_of, compile_library, fmi_headers
+from fmu_asset.compiled.compiler import compile_library
+from fmu_asset.compiled.package import compiled_binaries, fmi_headers
 from reporting.choices import require_one_of
 from reporting.errors import InvalidChoiceError
 
@@ -113,7 +114,7 @@ def test_a_binding_takes_no_other_word_in_its_header(key):
         binding.with_header(**{key: "replayed"})
 
 
-@pytest.mark.parametrize("call", [fmi_headers, partial(binaries_of, {}, "wing")])
+@pytest.mark.parametrize("call", [fmi_headers, partial(compiled_binaries, {}, "wing")])
 def test_the_parts_of_a_compiled_fmu_know_two_versions_of_fmi(call):
     with pytest.raises(InvalidChoiceError, match=r"`fmi` must be 2 or 3, and 1 came"):
         call(fmi=1)

@@ -30,7 +30,7 @@ from reporting import files, netcdf, provenance
 from reporting.errors import DamagedFileError, DiskFullError, FileNotWrittenError
 from reporting.json_file import plain
 from reporting.memory import ResultCache
-from reporting.netcdf import Group, Variable, read_groups, write_groups
+from reporting.netcdf import NetcdfGroup, Variable, read_groups, write_groups
 from tests.refusals import refused
 
 
@@ -135,14 +135,14 @@ def variables(draw: st.DrawFn, axes: tuple[str, ...]) -> Variable:
 
 
 @st.composite
-def group(draw: st.DrawFn) -> Group:
+def group(draw: st.DrawFn) -> NetcdfGroup:
     """Draw a group: some axes have labels, others have coordinates beside them."""
     axes = st.lists(st.sampled_from(list(SIZES)), unique=True, max_size=3).map(tuple)
     told = draw(st.dictionaries(_NAMES, axes.flatmap(variables), min_size=1, max_size=4))
     used = {axis for variable in told.values() for axis in variable.dims}
     coords = {axis: draw(variables((axis,))) for axis in sorted(used) if draw(st.booleans())}
     beside = {f"w_{axis}": draw(variables((axis,))) for axis in sorted(used) if draw(st.booleans())}
-    return Group(told, {**coords, **beside}, {"parameter": "e"} if draw(st.booleans()) else {})
+    return NetcdfGroup(told, {**coords, **beside}, {"parameter": "e"} if draw(st.booleans()) else {})
 
 
 @settings(max_examples=10)
@@ -170,7 +170,7 @@ def test_xarray_and_we_read_what_was_written(groups, tmp_path_factory):
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     begin = Variable(("trial",), np.array([0.0, 1.0]), {"units": "hours since 2020-01-01"})
-    write_groups(tmp_path / "a.nc", {"a": Group({"begin": begin}, {})}, {"schema": "outer"})
+    write_groups(tmp_path / "a.nc", {"a": NetcdfGroup({"begin": begin}, {})}, {"schema": "outer"})
     return tmp_path / "a.nc"
 
 

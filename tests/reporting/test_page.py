@@ -15,7 +15,7 @@ import pytest
 from benchmarks.browser import CHROMIUM, open_browser
 from reporting import figures
 from reporting.errors import InvalidFigureError
-from reporting.page import Column, Page, Table, Words, script_source
+from reporting.page import Page, PageColumn, Table, Words, script_source
 
 VOID = {"meta", "br", "link", "img"}
 
@@ -64,7 +64,7 @@ def page(title: str = "Title") -> Page:
     assert result.add_figure(svg(), "What is seen, in µε.", title='What & "whose" <size>') == 1
     result.add_section("Second")
     assert result.add_figure(svg(), "The same.", title="Another") == 2
-    columns = (Column("quantity"), Column("value", unit="N/mm", numeric=True))
+    columns = (PageColumn("quantity"), PageColumn("value", unit="N/mm", numeric=True))
     assert result.add_table(Table(columns, [("<k>", "0.677")]), "A caption.", title="Stiffness") == 1
     return result
 
@@ -109,7 +109,7 @@ def test_what_can_be_no_part_of_a_page_is_refused():
         with pytest.raises(InvalidFigureError, match="positive size"):
             figures.new_figure(size)
     with pytest.raises(InvalidFigureError, match="Row 1 of a table has 1 cells"):
-        Table((Column("a"), Column("b")), [("1", "2"), ("3",)])
+        Table((PageColumn("a"), PageColumn("b")), [("1", "2"), ("3",)])
 
 
 def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_there():
@@ -120,7 +120,7 @@ def test_words_say_cells_units_columns_that_may_go_and_rows_that_are_always_ther
     ]
     words.content = {"tables": {"t": {"columns": [*cells, {"text": "more", "cell": "x", "when": "long"}]}}}
     columns, rows = words.table("t", ["a"], what="length", long=False)
-    assert (columns, rows) == ([Column("name"), Column("length", "m", numeric=True)], [["a", "0.5"]])
+    assert (columns, rows) == ([PageColumn("name"), PageColumn("length", "m", numeric=True)], [["a", "0.5"]])
     assert words.table("t", ["a"], what="length", long=True)[1] == [["a", "0.5", "x"]]
     words.content["tables"]["t"] = {"columns": ["item", "value"], "rows": [["{{ what }}", "1"], ["none", ""]]}
     assert words.table("t", [["b", "2"]], what="length")[1] == [["length", "1"], ["b", "2"]]

@@ -10,7 +10,7 @@ import pytest
 
 from calibration.result.file import result_bytes, save_calibration
 from fmu_asset.client.binding import load_binding
-from fmu_asset.packing.contents import build_script_fmu
+from fmu_asset.packing.script import build_script_fmu
 from scenarios import asset_scripts, binding_files
 from tests.command_line import refused, said
 from tests.refusals import Inputs

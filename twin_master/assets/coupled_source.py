@@ -12,8 +12,8 @@ from fmu_asset.client.bound_variables import expand
 from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.coupling.structure import (
     Component,
+    ComponentSetting,
     Connector,
-    Setting,
     SystemStructure,
     expand_connection,
 )
@@ -268,8 +268,8 @@ def _given_fmu(component: ComponentSection, folder: Path) -> Path:
     return atomic_write_bytes(folder / f"{component.name}.fmu", companion_bytes(component.fmu))
 
 
-def _settings(component: ComponentSection) -> dict[str, Setting]:
-    settings: dict[str, Setting] = {}
+def _settings(component: ComponentSection) -> dict[str, ComponentSetting]:
+    settings: dict[str, ComponentSetting] = {}
     where = f"the component `{component.name}`"
     for pattern, value in component.parameters.items():
         before = f"the parameters of {where} cannot be read: "
@@ -278,5 +278,5 @@ def _settings(component: ComponentSection) -> dict[str, Setting]:
         for name in names:
             if name in settings:
                 raise MissionInputError(f"{where} is given `{name}` twice: keep one of the two.")
-            settings[name] = Setting(value)
+            settings[name] = ComponentSetting(value)
     return settings

@@ -299,11 +299,11 @@ class DesignSource(_Wing, ReducedModelSource):
         """
         if patch is None or not patch.effects:
             return super().observation_table(draws, model)
-        from fmu_asset.packing.structure_fmu import arrays_for
+        from fmu_asset.packing.structure_fmu import needed_patch_arrays
         from fmu_asset.slaves.contents import UnacceptableValuesError
 
         scenario, where = self._scenario, str(self.patch_path)
-        ask = strains_with_effects(self.wing, patch, arrays_for(self.wing_design, patch))
+        ask = strains_with_effects(self.wing, patch, needed_patch_arrays(self.wing_design, patch))
         force = scenario.asset.constant_load.get("tip_force", 0.0)
         before, states = f"the twin's model cannot carry {where}: ", model.states.coordinates
         with MissionInputError.instead_of(UnacceptableValuesError, before=before):

@@ -373,7 +373,7 @@ class ScriptSource(FmuSource):
         FmuBuildError
             The script cannot be packed.
         """
-        from fmu_asset.packing.contents import script_fmu
+        from fmu_asset.packing.script import script_fmu
 
         given = dict(self.places)
         script = given.pop(FMU_COPY)

@@ -108,7 +108,7 @@ class NamedStructure(AssetSource):
         FileNotWrittenError
             The disk is full or the folder cannot be written.
         """
-        from fe.structure.design import MatrixDesign
+        from fe.structure.matrix_design import MatrixDesign
         from fe.structure.operators import load_and_assemble, write_structure_vtu
 
         if isinstance(self.design, MatrixDesign):

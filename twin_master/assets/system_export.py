@@ -12,10 +12,10 @@ from fmu_asset.client.bound_variables import ParameterBinding
 from fmu_asset.client.exchange import Exchange
 from fmu_asset.coupling.structure import (
     Component,
+    ComponentSetting,
     Connection,
     Connector,
     Endpoint,
-    Setting,
     SystemStructure,
 )
 from fmu_asset.coupling.system import system_description
@@ -23,7 +23,7 @@ from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.folders import scratch_folder
 from fmu_asset.instances.plan import InitialValue
 from fmu_asset.packing.structure_fmu import pack_wing
-from fmu_asset.ssp.package import write_ssp
+from fmu_asset.ssp.writer import write_ssp
 from reporting.progress import reporter
 from scenarios import binding_files
 from twin_master.assets.coupled_source import SeveralSource
@@ -130,9 +130,9 @@ def _with_values(
         settings.append(
             InitialValue(slot.variable.kind, slot.variable.reference, slot.numbers(value).tolist())
         )
-    given: dict[str, dict[str, Setting]] = {
-        name: {key: Setting(number) for key, number in values.items()}
-        for name, values in system.of_components(settings).items()
+    given: dict[str, dict[str, ComponentSetting]] = {
+        name: {key: ComponentSetting(number) for key, number in values.items()}
+        for name, values in system.settings_of_components(settings).items()
     }
     components = tuple(
         replace(part, settings={**part.settings, **given.get(part.name, {})})

@@ -21,7 +21,7 @@ from reporting import figures as style
 from reporting.arrays import Float
 from reporting.errors import ReportingError
 from reporting.files import atomic_write_text
-from reporting.page import Column, Page, Words, number_column
+from reporting.page import Page, PageColumn, Words, number_column
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.flight import KIND, WATCHED_KIND, fleet_config, told_of
 from twin_master.fleet.learn import LESSONS_NAME, lesson_rows
@@ -255,7 +255,7 @@ def _add_group(
     more = [
         number_column(state.name, factor.unit) for state, factor in zip(scenario.state, factors, strict=True)
     ]
-    more += [Column("control"), number_column("change", "%"), *[number_column("alarms")] * told]
+    more += [PageColumn("control"), number_column("change", "%"), *[number_column("alarms")] * told]
     WORDS.add_table(
         page, "next", rows, more=more, shown=len(rows), assets=count, alarms=told, mission=scenario.mission
     )

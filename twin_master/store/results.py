@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.netcdf import Group, Variable
+from reporting.netcdf import NetcdfGroup, Variable
 from reporting.table_file import table_text
 from twin_master.learning.expectation import joined
 from twin_master.mission.loop import expected_in
@@ -29,7 +29,7 @@ _DECIDED_ON = {
 _MOMENT_TITLES = ("mean", "standard deviation", "5 % quantile", "95 % quantile")
 
 
-def groups_of(result: MissionResult) -> dict[str, Group]:
+def groups_of(result: MissionResult) -> dict[str, NetcdfGroup]:
     """Return the groups of `run.nc` for a mission; every variable carries its unit and a description."""
     made, plan = _Groups(result), result.knowledge.plan
     policy = {"control_index": plan.control_index, "action_value": plan.action_value, "value": plan.value}
@@ -98,14 +98,16 @@ class _Groups:
             attrs = {"units": unit, "long_name": text} if unit else {"long_name": text}
             yield name.format(**told), Variable(tuple(axes.split()), values, attrs)
 
-    def group(self, name: str, entries: Iterable[Entry], words: Words = _NONE, attrs: Words = _NONE) -> Group:
+    def group(
+        self, name: str, entries: Iterable[Entry], words: Words = _NONE, attrs: Words = _NONE
+    ) -> NetcdfGroup:
         """Return a group of the schema; `words` stand in braces of all its entries."""
         variables = dict(self._variables(name, entries, words))
         axes = {axis for variable in variables.values() for axis in variable.dims}
         coordinates = {
             name: label for name, label in self._coordinates.items() if axes.issuperset(label.dims)
         }
-        return Group(variables, coordinates, attrs)
+        return NetcdfGroup(variables, coordinates, attrs)
 
 
 def _observed(result: MissionResult) -> Iterator[Entry]:
@@ -122,7 +124,7 @@ def _observed(result: MissionResult) -> Iterator[Entry]:
         yield "{input}", values, {"input": name, "unit": result.units.get(name, "1")}
 
 
-def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Group]]:
+def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, NetcdfGroup]]:
     """Yield the groups of the beliefs filtered, smoothed and predicted."""
     flight, known = result.flight, result.knowledge
     states, observed, so_far = known.model.states, flight.observed, "observations up to the step"
@@ -192,7 +194,7 @@ Columns = dict[str, Any]
 """Numbers or texts of each column, by its heading."""
 
 
-def tables_of(groups: Mapping[str, Group], observation: ObservationSection) -> dict[str, str]:
+def tables_of(groups: Mapping[str, NetcdfGroup], observation: ObservationSection) -> dict[str, str]:
     """Return the text of each CSV file by its name.
 
     Parameters
@@ -235,7 +237,7 @@ def tables_of(groups: Mapping[str, Group], observation: ObservationSection) -> d
     }
 
 
-def _observations(group: Group, variable: str, observation: ObservationSection) -> Columns:
+def _observations(group: NetcdfGroup, variable: str, observation: ObservationSection) -> Columns:
     factor, units = observation.printed
     names = (f"{observation.role}_{number}_{unit}" for number, unit in enumerate(units, start=1))
     return dict(zip(names, factor * group[variable].values.T, strict=True))

@@ -12,7 +12,7 @@ from reporting.errors import DamagedFileError
 from reporting.files import atomic_file, atomic_write_text, hash_record
 from reporting.folders import restore_folder
 from reporting.json_file import read_json
-from reporting.netcdf import Group, read_groups, write_groups
+from reporting.netcdf import NetcdfGroup, read_groups, write_groups
 from twin_master.assets.asset_source import FlownAndBelieved
 from twin_master.errors import NotResumableError, RunFolderError, said
 from twin_master.run_folder import FIELD_NAME, read_config, to_json
@@ -30,7 +30,7 @@ TIMING_NAME = "timing.json"
 CSV_FOLDER = "csv"
 
 
-def write_run(folder: Path, groups: Mapping[str, Group], attributes: Mapping[str, Any]) -> Path:
+def write_run(folder: Path, groups: Mapping[str, NetcdfGroup], attributes: Mapping[str, Any]) -> Path:
     """Write `run.nc`; the bytes depend on nothing but what is given.
 
     Parameters

@@ -20,7 +20,7 @@ from discrepancy.system.interface import Model
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from fe.runtime.patch import LoadGain, LoadPlace, ModelPatch, PowerDamping, PowerStiffness, Primitive
-from fmu_asset.packing.contents import build_script_fmu
+from fmu_asset.packing.script import build_script_fmu
 from tests.discrepancy.rigs import INPUTS, FloatArray, asked, campaign, fmu_rig, integrated, laws
 from tests.discrepancy.rigs import seen as shown
 

@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 from fe.elements.cells import jacobians
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime.errors import MeshError
-from fe.structure.deck import words_of
-from fe.structure.decks import cards
+from fe.structure.deck_text import words_of
 from fe.structure.mesh import StructureMesh
-from fe.structure.mesh_file import read_by_meshio, read_mesh
+from fe.structure.mesh_file import read_mesh
+from fe.structure.meshio_file import read_by_meshio
+from fe.structure.nastran import cards
 from tests.meshes import box
 from tests.refusals import Inputs, refused
 

@@ -13,7 +13,7 @@ from fe.elements.elasticity import isotropic_compliance
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.runtime import errors
 from fe.structure.affine import static_responses
-from fe.structure.design import Gauge, Material
+from fe.structure.design import Gauge, MeshMaterial
 from fe.structure.gauges import gauge_rows
 from fe.structure.location import attach, on_surface
 from fe.structure.mesh import StructureMesh
@@ -270,7 +270,7 @@ def test_an_orthotropic_material_follows_its_axes(made):
 def test_an_orthotropic_material_is_softer_between_its_axes():
     # Jones (1999), eq. 2.97: 1 / E_x = c^4 / E_1 + (1 / G_12 - 2 nu_12 / E_1) s^2 c^2 + s^4 / E_2.
     c, s = np.cos(np.radians(30.0)), np.sin(np.radians(30.0))
-    ply = Material(
+    ply = MeshMaterial(
         name="ply", density=0.0, axes=((c, s, 0.0), (-s, c, 0.0)), young_moduli=(9e9, 7e9, 5e9),
         poisson_ratios=(0.3, 0.25, 0.2), shear_moduli=(4e9, 3e9, 2e9),
     )  # fmt: skip

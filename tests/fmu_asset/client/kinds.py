@@ -16,7 +16,7 @@ from fe.runtime.state import TIP_FORCE
 from fe.runtime.transient import ModalIntegrator
 from fe.structure.design import parse_structure
 from fmu_asset.client.binding import Binding, load_binding, parse_binding
-from fmu_asset.companions.damage_growth import DamageGrowth
+from fmu_asset.companions.damage_growth import DamageGrowthBehaviour
 from fmu_asset.structures import structure_binding
 from scenarios import binding_files
 from tests.conftest import BEAM
@@ -249,7 +249,7 @@ def damage(kind: Kind, ours: OurFmus) -> Shown:
     """The behaviour that is packed, in this process."""
     values = parameters_of(ours(kind.file))
     values |= {kind.binding.parameter[name].variable: value for name, value in kind.parameters.items()}
-    behaviour = DamageGrowth()
+    behaviour = DamageGrowthBehaviour()
     behaviour.start(values, 0.0, [1.0])
     loads = enumerate(kind.course["control"]["load_factor"])
     return [behaviour.advance(float(time), 1.0, [load]) for time, load in loads], {}

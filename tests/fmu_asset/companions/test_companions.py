@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fmu_asset.companions.damage_growth import DamageGrowth
-from fmu_asset.companions.strain_gauges import StrainGauges
+from fmu_asset.companions.damage_growth import DamageGrowthBehaviour
+from fmu_asset.companions.strain_gauges import StrainGaugesBehaviour
 from tests.fmu_asset.making import parameters_of
 from tests.fmu_asset.ours import OurFmus
 
@@ -17,13 +17,13 @@ from tests.fmu_asset.ours import OurFmus
 
 
 @pytest.fixture(scope="module")
-def damage(ours: OurFmus) -> Callable[..., DamageGrowth]:
+def damage(ours: OurFmus) -> Callable[..., DamageGrowthBehaviour]:
     """Return what begins with the start values that the packed FMU declares."""
     declared = parameters_of(ours("damage_growth"))
 
-    def begun(**changes: float) -> DamageGrowth:
+    def begun(**changes: float) -> DamageGrowthBehaviour:
         assert not set(changes) - set(declared)
-        behaviour = DamageGrowth()
+        behaviour = DamageGrowthBehaviour()
         behaviour.start(declared | changes, 0.0, [1.0])
         return behaviour
 
@@ -99,7 +99,7 @@ def gauges(ours: OurFmus) -> Callable[..., Callable[[float], list[float]]]:
         assert not set(changes) - set(declared)
         outside = tuple(f"[{gauge}]" for gauge in range(len(strains) + 1, 25))
         mine = {name: v for name, v in (declared | changes).items() if not name.endswith(outside)}
-        behaviour = StrainGauges()
+        behaviour = StrainGaugesBehaviour()
         started = behaviour.start(mine, 0.0, strains)
         return lambda time: started if time < 0.0 else behaviour.advance(float(time), 1.0, strains)
 

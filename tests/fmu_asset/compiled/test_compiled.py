@@ -22,8 +22,9 @@ from scipy.linalg import expm
 from fe.runtime.reduced import ReducedModel
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.compiled import package
-from fmu_asset.compiled.package import CROSS_COMPILER, data_file_bytes, pack_arrays
+from fmu_asset.compiled.compiler import CROSS_COMPILER
 from fmu_asset.compiled.package import STATES as STATE_NAMES
+from fmu_asset.compiled.package import data_file_bytes, pack_arrays
 from fmu_asset.packing.structure_fmu import build_fmu
 from tests.fmu_asset.making import DESCRIPTION, ROOT, members, run_python, tables
 from tests.fmu_asset.ours import OurFmus

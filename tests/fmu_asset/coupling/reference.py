@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import expm
 
-from fmu_asset.coupling.structure import Component, Setting, SystemStructure
+from fmu_asset.coupling.structure import Component, ComponentSetting, SystemStructure
 from tests.fmu_asset.making import system, tables
 from tests.fmu_asset.ours import OurFmus
 
@@ -25,7 +25,7 @@ def linear(name: str, fmu: Path, substeps: int = 1, **values: Any) -> Component:
     settings = {}
     for key, value in values.items():
         for place, x in np.ndenumerate(np.array(value, dtype=float)):
-            settings[key + "".join(str(index + 1) for index in place)] = Setting(float(x))
+            settings[key + "".join(str(index + 1) for index in place)] = ComponentSetting(float(x))
     return Component(name, fmu, settings, substeps)
 
 
@@ -50,7 +50,7 @@ def coupled(name: str, foreign_fmu: Any, substeps: int = 1) -> SystemStructure:
 def of_ours(ours: OurFmus, told: Mapping[str, Any] = SYSTEMS["three"], name: str = "test") -> SystemStructure:
     """Return a system of our FMUs: what is set in them, and how they are joined."""
     components = [
-        Component(part, ours(PARTS[part]), {key: Setting(*value) for key, value in given.items()})
+        Component(part, ours(PARTS[part]), {key: ComponentSetting(*value) for key, value in given.items()})
         for part, given in told["given"].items()
     ]
     return system(components, told["links"], name)

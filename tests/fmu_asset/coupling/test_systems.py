@@ -14,9 +14,17 @@ from scipy.sparse.csgraph import connected_components, shortest_path
 from fmu_asset import errors
 from fmu_asset.archive.fmu_file import read_fmu
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import Component, Connection, Connector, Endpoint, Setting, SystemStructure
+from fmu_asset.coupling.schedule import algebraic_loops, schedule, strong_components
+from fmu_asset.coupling.structure import (
+    Component,
+    ComponentSetting,
+    Connection,
+    Connector,
+    Endpoint,
+    SystemStructure,
+)
 from fmu_asset.coupling.structure import expand_connection as expand
-from fmu_asset.coupling.wiring import Wiring, algebraic_loops, schedule, strong_components
+from fmu_asset.coupling.wiring import Wiring
 from tests.fmu_asset.client.kinds import BINDINGS
 from tests.fmu_asset.coupling.reference import PARTS, SYSTEMS, coupled, linear, of_ours, recursion
 from tests.fmu_asset.making import bound, changed, system, tables, watch
@@ -127,7 +135,7 @@ def circle(fmu: Any, *, exchange: bool = False, delayed: bool = False, substeps:
         Connection(Endpoint("second", "x"), Endpoint("first", "u"), factor=-2.0, delayed=delayed),
     )
     second = Component("second", fmu, {}, substeps, "model-exchange" if exchange else "co-simulation")
-    first = Component("first", fmu, {"start": Setting(1.0)}, interface="co-simulation")
+    first = Component("first", fmu, {"start": ComponentSetting(1.0)}, interface="co-simulation")
     return SystemStructure("circle", (first, second), (), joined)
 
 
@@ -173,7 +181,7 @@ def test_what_does_not_fit_is_one_sentence(base, foreign_fmu, tmp_path) -> None:
     refused = [({"connections": [link(*ends) for ends in joined]}, w) for joined, w in REFUSED["unjoined"]]
     for name, key, value, words in REFUSED["unset"]:
         part = base.component(name) if name in PARTS else Component(name, foreign_fmu(name))
-        settled = replace(part, settings={key: Setting(*value)})
+        settled = replace(part, settings={key: ComponentSetting(*value)})
         refused += [({"components": [settled]}, words)]
     refused += [
         ({"components": []}, "has no component"),
@@ -202,10 +210,14 @@ def test_units_and_types_are_converted(base, foreign_fmu) -> None:
         assert wiring.ends["percent"][0].conversion == conversion
         assert next(iter(wiring.feeds.values())).conversion == (1.0, 0.0)
         assert (wiring.ends["seen"][0].conversion, wiring.units["seen"]) == ((2.0, 0.5), "m")
-    given = {"mass.servo": Setting(150.0, "g"), "response": Setting("transient"), "health.z1": Setting(0.2)}
+    given = {
+        "mass.servo": ComponentSetting(150.0, "g"),
+        "response": ComponentSetting("transient"),
+        "health.z1": ComponentSetting(0.2),
+    }
     wiring = Wiring(replace(base, components=(replace(base.component("wing"), settings=given),)))
     assert wiring.settings["wing"] == {"mass.servo": pytest.approx(0.15), "response": 2.0, "health.z1": 0.2}
-    switched = Component("a", foreign_fmu("array3"), {"active": Setting(False)})
+    switched = Component("a", foreign_fmu("array3"), {"active": ComponentSetting(False)})
     assert Wiring(SystemStructure("one", (switched,))).settings == {"a": {"active": 0.0}}
     # An enumeration and an integer feed each other.
     joined = Wiring(replace(base, connections=(link("damage.status", "spring.misbehaviour"),)))

@@ -23,8 +23,8 @@ from fmu_asset.checks.file_checks import check_file
 from fmu_asset.checks.fmu_check import check_fmu
 from fmu_asset.client.session import FmiAsset
 from fmu_asset.companions import COMPANION_NAMES
-from fmu_asset.compiled.package import compile_library, find_compiler
-from fmu_asset.packing.contents import build_script_fmu
+from fmu_asset.compiled.compiler import compile_library, find_compiler
+from fmu_asset.packing.script import build_script_fmu
 from fmu_asset.packing.structure_fmu import build_fmu
 from fmu_asset.slaves.table import structure_table
 from scenarios import asset_scripts

@@ -21,10 +21,10 @@ from fmu_asset.client.session import FmiAsset
 from fmu_asset.coupling.asset import CoupledAsset
 from fmu_asset.coupling.structure import (
     Component,
+    ComponentSetting,
     Connection,
     Connector,
     Endpoint,
-    Setting,
     SystemStructure,
     expand_connection,
 )
@@ -32,8 +32,8 @@ from fmu_asset.coupling.system import system_description
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.errors import CouplingError, SspError
 from fmu_asset.ssp.check import check_ssp, join_ssp, left_out_sentence
-from fmu_asset.ssp.package import write_ssp
 from fmu_asset.ssp.reader import read_ssp
+from fmu_asset.ssp.writer import write_ssp
 from tests.fmu_asset.client.kinds import BINDINGS
 from tests.fmu_asset.coupling.reference import PARTS, of_ours
 from tests.fmu_asset.making import archive_of, bound, members, tables, watch
@@ -129,7 +129,7 @@ def test_any_connection_and_value_survives(fmus, tmp_path_factory, drawn, subste
         replace(expand_connection(*pair, NAMES)[0], **dict(zip(keys, values, strict=True)))
         for pair, values in zip(ends, drawn, strict=True)
     )
-    given_values = {"level": Setting(level, "1"), "seed": Setting(seed)}
+    given_values = {"level": ComponentSetting(level, "1"), "seed": ComponentSetting(seed)}
     components = (
         Component("damage", fmus["damage"], given_values, substeps),
         Component("gauges", fmus["gauges"]),
@@ -286,7 +286,7 @@ def test_fmus_of_other_versions_are_joined(foreign_fmu, tmp_path) -> None:
 
 def test_start_values_of_outputs_are_set(foreign_fmu) -> None:
     """SSP 1.0, 5.2.3: what a parameter binding can set is everything that starts with a given value."""
-    ball = Component("ball", foreign_fmu("ball2"), {"h": Setting(3.0), "v": Setting(-1.0)})
+    ball = Component("ball", foreign_fmu("ball2"), {"h": ComponentSetting(3.0), "v": ComponentSetting(-1.0)})
     binding = bound(0.1, {"h": (["ball.h", "ball.v"], ["m", "m/s"])})
     with CoupledAsset(SystemStructure("one", (ball,)), binding, isolated=False) as asset:
         asset.reset()
@@ -423,6 +423,6 @@ def test_an_enumeration_in_a_system_is_set_by_name(alarm, tmp_path) -> None:
 
 
 def test_a_value_that_an_enumeration_of_a_system_lacks_is_refused(foreign_fmu) -> None:
-    siren = Component("siren", foreign_fmu("siren2"), {"loudness": Setting(2)})
+    siren = Component("siren", foreign_fmu("siren2"), {"loudness": ComponentSetting(2)})
     with pytest.raises(CouplingError, match="it is an enumeration of quiet = 1, loud = 3"):
         Wiring(SystemStructure("one", (siren,)))

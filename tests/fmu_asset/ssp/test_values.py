@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from fmu_asset.coupling.asset import CoupledAsset
-from fmu_asset.coupling.structure import Component, Setting, SystemStructure
+from fmu_asset.coupling.structure import Component, ComponentSetting, SystemStructure
 from fmu_asset.coupling.wiring import Wiring
 from fmu_asset.errors import CouplingError
 from fmu_asset.ssp.check import check_ssp, join_ssp
-from fmu_asset.ssp.package import write_ssp
 from fmu_asset.ssp.reader import read_ssp
+from fmu_asset.ssp.writer import write_ssp
 from tests.fmu_asset.making import archive_of, watch
 
 SYSTEM = """<?xml version="1.0" encoding="UTF-8"?>
@@ -104,8 +104,8 @@ def test_an_fmu_of_another_version_takes_a_text(alarm, model, tmp_path) -> None:
 
 def test_a_text_stays_after_a_reset_and_another_one_is_another_system(foreign_fmu) -> None:
     """Where the same system has another text, no state of it is taken."""
-    siren = Component("siren", foreign_fmu("siren2"), {"label": Setting("horn")})
-    other = replace(siren, settings={"label": Setting("whistle")})
+    siren = Component("siren", foreign_fmu("siren2"), {"label": ComponentSetting("horn")})
+    other = replace(siren, settings={"label": ComponentSetting("whistle")})
     binding = watch("siren.y", step_size=0.1)
     first, second = (
         CoupledAsset(SystemStructure("s", (c,)), binding, isolated=False) for c in (siren, other)

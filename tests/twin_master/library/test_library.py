@@ -20,11 +20,11 @@ from scipy.optimize import brentq
 from calibration.result.file import result_bytes
 from calibration.result.record import Calibration, ParameterPrior
 from fmu_asset.errors import FmuCallError, FmuTimeoutError, FmuWorkerError
-from fmu_asset.packing.contents import build_script_fmu
+from fmu_asset.packing.script import build_script_fmu
 from reporting.arrays import Float
 from reporting.progress import SilentProgress
 from scenarios import asset_scripts
-from scenarios.assets.gear_pump import steady_temperature
+from scenarios.assets.gear_pump import Conditions, steady_temperature
 from tests.kept import ROOT
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import check_same, cut_off_after, loaded_from, merged, table_of, written
@@ -340,7 +340,7 @@ def test_what_the_twin_knows_is_what_the_equations_say(believed, tmp_path):
     found, _ = known.rewards.expectation(believes, seen)
     assert (found[0], found[2]) == pytest.approx((health[:, 4, 1].mean(), error), rel=1e-7)
     # Where the cooler cannot hold the oil there is no steady operation.
-    assert math.isnan(steady_temperature(2500.0 * math.pi / 30.0, 210e5, 1.0, 0.0, 1.0))
+    assert math.isnan(steady_temperature(Conditions(2500.0 * math.pi / 30.0, 210e5, 1.0, 0.0, 1.0)))
 
 
 @pytest.mark.parametrize("way", ["asset", "library", "swept", "learnt"])

@@ -1,5 +1,0 @@
-"""Why files of structures and wings are refused: one file of sentences, filled in here."""
-
-from reporting.sentences import Sentences
-
-said = Sentences(__file__).said

@@ -1,0 +1,304 @@
+"""Reading the meshes of Abaqus and CalculiX from their input files (`.inp`).
+
+meshio reads such files as well, but neither NSET of *NODE, nor GENERATE over several lines, nor
+*SURFACE; it loses element sets of a deck of several blocks, and does not name the line of a fault.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+
+from fe.elements.kinds import DECK_KINDS
+from reporting.toml_file import short_repr
+
+from .coordinates import GLOBAL, CoordinateSystem, axes_by_points
+from .deck import Deck, SurfaceRow
+from .deck_text import FLAT, fail, lines_of, real, whole, words_of
+
+_COMMENT = re.compile(r"^\s*\*\*.*")
+_INCLUDE = re.compile(r"\s*\*\s*INCLUDE\s*,\s*INPUT\s*=(.*)", re.IGNORECASE)
+_TYPES_OF_MESHIO = {"C3D8RH": "C3D8", "C3D10MH": "C3D10", "C3D20RH": "C3D20"}
+"""Types under which meshio writes plain hexahedra and tetrahedra."""
+
+_SAME_STIFFNESS = re.compile(r"(C3D(?:4|6|8|10|15|20|20R))[HT]")
+"""Hybrid elements, and those with a temperature: plain ones where the material is compressible."""
+
+_VARIANT = re.compile(r"(C3D\d+)[A-Z]+")
+_OTHER_STIFFNESS = {
+    "C3D8I": "enhanced by incompatible modes and softer in bending",
+    "C3D8R": "integrated at one point and softer in bending",
+    "C3D10M": "modified for contact",
+}
+
+
+class _ElementType(NamedTuple):
+    """A type of elements: its name in meshio, and the number of its nodes."""
+
+    meshio_name: str
+    node_count: int
+
+
+def _element_types() -> dict[str, _ElementType]:
+    """Return the types of elements that are read, by their names in a deck."""
+    types = {}
+    for meshio_name, kind in DECK_KINDS.items():
+        types[kind.calculix] = _ElementType(meshio_name, kind.node_count)
+    for name, meshio_name in words_of("abaqus").flat.items():
+        types[name] = _ElementType(meshio_name, FLAT[meshio_name].node_count)
+    return types
+
+
+_ELEMENT_TYPES = _element_types()
+
+
+class _DataLine(NamedTuple):
+    """A line of data: its file and line, and its values."""
+
+    where: str
+    values: list[str]
+
+
+class _Block(NamedTuple):
+    """A keyword with its parameters, and the lines of data below it.
+
+    Attributes
+    ----------
+    where : str
+        File and line of the keyword.
+    keyword : str
+        The keyword in capital letters.
+    parameters : dict of str to str
+        Values by name in capital letters; empty for a parameter without value.
+    data : list of _DataLine
+        The lines of data.
+    """
+
+    where: str
+    keyword: str
+    parameters: dict[str, str]
+    data: list[_DataLine]
+
+    def required(self, parameter: str) -> str:
+        """Return a parameter that must be there."""
+        if not self.parameters.get(parameter):
+            fail(self.where, f"*{self.keyword} must say {parameter}=a name.")
+        return self.parameters[parameter]
+
+
+def read_abaqus(path: Path) -> Deck:
+    """Read the mesh of a deck; everything else in it (materials, steps, loads) is passed over.
+
+    Raises
+    ------
+    MeshError
+        If it cannot be read, or holds what the mesh would lose; the sentence names the line.
+    """
+    words = words_of("abaqus")
+    deck = Deck(path, words)
+    coordinates = GLOBAL
+    for block in _blocks(path):
+        if block.keyword.endswith(" SECTION"):
+            deck.sections[block.parameters.get("ELSET", "").casefold()] = block.where
+        if block.keyword not in words.read:
+            deck.pass_over(block.keyword, block.where)
+            continue
+        for parameter in block.parameters:
+            if parameter not in words.read[block.keyword]:
+                fail(
+                    block.where,
+                    f"*{block.keyword} with {short_repr(parameter)} is not read; write what it "
+                    "makes out.",
+                )
+        if block.keyword == "NODE":
+            _add_nodes(deck, block, coordinates)
+        elif block.keyword == "ELEMENT":
+            _add_elements(deck, block)
+        elif block.keyword == "SYSTEM":
+            coordinates = _coordinate_system(block)
+        elif block.keyword == "SURFACE":
+            _add_surface(deck, block)
+        else:
+            _add_members(deck, block)
+    return deck
+
+
+@dataclass
+class _RawBlock:
+    """A keyword line with the lines that continue it, and the lines of data below it."""
+
+    where: str
+    head: list[str]
+    data: list[_DataLine]
+
+    @property
+    def head_continues(self) -> bool:
+        """Whether the next line continues the keyword line."""
+        return not self.data and self.head[-1].endswith(",")
+
+
+def _blocks(path: Path) -> Iterator[_Block]:
+    """Yield the keywords of a file with their parameters and data."""
+    raw_blocks: list[_RawBlock] = []
+    for where, line in lines_of((path,), _COMMENT, _INCLUDE):
+        text = line.strip()
+        if text.startswith("*"):
+            raw_blocks.append(_RawBlock(where, [text[1:]], []))
+        elif raw_blocks and raw_blocks[-1].head_continues:
+            raw_blocks[-1].head.append(text)
+        elif raw_blocks:
+            values = [value.strip() for value in text.split(",")]
+            raw_blocks[-1].data.append(_DataLine(where, values))
+    for block in raw_blocks:
+        parts = [" ".join(part.split()) for part in "".join(block.head).split(",")]
+        keyword, *parameter_texts = parts
+        parameters = {}
+        for text in parameter_texts:
+            if text:
+                name, _, value = text.partition("=")
+                parameters[name.strip().upper()] = value.strip().strip('"')
+        yield _Block(block.where, keyword.upper(), parameters, block.data)
+
+
+def _coordinate_system(block: _Block) -> CoordinateSystem:
+    """Return the system of the nodes below a *SYSTEM.
+
+    It is given by its origin, then a point on x, then one in the plane of x and y. Without the
+    last, z stays and x turns about it; with the origin alone, the axes stay.
+    """
+    numbers: list[float] = []
+    for where, values in block.data:
+        # empty values at the end of a line are no numbers
+        for text in ",".join(values).rstrip(",").split(","):
+            numbers.append(real(where, text))
+    if len(numbers) not in (0, 3, 6, 9):
+        fail(
+            block.where,
+            f"*SYSTEM needs one, two or three points, but {len(numbers)} numbers came.",
+        )
+    points = np.zeros((3, 3))
+    points.flat[: len(numbers)] = numbers
+    origin, point_on_x, _ = points
+    if len(numbers) < 6:
+        points[1:] = origin + np.eye(3)[:2]
+    elif len(numbers) < 9:
+        point_on_x[2] = origin[2]
+        points[2] = origin + np.cross((0.0, 0.0, 1.0), point_on_x - origin)
+    return CoordinateSystem(origin, axes_by_points(block.where, points))
+
+
+def _add_nodes(deck: Deck, block: _Block, coordinates: CoordinateSystem) -> None:
+    """Add the nodes of a *NODE, whose coordinates are in the system of the last *SYSTEM."""
+    kind = block.parameters.get("SYSTEM", "R").upper()
+    if kind not in ("R", "C"):
+        fail(block.where, f"*NODE with SYSTEM={kind} is not read; give the nodes in SYSTEM=R or C.")
+    numbers = [whole(where, values[0]) for where, values in block.data]
+    rows = []
+    for where, values in block.data:
+        three_texts = (*values[1:], "", "", "")[:3]  # those left out are 0
+        rows.append([real(where, text) for text in three_texts])
+    points = replace(coordinates, kind=kind).to_space(np.reshape(rows, (-1, 3)))
+    for line, number, point in zip(block.data, numbers, points.tolist(), strict=True):
+        deck.add_node(line.where, number, point)
+    if "NSET" in block.parameters:
+        deck.members("NSET", block.required("NSET")).extend(numbers)
+
+
+def _add_elements(deck: Deck, block: _Block) -> None:
+    """Add the elements of an *ELEMENT; an element may take several lines."""
+    type_name = block.required("TYPE").upper()
+    plain_type = _plain_type(type_name, block.where)
+    if plain_type != type_name:
+        deck.remark(f"{block.where}: elements of type {type_name} are built as {plain_type}.")
+    element_type = _ELEMENT_TYPES[plain_type]
+    numbers: list[int] = []
+    places: list[str] = []  # file and line of each number
+    for where, values in block.data:
+        for text in values:
+            if text:
+                numbers.append(whole(where, text))
+                places.append(where)
+    width = element_type.node_count + 1
+    if len(numbers) % width:
+        fail(
+            block.where,
+            f"{len(numbers)} numbers are not a multiple of {width}, as {type_name} needs.",
+        )
+    added = []
+    for start in range(0, len(numbers), width):
+        number, *nodes = numbers[start : start + width]
+        deck.add_element(places[start], number, element_type.meshio_name, nodes)
+        added.append(number)
+    if "ELSET" in block.parameters:
+        deck.members("ELSET", block.required("ELSET")).extend(added)
+
+
+def _plain_type(name: str, where: str) -> str:
+    """Return the type of elements that is built for a type of a deck.
+
+    Parameters
+    ----------
+    name : str
+        The type in the deck.
+    where : str
+        Its file and line.
+    """
+    same = _SAME_STIFFNESS.fullmatch(name)
+    if name in _TYPES_OF_MESHIO:
+        plain = _TYPES_OF_MESHIO[name]
+    elif same:
+        plain = same[1]
+    else:
+        plain = name
+    if plain not in _ELEMENT_TYPES:
+        _refuse_type(name, where)
+    return plain
+
+
+def _refuse_type(name: str, where: str) -> NoReturn:
+    """Refuse a type of elements; of a variant of a known type, the message says how it differs."""
+    readable = ", ".join(kind.calculix for kind in DECK_KINDS.values())
+    variant = _VARIANT.fullmatch(name)
+    if variant is None or variant[1] not in _ELEMENT_TYPES:
+        fail(where, f"elements of type {short_repr(name)} cannot be read; {readable} can.")
+    difference = f"they are {_OTHER_STIFFNESS.get(name, 'other elements')}, not {variant[1]}"
+    remedy = f"write {variant[1]} if that is meant"
+    if variant[1] == "C3D8":
+        remedy = f"mesh with second-order elements (C3D20, C3D20R or C3D10), or {remedy}"
+    fail(
+        where,
+        f"elements of type {name} cannot be read: {difference}; {remedy}. {readable} can be read.",
+    )
+
+
+def _add_surface(deck: Deck, block: _Block) -> None:
+    """Add a *SURFACE that names faces of elements; one of nodes is passed over."""
+    if block.parameters.get("TYPE", "ELEMENT").upper() != "ELEMENT":
+        return
+    rows = []
+    for where, values in block.data:
+        member, face = (*values, "")[:2]
+        rows.append(SurfaceRow(where, member, face))
+    deck.surfaces[block.required("NAME")] = rows
+
+
+def _add_members(deck: Deck, block: _Block) -> None:
+    """Add the members of an *NSET or *ELSET, written out or generated by first, last and step."""
+    members = deck.members(block.keyword, block.required(block.keyword))
+    for where, values in block.data:
+        texts = [value for value in values if value]
+        if "GENERATE" not in block.parameters:
+            for text in texts:
+                members.extend(deck.members_or_number(block.keyword, where, text))
+            continue
+        numbers = [whole(where, text) for text in texts]
+        first, last, step = [*numbers, 1, 0, 0][:3]
+        if len(texts) not in (2, 3) or first < 1 or step < 1:
+            fail(
+                where,
+                f"first, last and step are expected, but {short_repr(','.join(texts))} came.",
+            )
+        members.extend(deck.counted(where, range(first, last + 1, step)))

@@ -1,0 +1,88 @@
+"""The coordinate systems of decks: points by radii and angles, or along other axes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fe.elements.elasticity import axes_of
+from fe.runtime.arrays import FloatArray
+
+from .deck_text import fail
+
+_LEAST_SINE = 1e-9
+
+
+@dataclass(frozen=True)
+class CoordinateSystem:
+    """A coordinate system.
+
+    Attributes
+    ----------
+    origin : (3,) array
+        The origin in space.
+    axes : (3, 3) array
+        The axes x, y, z in space, one in each row.
+    kind : {"R", "C", "S"}
+        The kind of coordinates: x, y, z; radius, angle about z from x in degrees, z; or radius,
+        angle from z, angle about z from x.
+    """
+
+    origin: FloatArray
+    axes: FloatArray
+    kind: str = "R"
+
+    def to_space(self, coordinates: ArrayLike) -> FloatArray:
+        """Return the points in space (..., 3) of coordinates (..., 3)."""
+        local = np.asarray(coordinates, dtype=np.float64)
+        if self.kind == "S":
+            radius, polar_degrees, azimuth_degrees = np.moveaxis(local, -1, 0)
+            polar = np.deg2rad(polar_degrees)
+            local = _from_cylinder(radius * np.sin(polar), azimuth_degrees, radius * np.cos(polar))
+        elif self.kind == "C":
+            radius, azimuth_degrees, height = np.moveaxis(local, -1, 0)
+            local = _from_cylinder(radius, azimuth_degrees, height)
+        return np.asarray(self.origin + local @ self.axes)
+
+
+def _from_cylinder(
+    radius: FloatArray, azimuth_degrees: FloatArray, height: FloatArray
+) -> FloatArray:
+    """Return x, y, z (..., 3) of cylindrical coordinates (...)."""
+    azimuth = np.deg2rad(azimuth_degrees)
+    return np.stack((radius * np.cos(azimuth), radius * np.sin(azimuth), height), axis=-1)
+
+
+GLOBAL = CoordinateSystem(np.zeros(3), np.eye(3))
+
+
+def axes_by_points(
+    where: str, points: FloatArray, order: tuple[int, int, int] = (0, 1, 2)
+) -> FloatArray:
+    """Return the axes of a coordinate system that is given by three points.
+
+    Parameters
+    ----------
+    where : str
+        File and line, for the message.
+    points : (3, 3) array
+        The origin, a point on the first axis, and a point in the plane of the first two axes.
+    order : tuple of int
+        Which of the three axes is x, which y and which z: the first axis, the second, which points
+        towards the last point, and the third, at right angles to both.
+
+    Returns
+    -------
+    (3, 3) array
+        The axes x, y, z, one in each row.
+
+    Raises
+    ------
+    MeshError
+        If the points lie on a line.
+    """
+    first, second = points[1] - points[0], points[2] - points[0]
+    product_of_lengths = np.linalg.norm(first) * np.linalg.norm(second)
+    if not np.linalg.norm(np.cross(first, second)) > _LEAST_SINE * product_of_lengths:
+        fail(where, "the three points of a coordinate system must not lie on a line.")
+    return axes_of(first, second)[list(order)]

@@ -1,0 +1,296 @@
+"""Reading the matrices and vectors of other finite element codes.
+
+The content of a file tells its format: MatrixMarket; archives of NumPy and SciPy (`.npz`, `.npy`);
+DMIG of Nastran; tables of `row column value` (CalculiX' `.sti` and `.mas`, Abaqus' COORDINATE) or
+of `node component node component value` (Abaqus' MATRIX INPUT). Those that name nodes bring their
+own unknowns.
+"""
+
+import io
+import re
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from scipy import io as scipy_io
+from scipy import sparse
+
+from fe.runtime.arrays import FloatArray, IntArray
+from fe.runtime.errors import MeshError
+from reporting.text_file import read_text
+
+from .deck_text import fail
+from .matrix_design import file_of
+from .nastran import cards
+
+Place = tuple[int, int]
+"""Node and component: 1, 2, 3 along x, y, z, then 4, 5, 6 about them."""
+
+_PLACE = re.compile(r"\s*(\d+)\s*[.,;\s]\s*([1-6])\s*")
+_SQUARE_FORMS = (1, 6)
+"""Forms of DMIG matrices that are square, or symmetric."""
+
+_REAL_TYPES = (1, 2)
+"""Types of DMIG matrices that are real."""
+
+
+class _FileContent(NamedTuple):
+    """The array of a file, and whether it is a table: lines of a place or two, and a value."""
+
+    array: FloatArray | sparse.sparray
+    is_table: bool
+
+
+def read_unknowns(path: Path) -> list[Place]:
+    """Read the node and component of each row of a matrix, a line each: `97.3`, `97 3` or `97,3`.
+
+    Raises
+    ------
+    MeshError
+        If the file cannot be read, or a line is not such a pair.
+    """
+    text = read_text(path, MeshError, what="file of unknowns")
+    unknowns = []
+    for number, line in enumerate(text.splitlines(), start=1):
+        match = _PLACE.fullmatch(line)
+        if match is not None:
+            unknowns.append((int(match[1]), int(match[2])))
+        elif line.strip():
+            fail(
+                f"{path}, line {number}",
+                f"a node and its component from 1 to 6 are expected, but {line!r} came.",
+            )
+    return unknowns
+
+
+def read_matrix(folder: Path, name: str) -> tuple[sparse.csr_array, list[Place] | None]:
+    """Read a matrix, and the unknown of each row where the file says it.
+
+    A table may leave out one of each two entries that mirror each other.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the file.
+    name : str
+        `FILE` or `FILE:MATRIX`.
+
+    Returns
+    -------
+    matrix : (n, n) sparse array
+        The matrix.
+    unknowns : list of (int, int) or None
+        Node and component of each row; None if the file does not say them.
+
+    Raises
+    ------
+    MeshError
+        If the file cannot be read, or holds no such matrix.
+    """
+    file, matrix_name = file_of(name)
+    path = folder / file
+    content = _read(path, matrix_name)
+    if not content.is_table:
+        return _square_matrix(path, content.array), None
+    table = content.array
+    width = table.shape[1]
+    if width not in (3, 5) or not table.size or not _are_whole(table[:, :-1]):
+        fail(
+            str(path),
+            "lines of row, column and value, or of node, component, node, component and value, "
+            f"are expected, but {len(table)} lines of {width} numbers came.",
+        )
+    positions = table[:, :-1].astype(np.int64)
+    unknowns = None
+    if width == 5:
+        both_places = positions.reshape(-1, 2)
+        places, index_of_place = np.unique(both_places, axis=0, return_inverse=True)
+        unknowns = [(node, component) for node, component in places.tolist()]
+        indices = index_of_place.reshape(-1, 2)
+    else:
+        if positions.min() < 1:
+            fail(str(path), "rows and columns are counted from 1, but there is a smaller one.")
+        indices = positions - 1
+    return _symmetric_matrix(indices, table[:, -1]), unknowns
+
+
+def _are_whole(numbers: FloatArray) -> bool:
+    return np.array_equal(numbers, np.rint(numbers))
+
+
+def _square_matrix(path: Path, matrix: FloatArray | sparse.sparray) -> sparse.csr_array:
+    """Return the matrix of a file as a sparse one; refuse one that is not square or not real."""
+    is_square = matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]
+    if not is_square or matrix.dtype.kind not in "fiu":
+        fail(
+            str(path),
+            f"a square matrix of real numbers is expected, but {matrix.dtype} of shape "
+            f"{matrix.shape} came.",
+        )
+    return sparse.csr_array(matrix, dtype=np.float64)
+
+
+def _symmetric_matrix(indices: IntArray, values: FloatArray) -> sparse.csr_array:
+    """Return the matrix of a table, with the mirrored entries if the table has one triangle only.
+
+    Parameters
+    ----------
+    indices : (N, 2) array
+        Row and column of each entry, from 0.
+    values : (N,) array
+        The entries; those of one place are added.
+    """
+    size = int(indices.max()) + 1
+    places = tuple(indices.T)
+    matrix = sparse.coo_array((values, places), (size, size)).tocsr()
+    pattern = sparse.coo_array((np.ones(len(values)), places), (size, size)).tocsr()
+    mirrored_entries = pattern.multiply(pattern.T).tocoo()
+    has_one_triangle = (mirrored_entries.row == mirrored_entries.col).all()
+    if has_one_triangle:
+        matrix = (matrix + matrix.T - sparse.diags_array(matrix.diagonal())).tocsr()
+    return matrix
+
+
+def read_vector(
+    folder: Path, name: str, unit_vector: Callable[[Place], FloatArray], size: int
+) -> FloatArray:
+    """Read a vector: as many numbers as there are unknowns, or lines of node, component and value.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the file.
+    name : str
+        `FILE` or `FILE:ARRAY`.
+    unit_vector : callable
+        Returns the vector (n,) of 1 at a node's component.
+    size : int
+        Number n of unknowns.
+
+    Returns
+    -------
+    (n,) array
+        The vector.
+
+    Raises
+    ------
+    MeshError
+        If the file cannot be read or has another length.
+    """
+    file, array_name = file_of(name)
+    content = _read(folder / file, array_name)
+    if content.is_table and content.array.shape[1] == 3:
+        terms = []
+        for node, component, value in content.array:
+            terms.append(value * unit_vector((int(node), int(component))))
+        return np.asarray(np.sum(terms, axis=0))
+    array = content.array
+    dense = array.todense() if isinstance(array, sparse.sparray | sparse.spmatrix) else array
+    values = np.asarray(dense, dtype=np.float64)
+    if values.size != size or max(values.shape) != size:
+        fail(
+            str(folder / file),
+            f"a vector of {size} numbers, or lines of node, component and value, are expected, but "
+            f"an array of shape {values.shape} came.",
+        )
+    return values.ravel()
+
+
+def _read(path: Path, array_name: str) -> _FileContent:
+    """Return the content of a file of any format; see the module.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    array_name : str
+        The array or matrix in it; empty if it has one only.
+    """
+    try:
+        if path.suffix in (".npz", ".npy"):
+            return _FileContent(_numpy_array(path, array_name), is_table=False)
+        text = read_text(path, MeshError, what="matrix file", otherwise="latin-1")
+        if text.startswith("%%MatrixMarket"):
+            return _FileContent(scipy_io.mmread(path), is_table=False)
+        if re.search(r"^DMIG", text, re.MULTILINE):
+            return _FileContent(_dmig_table(path, array_name), is_table=True)
+        if not text.strip():
+            raise ValueError("it is empty")
+        lines = io.StringIO(text.replace(",", " "))
+        table = np.loadtxt(lines, comments=("**", "#", "$"), ndmin=2)
+        return _FileContent(table, is_table=True)
+    except (ValueError, OSError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        reason = " ".join(str(error).split())
+        fail(str(path), f"the file cannot be read as a matrix: {reason}.")
+
+
+def _numpy_array(path: Path, array_name: str) -> FloatArray | sparse.sparray:
+    """Return an array of an archive of NumPy or SciPy."""
+    if path.suffix == ".npy":
+        array: FloatArray = np.load(path, allow_pickle=False)
+        return array
+    with np.load(path, allow_pickle=False) as archive:
+        if "format" in archive:  # of SciPy
+            return sparse.load_npz(path)
+        names = list(archive)
+        is_only_one = not array_name and len(names) == 1
+        if array_name not in names and not is_only_one:
+            fail(
+                str(path),
+                f"one of its arrays is expected, as FILE:ARRAY; it has {', '.join(names)}.",
+            )
+        archived: FloatArray = archive[array_name or names[0]]
+        return archived
+
+
+class _DmigMatrix(NamedTuple):
+    """A matrix in the bulk data of Nastran.
+
+    Attributes
+    ----------
+    form : int
+        The form in Nastran's numbers: square, symmetric, ...
+    entries : list of tuple of float
+        Node and component of the row, node and component of the column, and value of each entry.
+    """
+
+    form: int
+    entries: list[tuple[float, ...]]
+
+
+def _dmig_table(path: Path, matrix_name: str) -> FloatArray:
+    """Read a real square matrix from the DMIG of the bulk data, as a table (N, 5)."""
+    matrices: dict[str, _DmigMatrix] = {}
+    for card in cards(path):
+        if card.word != "DMIG":
+            continue
+        name = card.fields[0].upper()
+        is_head = name not in matrices
+        if is_head:
+            matrices[name] = _DmigMatrix(form=card.whole(2), entries=[])
+            if card.whole(3) not in _REAL_TYPES:
+                fail(card.where, f"a real matrix is expected, but {name} is complex.")
+            continue
+        column = (card.whole(1), max(card.whole(2), 1))
+        for first in range(4, len(card.fields), 4):
+            if card.fields[first]:
+                row = (card.whole(first), max(card.whole(first + 1), 1))
+                (value,) = card.reals(first + 2, 1)
+                matrices[name].entries.append((*row, *column, value))
+    chosen = matrix_name.upper()
+    if not chosen and len(matrices) == 1:
+        (chosen,) = matrices
+    if chosen not in matrices or not matrices[chosen].entries:
+        fail(
+            str(path),
+            f"one of its matrices is expected, as FILE:MATRIX; it has {', '.join(matrices)}.",
+        )
+    matrix = matrices[chosen]
+    if matrix.form not in _SQUARE_FORMS:
+        fail(
+            str(path),
+            f"a square or symmetric matrix is expected, but {chosen} is of form {matrix.form}.",
+        )
+    return np.array(matrix.entries)

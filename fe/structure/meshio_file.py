@@ -1,0 +1,311 @@
+"""Reading meshes of Gmsh, VTU, MED and other formats by meshio."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fe.elements.kinds import KINDS, meshio_with_wedges
+from fe.runtime.arrays import BoolArray, IntArray
+from fe.runtime.errors import MeshError
+from reporting.words import counted, is_or_are
+
+from .deck import Deck
+from .deck_text import FLAT, fail
+
+if TYPE_CHECKING:
+    from meshio import Mesh
+
+_MOST_VALUES = 1000
+"""Most values of an array of integers by which it is read as sets."""
+
+_LEFT_OUT = 0
+"""Number that no element has: they are counted from one."""
+
+_LONGEST_REASON = 500
+
+
+def read_by_meshio(path: Path) -> Deck:
+    """Read the mesh of a file of any format that meshio knows.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+
+    Raises
+    ------
+    MeshError
+        If meshio cannot read it, or loses elements of it.
+    """
+    mesh = _mesh_of_meshio(path)
+    deck = Deck(path)
+    if path.suffix.lower() == ".msh":
+        _check_element_lines(path)
+    points = np.atleast_2d(mesh.points)
+    points = np.pad(
+        points, ((0, 0), (0, 3 - points.shape[1]))
+    )  # those of a plane have two coordinates
+    deck.nodes = {number: tuple(point) for number, point in enumerate(points.tolist(), start=1)}
+    numbers_of_blocks = _add_elements(deck, mesh)
+    for number, element_numbers in enumerate(numbers_of_blocks):
+        cell_arrays = _NamedArrays(mesh.cell_sets, mesh.cell_data)
+        _add_sets(deck, mesh, "ELSET", element_numbers, cell_arrays, number)
+    node_numbers = np.array(list(deck.nodes))
+    point_arrays = _NamedArrays(
+        sets={name: [members] for name, members in mesh.point_sets.items()},
+        data={name: [values] for name, values in mesh.point_data.items()},
+    )
+    _add_sets(deck, mesh, "NSET", node_numbers, point_arrays, 0)
+    return deck
+
+
+def _add_elements(deck: Deck, mesh: Mesh) -> list[IntArray]:
+    """Add the elements of a mesh.
+
+    Returns
+    -------
+    list of (E,) array
+        For each block of elements the numbers that they have in the deck; `_LEFT_OUT` for those
+        that were left out. Elements that are there twice share a number.
+    """
+    suffix = deck.path.suffix.lower()
+    outside_blocks = _outside_physical_groups(mesh)
+    left_out = sum(int(outside.sum()) for outside in outside_blocks)
+    if left_out:
+        elements = counted(left_out, "element")
+        deck.remark(
+            f"{deck.path}: {elements} of no physical group {is_or_are(left_out)} left out; set "
+            "Mesh.SaveAll = 0 in Gmsh, and it saves none of them."
+        )
+    numbers_of_blocks = []
+    number_of_nodes: dict[object, int] = {}
+    count = 0
+    for block, outside in zip(mesh.cells, outside_blocks, strict=True):
+        numbers = []
+        rows = (_node_rows(block.type, block.data, suffix) + 1).tolist()
+        for nodes, is_outside in zip(rows, outside.tolist(), strict=True):
+            count += 1
+            if is_outside:
+                numbers.append(_LEFT_OUT)
+                continue
+            # Gmsh writes an element once for each of its physical groups.
+            key = (block.type, *sorted(nodes)) if suffix == ".msh" else count
+            number = number_of_nodes.setdefault(key, count)
+            numbers.append(number)
+            if number == count:
+                deck.add_element(str(deck.path), count, block.type, nodes)
+        numbers_of_blocks.append(np.array(numbers, dtype=np.int64))
+    return numbers_of_blocks
+
+
+def _node_rows(block_type: str, data: IntArray, suffix: str) -> IntArray:
+    """Return the nodes (E, n) of a block of elements; none for elements of an unknown type.
+
+    Parameters
+    ----------
+    block_type : str
+        The type of the elements in meshio.
+    data : (E, n) array
+        Their nodes as meshio has read them.
+    suffix : str
+        The ending of the file: MED has an order of nodes of its own.
+    """
+    if block_type not in KINDS and block_type not in FLAT:
+        return np.zeros((len(data), 0), dtype=np.int64)
+    if suffix == ".med" and block_type in KINDS:
+        return data[:, KINDS[block_type].med_order]
+    return data
+
+
+class _NamedArrays(NamedTuple):
+    """Sets of a mesh, and its data at points or cells: arrays by name, one for each block."""
+
+    sets: Mapping[str, Sequence[ArrayLike | None]]
+    data: Mapping[str, Sequence[ArrayLike]]
+
+
+def _add_sets(
+    deck: Deck, mesh: Mesh, kind: str, numbers: IntArray, arrays: _NamedArrays, block: int
+) -> None:
+    """Add the sets of the nodes, or of one block of elements.
+
+    Parameters
+    ----------
+    deck : Deck
+        The deck that they are added to.
+    mesh : meshio.Mesh
+        The mesh.
+    kind : {"NSET", "ELSET"}
+        Sets of nodes, or of elements.
+    numbers : (n,) array
+        The numbers of the nodes or elements in the deck.
+    arrays : _NamedArrays
+        The sets and data of nodes or elements.
+    block : int
+        The index of the block in these arrays.
+    """
+    named_sets: list[tuple[str, IntArray]] = []
+    for name, members in arrays.sets.items():
+        if members[block] is not None and not name.startswith("gmsh:"):
+            named_sets.append((name, np.asarray(members[block], dtype=np.int64)))
+    for label, values in arrays.data.items():
+        for name, indices in _sets_of_values(mesh, label, values, block):
+            if name not in arrays.sets:
+                named_sets.append((name, indices))
+    for name, indices in named_sets:
+        members_of_set = numbers[indices]
+        remaining = members_of_set[members_of_set != _LEFT_OUT]
+        if len(remaining) or not len(members_of_set):
+            deck.members(kind, name).extend(remaining.tolist())
+
+
+def _sets_of_values(
+    mesh: Mesh, label: str, arrays: Sequence[ArrayLike], block: int
+) -> Iterator[tuple[str, IntArray]]:
+    """Yield the sets of nodes or elements with one value in an array of integers.
+
+    Parameters
+    ----------
+    mesh : meshio.Mesh
+        The mesh.
+    label : str
+        The name of the array, such as "gmsh:physical" or "cell_tags".
+    arrays : sequence of (n,) array
+        The array for each block.
+    block : int
+        The index of the block.
+
+    Yields
+    ------
+    name : str
+        A name of the set, in the words of the file.
+    indices : (k,) array
+        The indices of its members in the block.
+    """
+    array = np.asarray(arrays[block])
+    if array.ndim != 1 or not np.issubdtype(array.dtype, np.integer):
+        return
+    values = np.unique(array)
+    if len(values) > _MOST_VALUES:
+        return
+    all_values = tuple(np.unique(np.concatenate(arrays)).tolist())
+    # meshio writes a set alone as an array of 0 in it and -1 outside, others write 1 and 0
+    value_of_members = {(-1, 0): 0, (0, 1): 1}.get(all_values)
+    for value in values.tolist():
+        names = _names_of_value(mesh, label, value, block)
+        if value == value_of_members and ":" not in label:
+            names = [*names, label]
+        for name in names:
+            yield name, np.flatnonzero(array == value)
+
+
+def _names_of_value(mesh: Mesh, label: str, value: int, block: int) -> list[str]:
+    """Return the names that a file gives to a value of an array of integers.
+
+    Parameters
+    ----------
+    mesh : meshio.Mesh
+        The mesh.
+    label : str
+        The name of the array.
+    value : int
+        The value.
+    block : int
+        The index of the block of elements that have it.
+    """
+    number_name = f"{label}={value}"
+    if label in ("cell_tags", "point_tags"):  # MED counts families of named groups
+        families: Mapping[int, list[str]] = getattr(mesh, label, {})
+        return families.get(value, [number_name])
+    if label != "gmsh:physical":
+        return [number_name]
+    cell_type = mesh.cells[block].type
+    dimension = min(FLAT[cell_type].corner_count, 3) - 1 if cell_type in FLAT else 3
+    names = [name for name, tag in mesh.field_data.items() if tag.tolist() == [value, dimension]]
+    return names or [number_name]
+
+
+def _outside_physical_groups(mesh: Mesh) -> list[BoolArray]:
+    """Return for each block of a mesh from Gmsh which elements belong to no part of the structure.
+
+    Gmsh writes elements without a physical group, as group 0, if its option Mesh.SaveAll is set.
+    They are construction geometry if other elements of their dimension have a group. If no solid
+    element has one, the groups name faces only, and all solid elements are the structure.
+    """
+    groups = mesh.cell_data.get("gmsh:physical")
+    if groups is None:
+        return [np.zeros(len(block.data), dtype=bool) for block in mesh.cells]
+    any_has_group = any(np.any(group) for group in groups)
+    solid_groups = [
+        group for block, group in zip(mesh.cells, groups, strict=True) if block.type not in FLAT
+    ]
+    any_solid_has_group = any(np.any(group) for group in solid_groups)
+    outside = []
+    for block, group in zip(mesh.cells, groups, strict=True):
+        groups_choose_elements = any_has_group if block.type in FLAT else any_solid_has_group
+        outside.append((np.asarray(group) == 0) & groups_choose_elements)
+    return outside
+
+
+def _check_element_lines(path: Path) -> None:
+    """Refuse a text file of Gmsh with more lines of elements than it declares.
+
+    Version 2 declares the number of elements, version 4 the numbers of blocks and of elements; Gmsh
+    writes one line for each.
+    """
+    lines = [line.strip() for line in path.read_bytes().splitlines()]
+    if b"$MeshFormat" not in lines or b"$Elements" not in lines or b"$EndElements" not in lines:
+        return
+    format_fields = lines[lines.index(b"$MeshFormat") + 1].split()
+    is_text = format_fields[1] == b"0"
+    if not is_text:
+        return
+    start = lines.index(b"$Elements") + 1
+    section = lines[start : lines.index(b"$EndElements")]
+    header, *rows = [line for line in section if line]
+    declared = sum(int(number) for number in header.split()[:2])
+    if len(rows) > declared:
+        fail(
+            f"{path}, line {start + 1}",
+            f"$Elements declares {declared} lines of blocks and elements, but {len(rows)} follow, "
+            "and the last would be lost. Delete the line that is there twice, or write the mesh "
+            "anew.",
+        )
+
+
+def _mesh_of_meshio(path: Path) -> Mesh:
+    """Return the mesh that meshio reads from a file, or say in one sentence why it does not."""
+    printed = io.StringIO()
+    try:
+        # meshio writes what it thinks of a file to the terminal, and ends the program if it fails.
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(printed),
+            warnings.catch_warnings(),
+        ):
+            warnings.simplefilter("ignore")
+            return meshio_with_wedges().read(path)
+    except SystemExit:
+        reason = printed.getvalue().removeprefix("Error: ")
+    except Exception as error:  # noqa: BLE001 - the readers of formats fail in any way
+        reason = getattr(error, "strerror", None) or str(error) or "its format is not known"
+        # version 4 of Gmsh's format, where some blocks of elements have groups and others do not
+        if "gmsh:physical" in reason:
+            fail(
+                str(path),
+                "some elements are in a physical group and others in none, as Gmsh saves them "
+                "with Mesh.SaveAll = 1. Set Mesh.SaveAll = 0 and save the mesh anew.",
+            )
+    reason = " ".join(reason[:_LONGEST_REASON].split()).rstrip(".")
+    raise MeshError(
+        f"The mesh file {path} cannot be read as {path.suffix}: {reason}; it is damaged, cut off, "
+        "or of another dialect. Write it anew, or as .msh, .inp, .med or .bdf."
+    )

@@ -1,0 +1,328 @@
+"""Reading the meshes of Nastran from the bulk data of its decks (`.bdf`, `.nas`, `.fem`).
+
+meshio reads such files as well, but takes every grid point for Cartesian, passes rigid elements
+over, and does not name the line of a fault.
+"""
+
+import re
+from collections import Counter
+from pathlib import Path
+from typing import NamedTuple, NoReturn
+
+import numpy as np
+
+from fe.elements.kinds import KINDS
+from fe.runtime.arrays import FloatArray
+from reporting.toml_file import short_repr
+
+from .coordinates import GLOBAL, CoordinateSystem, axes_by_points
+from .deck import Deck
+from .deck_text import FLAT, fail, lines_of, real, whole, words_of
+
+_CORNERS_OF_SOLIDS = {"CTETRA": 4, "CHEXA": 8, "CPENTA": 6}
+_ORDER_FOR_MESHIO = {
+    "hexahedron20": (*range(12), *range(16, 20), *range(12, 16)),
+    "wedge15": (*range(9), *range(12, 15), *range(9, 12)),
+}
+"""The places of nodes: Nastran counts the middles of the upright edges before those of the top."""
+
+_FLAT_WORDS = words_of("nastran").flat
+_SECTION_WORDS = re.compile("P(BAR|BEAM|BCOMP|COMP|LPLANE|ROD|SHEAR|SHELL|TUBE)[GL]?")
+_SYSTEM_WORDS = re.compile(r"CORD([12])([RCS])")
+_COMMENT = re.compile(r"\$.*")
+_INCLUDE = re.compile(r"\s*INCLUDE\b(.*)", re.IGNORECASE)
+_BEGIN = re.compile(r"\s*BEGIN\b", re.IGNORECASE)
+_MARKER = re.compile(r"\+(?![\d.])")
+_MOST_NESTED_SYSTEMS = 50
+
+
+class _Card(NamedTuple):
+    """An entry of the bulk data.
+
+    Attributes
+    ----------
+    word : str
+        The word that it begins with.
+    where : str
+        Its file and line.
+    fields : list of str
+        Its fields from the second on, with those of its continuations.
+    """
+
+    word: str
+    where: str
+    fields: list[str]
+
+    def whole(self, index: int, default: int = 0) -> int:
+        """Return a field as a whole number; the default if it is empty."""
+        text = self.fields[index] if index < len(self.fields) else ""
+        return whole(self.where, text) if text else default
+
+    def reals(self, first: int, count: int) -> list[float]:
+        """Return fields as real numbers; 0 for empty ones."""
+        padded_fields = self.fields + [""] * (first + count)
+        return [real(self.where, text) for text in padded_fields[first : first + count]]
+
+    @property
+    def is_by_grid_points(self) -> bool:
+        """Whether a coordinate system is given by grid points, as by CORD1R."""
+        return self.word[4] == "1"
+
+
+def read_nastran(path: Path) -> Deck:
+    """Read the mesh of a deck: its bulk data, with or without the sections above it.
+
+    The elements of a property are the set `nastran:ref=` and its number.
+
+    Raises
+    ------
+    MeshError
+        If it cannot be read, or holds what the mesh would lose; the sentence names the line.
+    """
+    deck = Deck(path, words_of("nastran"))
+    points = _GridPoints()
+    for card in cards(path):
+        word = card.word
+        if word == "GRID":
+            points.add_grid(card)
+        elif word == "GRDSET":
+            points.default_system = card.whole(1)
+        elif _SYSTEM_WORDS.fullmatch(word):
+            points.add_systems(card)
+        elif word in _CORNERS_OF_SOLIDS or word in _FLAT_WORDS:
+            _add_element(deck, card)
+        elif _SECTION_WORDS.fullmatch(word):
+            deck.sections[f"nastran:ref={card.whole(0)}"] = card.where
+        else:
+            deck.pass_over(word, card.where)
+    for number, card in points.grids.items():
+        deck.add_node(card.where, number, points.point(number, card.where).tolist())
+    return deck
+
+
+class _GridPoints:
+    """The grid points of a deck, and the coordinate systems that they are given in.
+
+    Coordinate systems may be given by grid points, and these in other systems: both are resolved
+    when they are needed, after the whole deck was read.
+
+    Attributes
+    ----------
+    grids : dict of int to _Card
+        The cards of the grid points by number.
+    default_system : int
+        The system of grid points that do not name one.
+    """
+
+    def __init__(self) -> None:
+        self.grids: dict[int, _Card] = {}
+        self.default_system = 0
+        self._system_cards: dict[int, _Card] = {}
+        self._systems: dict[int, CoordinateSystem] = {0: GLOBAL}
+
+    def add_grid(self, card: _Card) -> None:
+        """Add the card of a grid point."""
+        number = card.whole(0)
+        if self.grids.setdefault(number, card).fields != card.fields:
+            fail(card.where, f"the grid point {number} is there twice; delete one.")
+
+    def add_systems(self, card: _Card) -> None:
+        """Add the coordinate systems of a card; one by grid points may hold two."""
+        holds_two = card.is_by_grid_points and card.whole(4) != 0
+        for first_field in (0, 4) if holds_two else (0,):
+            number = card.whole(first_field)
+            self._system_cards[number] = card._replace(fields=card.fields[first_field:])
+
+    def point(self, number: int, where: str, depth: int = 0) -> FloatArray:
+        """Return a grid point in space (3,).
+
+        Parameters
+        ----------
+        number : int
+            The number of the grid point.
+        where : str
+            File and line of what names it.
+        depth : int
+            The number of systems that are being resolved.
+        """
+        if number not in self.grids:
+            fail(where, f"the grid point {number} is not there.")
+        card = self.grids[number]
+        system = self._system(card.whole(1, self.default_system), card.where, depth)
+        return system.to_space(card.reals(2, 3))
+
+    def _system(self, number: int, where: str, depth: int) -> CoordinateSystem:
+        """Return a coordinate system by its number; see `point`."""
+        if number in self._systems:
+            return self._systems[number]
+        if number not in self._system_cards:
+            fail(where, f"the coordinate system {number} is not there.")
+        if depth > _MOST_NESTED_SYSTEMS:
+            fail(
+                where,
+                f"the coordinate system {number} rests on itself, or on too many others.",
+            )
+        card = self._system_cards[number]
+        # origin, a point on z, and one in the plane of x and z
+        if card.is_by_grid_points:
+            three_points = [
+                self.point(card.whole(field), card.where, depth + 1) for field in (1, 2, 3)
+            ]
+            points = np.array(three_points)
+        else:
+            reference = self._system(card.whole(1), card.where, depth + 1)
+            points = reference.to_space(np.reshape(card.reals(2, 9), (3, 3)))
+        axes = axes_by_points(card.where, points, order=(1, 2, 0))
+        kind = card.word[5]
+        self._systems[number] = CoordinateSystem(points[0], axes, kind)
+        return self._systems[number]
+
+
+def _add_element(deck: Deck, card: _Card) -> None:
+    """Add an element, and its number to the set of its property."""
+    number = card.whole(0)
+    if card.word in _FLAT_WORDS:
+        meshio_name = _FLAT_WORDS[card.word]
+        node_count = FLAT[meshio_name].node_count
+        nodes = [card.whole(field) for field in range(2, 2 + node_count)]
+    else:
+        meshio_name, nodes = _solid_element(card)
+    deck.add_element(card.where, number, meshio_name, nodes)
+    deck.members("ELSET", f"nastran:ref={card.whole(1, number)}").append(number)
+
+
+def _solid_element(card: _Card) -> tuple[str, list[int]]:
+    """Return the type in meshio of a solid element, and its nodes in meshio's order."""
+    fields = [card.whole(field) for field in range(2, len(card.fields))]
+    nodes = [node for node in fields if node]
+    corner_count = _CORNERS_OF_SOLIDS[card.word]
+    kinds = {kind.node_count: kind for kind in KINDS.values() if len(kind.corners) == corner_count}
+    if len(nodes) not in kinds:
+        counts = " or ".join(str(count) for count in kinds)
+        fail(
+            card.where,
+            f"{card.word} {card.whole(0)} must have {counts} nodes, but {len(nodes)} came.",
+        )
+    meshio_name = kinds[len(nodes)].file_type
+    order = _ORDER_FOR_MESHIO.get(meshio_name, range(len(nodes)))
+    return meshio_name, [nodes[place] for place in order]
+
+
+class _Line(NamedTuple):
+    """A line of the bulk data: head, fields, and the marker of the line that continues it."""
+
+    where: str
+    head: str
+    fields: list[str]
+    marker: str
+
+    @property
+    def is_continuation(self) -> bool:
+        """Whether it continues another line."""
+        return not self.head or self.head[0] in "+*"
+
+    @property
+    def name(self) -> str:
+        """The marker of the line that it continues; empty where that is the one before."""
+        return self.head[1:].upper()
+
+
+def cards(path: Path) -> list[_Card]:
+    """Return the entries of the bulk data of a file, each with the fields of its continuations.
+
+    A continuation without a name belongs to the line above it. One with a name belongs to the line
+    that ends with this name as its marker, which may stand above or below.
+    """
+    lines = _bulk_lines(path)
+    finished_cards: list[_Card] = []
+    waiting_cards: dict[str, _Card] = {}  # cards whose last line ends with a marker, by the marker
+    early_lines: dict[
+        str, _Line
+    ] = {}  # continuations that stand above the line they belong to, by name
+    card: _Card | None = None
+    marker = ""
+    markers_below = Counter(line.marker for line in lines)
+    names_below = Counter(line.name for line in lines if line.is_continuation)
+    for line in lines:
+        markers_below[line.marker] -= 1
+        if not line.is_continuation:
+            card = _Card(
+                line.head.upper().rstrip("*_"), line.where, line.fields
+            )  # meshio writes CTETRA_
+            finished_cards.append(card)
+        else:
+            names_below[line.name] -= 1
+            # more lines below end with the name than continuations below ask for one: one of them
+            # is mine
+            belongs_below = bool(line.name) and markers_below[line.name] > names_below[line.name]
+            if line.name in waiting_cards:
+                card = waiting_cards.pop(line.name)
+            elif belongs_below:
+                early_lines[line.name] = line
+                card = None
+                marker = line.marker
+                continue
+            elif card is None or (line.name and marker):
+                _refuse_continuation(line)
+            card.fields.extend(line.fields)
+        # continuations that stood above follow here, one after the other
+        marker = line.marker
+        while marker in early_lines:
+            continuation = early_lines.pop(marker)
+            card.fields.extend(continuation.fields)
+            marker = continuation.marker
+        if marker:
+            waiting_cards[marker] = card
+    for line in early_lines.values():
+        _refuse_continuation(line)
+    return finished_cards
+
+
+def _bulk_lines(path: Path) -> list[_Line]:
+    """Return the lines of the bulk data up to ENDDATA."""
+    lines = list(lines_of((path,), _COMMENT, _INCLUDE))
+    start = 0
+    for number, (_, text) in enumerate(lines, start=1):
+        if _BEGIN.match(text):
+            start = number
+            break
+    bulk_lines: list[_Line] = []
+    for where, text in lines[start:]:
+        head, *fields, end = _fields(where, text.expandtabs(8))
+        if head.upper().startswith("ENDDATA"):
+            break
+        bulk_lines.append(_Line(where, head, fields, end.lstrip("+*").upper()))
+    return bulk_lines
+
+
+def _refuse_continuation(line: _Line) -> NoReturn:
+    """Refuse a continuation that belongs to no line."""
+    fail(
+        line.where,
+        f"the continuation {short_repr(line.head)} stands behind no line that it continues.",
+    )
+
+
+def _fields(where: str, text: str) -> list[str]:
+    """Return the fields of a line: its word, four or eight fields, the marker of what continues it.
+
+    Parameters
+    ----------
+    where : str
+        File and line.
+    text : str
+        The line, in free format, with commas, or in fixed format, with columns of 8 or 16
+        characters.
+    """
+    if "," not in text:
+        is_wide = "*" in text[:8]
+        count, width = (4, 16) if is_wide else (8, 8)
+        fields = [text[8 + width * index : 8 + width * (index + 1)] for index in range(count)]
+        return [field.strip() for field in (text[:8], *fields, text[72:])]
+    values = [value.strip() for value in text.split(",")]
+    count = 4 if "*" in values[0] else 8
+    marker = values.pop() if _MARKER.match(values[-1]) else ""
+    if len(values) > count + 2:
+        fail(where, f"a line of at most {count + 2} fields is expected, but {len(values)} came.")
+    values += [""] * (count + 2 - len(values))
+    return [*values[:-1], marker or values[-1]]

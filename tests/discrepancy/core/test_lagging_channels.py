@@ -1,0 +1,84 @@
+"""A channel that shows what it should have shown earlier: a late filter or logger."""
+
+import numpy as np
+import pytest
+
+from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantity, Trial, TrialKind
+from discrepancy.system.response import Conditions
+from discrepancy.system.sensing import observe
+from discrepancy.verdict import VerdictKind
+from discrepancy.workflow import investigate
+from fe.runtime.patch import ModelPatch, SensorLag
+from tests.discrepancy.rigs import chosen, one_mass
+
+LAG = 0.0137
+NOISE = 2e-5
+TIME = np.arange(300) * 0.01
+MODEL = one_mass(
+    stiffness=800.0,
+    damping={"matrix": 3.2},
+    parameter=[
+        {"name": "stiffness", "terms": "stiffness", "deviation": 0.03, "low": 0.5, "high": 1.5},
+        {"name": "damping", "terms": "damping", "deviation": 0.1, "low": 0.2, "high": 3.0},
+    ],
+)
+
+
+def shaken(lag: float) -> Campaign:
+    """Return two trials under forces of many frequencies, the second held out, with a channel that lags."""
+    generator = np.random.default_rng(4)
+    trials = []
+    for name in ("first", "second"):
+        frequencies = 2.0 * np.pi * generator.uniform(1.5, 5.0, 6)
+        phases = generator.uniform(0.0, 2.0 * np.pi, 6)
+        force = 5.0 * np.sin(TIME[:, None] * frequencies + phases).sum(axis=1) * np.minimum(1.0, TIME / 0.5)
+        trials.append(
+            Trial.plain(
+                name,
+                TrialKind.FORCED,
+                ("x",),
+                TIME,
+                values=np.zeros((len(TIME), 1)),
+                force=force,
+                load_place="push",
+                held_out=name == "second",
+            )
+        )
+    channel = Channel("x", Quantity.DISPLACEMENT, "x", NoiseRecord(NOISE, 500.0))
+    empty = Campaign("one mass", {"x": channel}, tuple(trials), None, {}, "0" * 64)
+    conditions = Conditions(np.ones(2))
+    measured = []
+    for trial in trials:
+        values = observe(MODEL, empty, trial, ModelPatch((SensorLag("x", lag),)), conditions).values
+        noise = NOISE * generator.standard_normal(values.shape)
+        measured.append(
+            Trial.plain(
+                trial.name,
+                trial.kind,
+                trial.channels,
+                TIME,
+                values=values + noise,
+                force=trial.force,
+                load_place="push",
+                held_out=trial.held_out,
+            )
+        )
+    return Campaign("one mass", {"x": channel}, tuple(measured), None, {}, "0" * 64)
+
+
+@pytest.mark.slow
+def test_a_channel_that_lags_is_named_with_its_lag():
+    """Damping delays the displacement, too, but not by the same time at every frequency."""
+    found = investigate(shaken(LAG), MODEL, chosen("sensor_lag", "structural_damping"), thorough=False)
+    assert found.verdict.kind is VerdictKind.NAMED, found.verdict.sentence
+    (effect,) = found.verdict.effects
+    (lag,) = effect.parameters
+    assert (effect.identifier, effect.place) == ("sensor_lag", "x")
+    assert lag.low < LAG / 0.01 < lag.high
+    assert lag.high - lag.low < 0.05
+
+
+@pytest.mark.slow
+def test_no_lag_is_named_where_there_is_none():
+    found = investigate(shaken(0.0), MODEL, chosen("sensor_lag", "structural_damping"), thorough=False)
+    assert found.verdict.kind is VerdictKind.NOTHING_MISSING, found.verdict.sentence
