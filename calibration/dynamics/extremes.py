@@ -36,7 +36,7 @@ def refine_by_extremes(trials: Fits) -> Fits:
 
 
 class _ExtremesUnknowns(NamedTuple):
-    """Unknowns of a fit to the extremes, from an array (9,).
+    """The unknowns of a fit to the extremes of a record, which are an array (9,) for the solver.
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class _ExtremesUnknowns(NamedTuple):
     offset, drift : float
         The coefficients of the line [V] and [V/s].
     half_line : float
-        Half the width of the drawn line [V].
+        Half the thickness of the drawn line [V].
     """
 
     wave: ComplexArray
@@ -73,6 +73,17 @@ class _ExtremesUnknowns(NamedTuple):
 
 
 def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
+    """Return one trial fitted to the extremes of its record.
+
+    The record was read off a plot: in each column of pixels it has the lowest and the highest ink.
+    The model signal is evaluated at several instants of a column; its extremes, extended by half
+    the thickness of the line, are fitted to the ink.
+
+    Parameters
+    ----------
+    fit : RingDownFit
+        The trial, fitted to the middle of the ink; the start of this fit.
+    """
     record = fit.record
     if record.lowest is None or record.highest is None:
         raise ExperimentDataError(
@@ -88,8 +99,19 @@ def _refine_by_extremes(fit: RingDownFit) -> RingDownFit:
     instants = time[:, np.newaxis] + offsets_in_column
 
     # Unknowns are scaled to about one: amplitudes by the range of the signal, decays by the start.
-    size = float(np.ptp(record.signal))
-    scale = np.array([size, size, size, size, *np.abs(pole.real), size, size, size])
+    signal_range = float(np.ptp(record.signal))
+    scale = np.array(
+        [
+            signal_range,
+            signal_range,
+            signal_range,
+            signal_range,
+            *np.abs(pole.real),
+            signal_range,
+            signal_range,
+            signal_range,
+        ]
+    )
     half_line = 0.5 * float(np.percentile(highest - lowest, 10.0))
     start = np.array([*wave.real, *wave.imag, *pole.real, 0.0, 0.0, half_line]) / scale
 

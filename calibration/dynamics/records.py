@@ -23,7 +23,7 @@ FILE_PATTERNS = (
     "initialconditiondata_*.dat",
     "ringdown_trial*_digitised.csv",
 )
-"""Names of record files, best first: raw at 100 kHz, or read off the published plots."""
+"""Names of record files, the best kind first: raw at 100 kHz, or read off the published plots."""
 
 MINIMUM_COUNT = 64
 """Fewest samples of a record."""
@@ -95,6 +95,7 @@ class RingDownRecord:
 
 
 def _refuse_uneven_time(record: RingDownRecord) -> None:
+    """Refuse a record whose time does not increase in even steps, up to its rounding."""
     time = record.time
     step = np.diff(time)
     mean_step = float(time[-1] - time[0]) / (record.count - 1)
@@ -112,17 +113,31 @@ def _refuse_uneven_time(record: RingDownRecord) -> None:
 
 
 def _refuse_constant_signal(record: RingDownRecord) -> None:
+    """Refuse a record whose signal never changes."""
     if np.ptp(record.signal) == 0.0:
         raise ExperimentDataError(f"{record.source}: the signal is constant; nothing rings.")
 
 
 def _refuse_clipping(record: RingDownRecord, signal: Float, extreme: float, name: str) -> None:
-    """Refuse a record whose signal stays at its smallest or largest value, as `name` says."""
+    """Refuse a record that stays at an extreme value for several samples, as if clipped.
+
+    Parameters
+    ----------
+    record : RingDownRecord
+        The record.
+    signal : (N,) array
+        The signal, or its lowest or highest values.
+    extreme : float
+        The smallest or largest value of the signal.
+    name : str
+        Which of the two it is, for the message.
+    """
     is_extreme = np.abs(signal - extreme) <= 1e-9 * np.ptp(signal)
+    # Runs of extreme values begin and end where the padded mask changes, in turn.
     padded = np.concatenate([[False], is_extreme, [False]]).astype(np.int8)
-    changes = np.flatnonzero(np.diff(padded))
-    starts = changes[::2]
-    ends = changes[1::2]
+    run_boundaries = np.flatnonzero(np.diff(padded))
+    starts = run_boundaries[::2]
+    ends = run_boundaries[1::2]
     longest_run = int(np.max(ends - starts))
     if longest_run >= 3 and longest_run / record.sampling_rate >= _CLIPPED_DURATION:
         raise ExperimentDataError(
@@ -161,7 +176,7 @@ def read_records(path: Path) -> tuple[RingDownRecord, ...]:
 
 
 def find_records(path: Path) -> tuple[Path, ...]:
-    """Return the files that `read_records` reads: those of the best kind, or none.
+    """Return the files that `read_records` reads: all files of the best kind that there is.
 
     Raises
     ------
@@ -184,6 +199,7 @@ def find_records(path: Path) -> tuple[Path, ...]:
 
 
 def _read_record(file: Path) -> RingDownRecord:
+    """Return the ring-down record in a file of any of the known layouts."""
     text = read_text(file, ExperimentFileError)
     layout = _layout_of(text, file)
     table = parse_table(
@@ -222,6 +238,11 @@ class _Layout(NamedTuple):
 
 
 def _layout_of(text: str, file: Path) -> _Layout:
+    """Return the layout of a record file from its first line.
+
+    The line is a header if it contains anything but numbers; a file without header has the columns
+    of the published records.
+    """
     filled_lines = [line for line in text.splitlines() if line.strip()]
     if not filled_lines:
         raise ExperimentFileError(
@@ -229,8 +250,8 @@ def _layout_of(text: str, file: Path) -> _Layout:
         )
     first_line = filled_lines[0].strip()
     separator = "," if "," in first_line and "\t" not in first_line else None
-    has_words = re.search(r"[^\d\s.,;eE+-]", first_line.lstrip("#"))
-    if has_words:
+    header_match = re.search(r"[^\d\s.,;eE+-]", first_line.lstrip("#"))
+    if header_match:
         header = _column_names(first_line, separator, file)
         if not first_line.startswith("#"):
             text = text.replace(first_line, f"#{first_line}", 1)
@@ -245,7 +266,7 @@ def _layout_of(text: str, file: Path) -> _Layout:
 
 
 def _column_names(header_line: str, separator: str | None, file: Path) -> list[str]:
-    """Return the names in a header line, without units."""
+    """Return the names of the columns in a header line, without their units."""
     if separator is not None:
         between_cells = separator
     else:
@@ -257,7 +278,7 @@ def _column_names(header_line: str, separator: str | None, file: Path) -> list[s
 
 
 def _column_name(cell: str, file: Path) -> str:
-    """Return the name in a cell of a header without unit or remark in brackets.
+    """Return the name in a cell of a header, without unit and remarks in brackets.
 
     Raises
     ------
@@ -272,7 +293,7 @@ def _column_name(cell: str, file: Path) -> str:
 
 
 def _column(table: TextTable, names: tuple[str, ...]) -> Float:
-    """Return the column that has one of several names."""
+    """Return the numbers of the column that has one of several possible names."""
     for name in names:
         if name in table.columns:
             return table.numbers(name, "a ring-down")

@@ -55,7 +55,7 @@ def disagreements(result: Calibration, lab: LabData, quality: FitQuality) -> lis
 
 
 def _reading_disagreements(result: Calibration, *, is_published: bool) -> list[str]:
-    """Return sentences on readings that are far from the calibrated model."""
+    """Return sentences on readings that differ noticeably from the calibrated model."""
     figures = {figure.name: figure for figure in result.figures}
     sentences = []
     for reading in result.readings:
@@ -111,6 +111,7 @@ class _MeanMode(NamedTuple):
 
 
 def _mean_mode(windows: Sequence[RingDownMode]) -> _MeanMode:
+    """Return the mean of the first mode over windows."""
     rows = [
         (window.frequency, 100 * window.damping_ratio, 1e3 * window.amplitude) for window in windows
     ]
@@ -118,7 +119,11 @@ def _mean_mode(windows: Sequence[RingDownMode]) -> _MeanMode:
 
 
 def _softening_sentences(windows: Sequence[RingDownMode]) -> list[str]:
-    """Return a sentence on a first mode whose frequency depends on its amplitude, if it does."""
+    """Return a sentence that the first frequency depends on the amplitude, if it does.
+
+    The third of the windows with the smallest amplitudes is compared with the third with the
+    largest.
+    """
     by_amplitude = sorted(windows, key=lambda window: window.amplitude)
     third = len(windows) // 3
     small = _mean_mode(by_amplitude[:third])
@@ -134,4 +139,5 @@ def _softening_sentences(windows: Sequence[RingDownMode]) -> list[str]:
 
 
 def _percent(value: float) -> str:
+    """Return a fraction as a signed percentage."""
     return f"{100.0 * value:+.1f} %".replace("-", "−")

@@ -54,15 +54,19 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
     BindingError
         If the FMU has no number to observe.
     """
-    usable = [variable for variable in description.variables if bindable(variable)]
-    observed = _variables_to_observe(description, usable)
-    ports = _ports([v for v in usable if v.causality in ("input", "output")])
+    bindable_variables = [variable for variable in description.variables if bindable(variable)]
+    observed = _variables_to_observe(description, bindable_variables)
+    ports = _ports([v for v in bindable_variables if v.causality in ("input", "output")])
     port_names = {variable.name for port in ports.values() for variable in port.values()}
-    inputs = [v for v in usable if v.causality == "input" and v.name not in port_names]
-    parameters = [v for v in usable if v.causality == "parameter" and v.variability != "constant"]
+    inputs = [v for v in bindable_variables if v.causality == "input" and v.name not in port_names]
+    parameters = [
+        v for v in bindable_variables if v.causality == "parameter" and v.variability != "constant"
+    ]
     observed_names = {variable.name for variable in observed}
-    recorded = [v for v in usable if v.causality == "output" and v.name not in observed_names]
-    usable_names = {variable.name for variable in usable}
+    recorded = [
+        v for v in bindable_variables if v.causality == "output" and v.name not in observed_names
+    ]
+    usable_names = {variable.name for variable in bindable_variables}
     keys = _TableKeys()
     text = rendered(
         "draft.toml",
@@ -74,7 +78,7 @@ def draft_binding(description: FmuDescription, *, step_size: float | None = None
         parameters=[(keys.key("parameter", v.name), v) for v in parameters],
         ports=[(keys.key("port", stem or "port"), port) for stem, port in ports.items()],
         recorded=_groups(recorded),
-        others=[v.name for v in usable if v.causality in _INTERNAL],
+        others=[v.name for v in bindable_variables if v.causality in _INTERNAL],
         left_out=[
             v.name
             for v in description.variables
@@ -125,26 +129,30 @@ def observable(description: FmuDescription, usable: Sequence[VariableInfo]) -> l
 def _variables_to_observe(
     description: FmuDescription, usable: Sequence[VariableInfo]
 ) -> list[VariableInfo]:
-    """Return the outputs to observe: real numbers with a name that is not auxiliary, if any."""
+    """Return the outputs to observe.
+
+    They are the real outputs whose names do not look auxiliary; if there are none, all real ones;
+    if there are none of these, all outputs.
+    """
     candidates = observable(description, usable)
-    reals = [v for v in candidates if v.kind in FLOAT_KINDS]
-    main = [v for v in reals if not _AUXILIARY.search(v.name)]
-    return main or reals or candidates
+    real_outputs = [v for v in candidates if v.kind in FLOAT_KINDS]
+    main_outputs = [v for v in real_outputs if not _AUXILIARY.search(v.name)]
+    return main_outputs or real_outputs or candidates
 
 
 class _TableKeys:
-    """Keys of the tables of a binding, unique within their role."""
+    """Makes keys for the tables of a binding that are unique within their role."""
 
     def __init__(self) -> None:
         self._uses: Counter[tuple[str, str]] = Counter()
 
     def key(self, role: str, name: str) -> str:
-        """Return a key made of a name, with a number behind it where that key is taken."""
-        plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "x"
-        key = plain
+        """Return a key made from a name; a number is appended if that key is used already."""
+        plain_key = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_").lower() or "x"
+        key = plain_key
         while self._uses[role, key]:
-            self._uses[role, plain] += 1
-            key = f"{plain}_{self._uses[role, plain]}"
+            self._uses[role, plain_key] += 1
+            key = f"{plain_key}_{self._uses[role, plain_key]}"
         self._uses[role, key] += 1
         return key
 
@@ -182,11 +190,11 @@ def _ports(variables: Sequence[VariableInfo]) -> dict[str, PortVariables]:
 
 
 def _is_port(variables: PortVariables) -> bool:
-    """Return whether the force stands alone on its side of the FMU."""
+    """Return whether variables form a port: the force is the only one of its causality."""
     if len(variables) < 2 or "force" not in variables:
         return False
-    sides = [variable.causality for variable in variables.values()]
-    return sides.count(variables["force"].causality) == 1
+    causalities = [variable.causality for variable in variables.values()]
+    return causalities.count(variables["force"].causality) == 1
 
 
 class _NumberedName(NamedTuple):
@@ -224,7 +232,7 @@ def _numbered_name(variable: VariableInfo) -> _NumberedName | None:
 
 
 def _groups(variables: Iterable[VariableInfo]) -> list[list[VariableInfo]]:
-    """Put variables together that are numbered one after the other and have the same unit."""
+    """Return variables in groups: those with successive numbers and equal units form one."""
     groups: list[list[VariableInfo]] = []
     expected: _NumberedName | None = None
     for variable in variables:
@@ -247,7 +255,7 @@ def _pattern(group: Sequence[VariableInfo]) -> str:
 
 
 def _stem(group: Sequence[VariableInfo]) -> str:
-    """Return the name of a variable, or what the names of a group have in common."""
+    """Return the name of a variable, or the common beginning of the names of a group."""
     name = group[0].name
     match = _NUMBERED.fullmatch(name) if len(group) > 1 else None
     if match is None:

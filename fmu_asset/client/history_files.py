@@ -23,9 +23,10 @@ InputHistories = dict[str, dict[str, Float]]
 _ELEMENT = re.compile(r"(?P<name>.+)\[(?P<number>\d+)\]", re.DOTALL)
 _TIME = "time"
 _TIME_TOLERANCE = 1e-6
-"""Error of a time that a spreadsheet rounded, as a share of the interval between observations."""
+"""Largest error of a time, such as a spreadsheet's rounding, as a fraction of the interval between
+observations."""
 _WHOLE = 0
-"""Number of the column of an input that is not given by elements; these count from 1."""
+"""Stands for all of an input in one column, instead of the number of an element (from 1)."""
 
 
 class _InputName(NamedTuple):
@@ -65,7 +66,7 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
     time = table.numbers(_TIME, "a simulation")
     _check_times(time, path, binding)
     known_names = _names_of_columns(binding)
-    columns: dict[_InputName, dict[int, Float]] = {}
+    columns_of_input: dict[_InputName, dict[int, Float]] = {}
     for column in table.columns:
         if column == _TIME:
             continue
@@ -76,7 +77,7 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
                 f"The column {column!r} of {path} is no input of the binding {binding.name}; it "
                 f"has {comma_list(known)}."
             )
-        elements = columns.setdefault(input_name, {})
+        elements = columns_of_input.setdefault(input_name, {})
         mixes_forms = bool(elements) and (number == _WHOLE or _WHOLE in elements)
         if number in elements or mixes_forms:
             raise FmuInputError(
@@ -84,18 +85,18 @@ def read_histories(path: Path, binding: Binding) -> tuple[int, InputHistories]:
             )
         elements[number] = table.numbers(column, "a simulation")
     histories: InputHistories = {}
-    for input_name, elements in columns.items():
+    for input_name, elements in columns_of_input.items():
         history = _joined_elements(input_name, elements, path)
         histories.setdefault(input_name.role, {})[input_name.name] = history
     return len(time), histories
 
 
 def _check_times(time: Float, path: Path, binding: Binding) -> None:
-    """Refuse times that are not those of the steps of a binding."""
+    """Refuse times (N,) [s] that are not those at which the steps of a binding begin."""
     expected = binding.binding.start_time + binding.interval * np.arange(len(time))
-    wrong = np.flatnonzero(np.abs(time - expected) > _TIME_TOLERANCE * binding.interval)
-    if len(wrong):
-        step = int(wrong[0])
+    wrong_steps = np.flatnonzero(np.abs(time - expected) > _TIME_TOLERANCE * binding.interval)
+    if len(wrong_steps):
+        step = int(wrong_steps[0])
         raise FmuInputError(
             f"{path} has the time {time[step]:.12g} s where step {step} begins at "
             f"{expected[step]:.12g} s: the binding {binding.name} starts at "
@@ -105,15 +106,15 @@ def _check_times(time: Float, path: Path, binding: Binding) -> None:
 
 
 def _names_of_columns(binding: Binding) -> dict[str, _InputName]:
-    """Return the inputs of a binding by the names that columns may have.
+    """Return the inputs of a binding by all names that their columns may have.
 
-    A column may have the name alone where only one role has an input of that name.
+    A name without a role is accepted if only one role has an input of this name.
     """
     inputs = [_InputName(role, name) for role in INPUT_ROLES for name in binding.inputs(role)]
     for port_name, port in binding.port.items():
         inputs += [_InputName("port", f"{port_name}.{quantity}") for quantity in port.quantities]
-    uses = Counter(entry.name for entry in inputs)
-    short_names = {entry.name: entry for entry in inputs if uses[entry.name] == 1}
+    name_counts = Counter(entry.name for entry in inputs)
+    short_names = {entry.name: entry for entry in inputs if name_counts[entry.name] == 1}
     full_names = {entry.full: entry for entry in inputs}
     return short_names | full_names
 
@@ -121,7 +122,22 @@ def _names_of_columns(binding: Binding) -> dict[str, _InputName]:
 def _column_meaning(
     column: str, known_names: dict[str, _InputName]
 ) -> tuple[_InputName | None, int]:
-    """Return the input of a column, None if there is none, and the element of it or `_WHOLE`."""
+    """Return the input and the number of its element that the name of a column means.
+
+    Parameters
+    ----------
+    column : str
+        The name of the column.
+    known_names : dict of str to _InputName
+        The inputs by the names of columns.
+
+    Returns
+    -------
+    input_name : _InputName or None
+        None if there is no such input.
+    number : int
+        The number of the element, or `_WHOLE` if the column is not that of an element.
+    """
     if column in known_names:
         return known_names[column], _WHOLE
     match = _ELEMENT.fullmatch(column)
@@ -131,7 +147,13 @@ def _column_meaning(
 
 
 def _joined_elements(input_name: _InputName, elements: dict[int, Float], path: Path) -> Float:
-    """Return the history of an input: (N,) of a whole one, or (N, n) from its elements."""
+    """Return the history of an input, from one column or from those of its elements.
+
+    Returns
+    -------
+    (N,) or (N, n) array
+        The latter if the input is given by its n elements.
+    """
     if _WHOLE in elements:
         return elements[_WHOLE]
     missing = {*range(1, len(elements) + 1)} - elements.keys()

@@ -145,7 +145,7 @@ class FmiAsset(SteppedFmu):
             self._raise_located(error, "restoring the state")
 
     def _was_started_like(self, saved: SavedState) -> bool:
-        """Return whether the instance runs, and was started as that of a saved state."""
+        """Return whether the instance runs and had the same start as that of a saved state."""
         if self._phase != "ready" or self._instance.lost:
             return False
         return (
@@ -156,12 +156,13 @@ class FmiAsset(SteppedFmu):
         )
 
     def _start_as_saved(self, saved: SavedState) -> None:
-        """Start an instance as that of a saved state."""
+        """Start an instance with the parameters and inputs of a saved state's start."""
         self._health = dict(saved.health)
         self._set_parameters(saved.parameters)
         start_inputs = saved.start_inputs
         if not start_inputs and self.binding.binding.structural_parameters:
-            # Arrays that were resized may have no start values that fit: zeros are not sent.
+            # The start values of resized arrays may not fit. Zeros fill the block instead; they
+            # are not sent to the FMU.
             start_inputs = bytes(self._bytes_of_inputs())
         if start_inputs:
             request = [0.0, 0.0, *np.frombuffer(start_inputs).tolist()]
@@ -171,10 +172,10 @@ class FmiAsset(SteppedFmu):
         self._start_instance(request, with_inputs=with_inputs, index=saved.first_index)
 
     def _replay(self, saved: SavedState) -> None:
-        """Make the recorded steps of a saved state again."""
-        width = self._bytes_of_inputs()
+        """Repeat the steps of a saved state from its start."""
+        bytes_per_step = self._bytes_of_inputs()
         for index in range(saved.steps_since_start):
-            inputs = saved.body[index * width : (index + 1) * width]
+            inputs = saved.body[index * bytes_per_step : (index + 1) * bytes_per_step]
             self._request[0] = self.time
             self._request[1] = self._step_size
             self._request.cast("B")[HEAD_BYTES:] = inputs
@@ -183,9 +184,9 @@ class FmiAsset(SteppedFmu):
             self._record.append(inputs)
 
     def fork(self) -> Self:
-        """Return another asset of the same FMU in the same state, with a worker of its own.
+        """Return an independent asset of the same FMU in the same state, with its own worker.
 
-        The FMU is not extracted again. The two are independent from here on.
+        The FMU is not extracted again.
 
         Raises
         ------
@@ -195,20 +196,20 @@ class FmiAsset(SteppedFmu):
             As `save_state` and `restore_state`.
         """
         state = self.save_state()
-        other = self.sibling()
+        forked_asset = self.sibling()
         try:
-            other.restore_state(state)
+            forked_asset.restore_state(state)
         except BaseException:
-            other.close()
+            forked_asset.close()
             raise
-        return other
+        return forked_asset
 
     def _bytes_of_inputs(self) -> int:
         """Return the size of the inputs of one step in a request block [bytes]."""
         return 8 * self._exchange.plan.input_count
 
     def _refuse_foreign(self, saved: SavedState) -> None:
-        """Refuse a state of another FMU or binding."""
+        """Refuse a saved state that belongs to another FMU or binding, or is damaged."""
         if saved.fmu != self.description.sha256:
             raise FmuStateError(
                 f"The state was saved with another FMU than {self.description.label} (its hash "
@@ -218,14 +219,14 @@ class FmiAsset(SteppedFmu):
             raise FmuStateError(
                 "The state was saved with another step size or start time; use that binding."
             )
-        width = self._bytes_of_inputs()
+        bytes_of_inputs = self._bytes_of_inputs()
         replays = saved.method == "replay"
         is_sound = (
             saved.method == self.state_method
-            and len(saved.inputs) == width
-            and len(saved.start_inputs) in (0, width)
+            and len(saved.inputs) == bytes_of_inputs
+            and len(saved.start_inputs) in (0, bytes_of_inputs)
             and saved.first_index <= saved.index
-            and not (replays and len(saved.body) != width * saved.steps_since_start)
+            and not (replays and len(saved.body) != bytes_of_inputs * saved.steps_since_start)
         )
         if not is_sound:
             raise FmuStateError(

@@ -102,7 +102,7 @@ class Slave:
     # ------------------------------------------------------------------ life of an instance
 
     def setup_experiment(self, start_time: float = 0.0, *_: object) -> None:
-        """Take the start time [s]."""
+        """Set the start time [s]."""
         if math.isfinite(start_time):
             self._time = float(start_time)
             self._start_time = float(start_time)
@@ -119,7 +119,7 @@ class Slave:
             )
 
     def exit_initialization_mode(self) -> None:
-        """Check parameters and inputs, and find the initial state."""
+        """Check parameters and inputs, and compute the initial state."""
         if self._phase != INITIALISING:
             self._refuse(Status.BAD_CALL, "initialisation was left without having been entered")
             return
@@ -130,17 +130,17 @@ class Slave:
         self._phase = TERMINATED
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Advance by one communication step, with the inputs held.
+        """Advance by one communication step, over which the inputs are constant.
 
         Parameters
         ----------
         current_time, step_size : float
-            Begin and duration of the step [s].
+            The begin and the duration of the step [s].
 
         Returns
         -------
         bool
-            False (fmi2Discard) if nothing changed.
+            Whether the step was made. If not (fmi2Discard), nothing has changed.
         """
         if not self._may_step(current_time, step_size):
             return False
@@ -155,7 +155,7 @@ class Slave:
         return is_done
 
     def _initialise(self) -> bool:
-        """Compute the outputs at the start; return whether that was possible."""
+        """Compute the outputs at the start; return whether the values were accepted."""
         return self._compute_outputs(
             partial(self._behaviour.start, self._parameters(self._values), self._time),
             self._first_output,
@@ -170,14 +170,14 @@ class Slave:
         action: str,
         consequence: str,
     ) -> bool:
-        """Compute outputs from the inputs and keep them; return whether that was possible.
+        """Compute the outputs and store them; return whether the values were accepted.
 
         Parameters
         ----------
         compute : callable
-            Returns the outputs that belong to inputs.
+            Returns the outputs for inputs.
         checked_rows : int
-            Number of rows, from the first, whose values must lie in their ranges.
+            The number of rows, from the first, whose values must lie in their ranges.
         action : str
             What is done, for messages.
         consequence : str
@@ -199,9 +199,9 @@ class Slave:
         return True
 
     def _check_ranges(self, checked_rows: int, consequence: str) -> bool:
-        """Refuse values outside of their ranges, and hand tunable values to the behaviour.
+        """Check that values lie in their ranges; give tunable values to the behaviour.
 
-        Parameters are those of `_compute_outputs`.
+        The parameters are those of `_compute_outputs`. Returns whether all values are accepted.
         """
         if not self._in_range(0, checked_rows, consequence):
             return False
@@ -213,7 +213,7 @@ class Slave:
         return True
 
     def _may_step(self, current_time: float, step_size: float) -> bool:
-        """Return whether a step is acceptable now; refuse it if not."""
+        """Return whether a step is possible now; if not, refuse it with a message."""
         if self._phase != READY:
             phase = _PHASE_NAMES[self._phase]
             return self._refuse(Status.BAD_CALL, f"a step was asked for {phase}")
@@ -241,7 +241,20 @@ class Slave:
     # ------------------------------------------------------------------ values
 
     def _set(self, kind: str, vrs: Sequence[int], values: Sequence[float]) -> None:
-        """Set inputs and tunable parameters at any time, others until the end of initialisation."""
+        """Set variables by their value references.
+
+        Inputs and tunable parameters can be set at any time, other parameters until the
+        initialisation.
+
+        Parameters
+        ----------
+        kind : str
+            The base type of the call: Real, Integer or Boolean.
+        vrs : sequence of int
+            The value references.
+        values : sequence of float
+            The values.
+        """
         for vr, value in zip(vrs, values, strict=True):
             row = self._table[vr] if 0 <= vr < len(self._table) else None
             if row is None or row.causality == "output" or row.kind not in _KINDS_OF_CALLS[kind]:
@@ -263,7 +276,7 @@ class Slave:
     set_boolean = partialmethod(_set, "Boolean")
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
-        """Return values; some outputs are computed when they are read."""
+        """Return the values of variables; outputs of a group are computed now if they are pending."""
         values = self._values
         if min(vrs, default=0) < 0 or max(vrs, default=0) >= len(values):
             unknown = next(vr for vr in vrs if not 0 <= vr < len(values))
@@ -278,7 +291,7 @@ class Slave:
         return [values[vr] for vr in vrs]
 
     def _compute_group(self, number: int) -> None:
-        """Compute a group of outputs that is read and not known yet."""
+        """Compute a group of outputs that are read, and store them."""
         group = self._groups[number]
         try:
             self._values[group] = self._behaviour.later(number)
@@ -308,20 +321,20 @@ class Slave:
     # ------------------------------------------------------------------ state
 
     def _get_fmu_state(self) -> bytes:
-        """Return all on which the future depends, and all values that can be read, as bytes.
+        """Return the state of the instance and all its values as bytes.
 
         The numbers are the phase, the time and the start time; flags of stale and pending outputs;
         the values of all rows; and the state of the behaviour.
         """
         flags = [float(flag) for flag in (self._stale, *self._pending)]
-        head = [float(self._phase), self._time, self._start_time, *flags]
-        numbers = [*head, *map(float, self._values), *self._behaviour.state()]
+        leading_numbers = [float(self._phase), self._time, self._start_time, *flags]
+        numbers = [*leading_numbers, *map(float, self._values), *self._behaviour.state()]
         tag = self.content_tag.encode("ascii")[:_TAG_LENGTH].ljust(_TAG_LENGTH, b"\0")
         header = _STATE_HEADER.pack(_MAGIC, tag, len(numbers))
         return header + struct.pack(f"<{len(numbers)}d", *numbers)
 
     def _set_fmu_state(self, state: object) -> None:
-        """Restore what `_get_fmu_state` returned; anything else is refused."""
+        """Restore a state that `_get_fmu_state` returned; refuse anything else."""
         flags_begin = 3
         values_begin = flags_begin + 1 + len(self._pending)
         values_end = values_begin + len(self._values)
@@ -389,14 +402,14 @@ class Slave:
         return True
 
     def _refuse(self, status: int, sentence: str) -> bool:
-        """Set the output `status`, log a sentence, and return False.
+        """Refuse a call: set the output `status`, log a sentence, and return False.
 
         Parameters
         ----------
         status : Status
-            Why a call is refused.
+            The reason as a code.
         sentence : str
-            The same for people.
+            The reason as a sentence for users.
         """
         self._values[self._status] = status
         is_discarded = self._phase == READY and status != Status.BAD_STATE

@@ -42,23 +42,23 @@ _PROGRAM = (
 
 
 class WorkerProcess:
-    """A worker process, its supervisor and its two pipes.
+    """The twin's handle of a worker process: its supervisor, and the two pipes to the worker.
 
     Parameters
     ----------
     folder : Path
-        Scratch folder: its working directory, and where its output goes.
+        The scratch folder: the worker's working directory, which also has its log.
     shared : str
-        Folder of the extracted FMU.
+        The folder of the extracted FMU.
     grants : Grants or None
-        What the sandbox grants beyond what every FMU has; None for no sandbox.
+        The rights that the sandbox grants in addition to those of every FMU; None for no sandbox.
 
     Attributes
     ----------
     number : int
-        Process number of the worker.
+        The process number of the worker.
     outgoing, incoming : int
-        File descriptors of the twin's ends of the pipes.
+        The file descriptors of the twin's ends of the pipes.
 
     Raises
     ------
@@ -85,7 +85,7 @@ class WorkerProcess:
         self.number: int = number
 
     def _start(self, shared: str, grants: Grants | None) -> "subprocess.Popen[bytes]":
-        """Return the process of the supervisor; arguments as for the class."""
+        """Start the supervisor and return its process; arguments as for the class."""
         root = str(Path(__file__).parents[2])
         environment = {
             **os.environ,
@@ -117,7 +117,7 @@ class WorkerProcess:
             raise FmuWorkerError(f"The worker process could not be started ({error}).") from error
 
     def kill(self) -> None:
-        """End the worker, and whatever the FMU has started, at once."""
+        """End the worker, and all processes that the FMU has started, at once."""
         if self._process.returncode is not None:
             return
         self._process.terminate()
@@ -127,12 +127,18 @@ class WorkerProcess:
             self._process.kill()  # the worker dies with its supervisor
             self._process.wait()
         os.close(self._end_event)
-        # either the worker was killed, or the supervisor before it could clear up
+        # SIGKILL means that the worker was killed, or the supervisor before it could clean up
         if self._process.returncode == -signal.SIGKILL:
             end_processes(self._folder)
 
     def end(self, limit: float) -> None:
-        """Close the pipes, on which a worker ends, wait at most `limit` [s], and kill it then."""
+        """Close the pipes, so that the worker ends; kill it if it still runs after a time.
+
+        Parameters
+        ----------
+        limit : float
+            The time that the worker has to end by itself [s].
+        """
         for pipe in self._pipes:
             pipe.close()
         self._wait_for_end(limit)
@@ -144,7 +150,7 @@ class WorkerProcess:
         return self._pipes[0].closed
 
     def death_error(self, action: str) -> FmuWorkerError:
-        """End the worker if it lives, and return the error that says how it died.
+        """Return the error that says how the worker died; a worker that still runs is killed.
 
         Parameters
         ----------
@@ -161,14 +167,14 @@ class WorkerProcess:
 
     @staticmethod
     def _cause_of_death(is_alive: bool, code: int) -> str:
-        """Return the end of the sentence on a worker that died.
+        """Return the end of a sentence that says how the worker died.
 
         Parameters
         ----------
         is_alive : bool
-            Whether it had not ended by itself.
+            Whether the worker still ran, and was killed.
         code : int
-            Exit code of its process, negative for a signal.
+            The exit code of its process; negative for a signal.
         """
         if is_alive:
             return "closed its pipe, or wrote something else into it"
@@ -184,11 +190,11 @@ class WorkerProcess:
         return f"ended with exit status {code}: the FMU's code ended its own process"
 
     def _wait_for_end(self, limit: float) -> bool:
-        """Return whether the process ended within a limit [s]; it is not reaped yet."""
+        """Return whether the process ends within a time [s]. It is not reaped yet."""
         return self._process.returncode is not None or has_ended(self._end_event, limit)
 
     def _last_words(self) -> list[str]:
-        """Return the last lines of the worker's output, without our own trace of a Python crash."""
+        """Return the last lines of the worker's log, without Python's report of a crash."""
         with contextlib.suppress(OSError):
             # the FMU may have put a link or a pipe in the place of the log
             flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK
