@@ -276,7 +276,7 @@ class Slave:
     set_boolean = partialmethod(_set, "Boolean")
 
     def get_real(self, vrs: Sequence[int]) -> list[float]:
-        """Return the values of variables; outputs of a group are computed now if they are pending."""
+        """Return values of variables; groups of outputs that are pending are computed now."""
         values = self._values
         if min(vrs, default=0) < 0 or max(vrs, default=0) >= len(values):
             unknown = next(vr for vr in vrs if not 0 <= vr < len(values))
