@@ -178,42 +178,45 @@ def _lengths_in_millimetres(table: TextTable, column: str) -> Float:
 
 
 def tailored_geometry(lengths: Lengths) -> Geometry:
-    """Return the posterior means of the lengths [m], rounded to their standard deviation of 0.1 mm.
+    """Return the posterior means of the lengths [m], as the paper uses them.
 
-    The paper keeps the means and drops their standard deviation.
+    They are rounded to 0.1 mm, which is their standard deviation. The paper does not use that
+    further.
     """
     return Geometry(*(round(length.posterior.mean, 4) for length in lengths))
 
 
 def tailored_design(design: WingDesign, lengths: Lengths) -> WingDesign:
-    """Return the design with the measured planform.
+    """Return a wing's design with the planform that was measured on the built wing.
 
-    Only the planform is replaced. What the design locates by a fraction moves with it: ribs, point
-    masses and bands of the skin along the span, and everything along the chord. What it locates by
-    a distance stays: gauges and defect regions from the root, the test load from the tip. The net
-    load of a turn, the thicknesses of skin and webs, and the size of the largest cell stay, too.
+    Only semi-span and chords change. Parts whose place the design gives as a fraction move with the
+    planform: ribs, point masses and bands of the skin along the span, and everything along the
+    chord. Parts whose place it gives as a distance stay: gauges and defect regions, measured from
+    the root, and the test load, measured from the tip. Unchanged are also the net load in a turning
+    flight, the thicknesses of skin and webs, and the size of the largest cell of the mesh.
 
     Parameters
     ----------
     design : WingDesign
-        The wing as drawn.
+        The design before the measurement.
     lengths : Lengths
         The measured lengths.
 
     Raises
     ------
     ExperimentDataError
-        If a length differs from that of the design by more than a tenth, as of another wing.
+        If a length differs from that of the design by more than a tenth; the measurements are then
+        probably those of another wing.
     InvalidDesignError
-        If the tailored wing cannot be built; the message names the part of the design.
+        If the wing with these lengths cannot be built; the message names the part of the design.
     """
     planform = asdict(tailored_geometry(lengths))
     for name, value in planform.items():
-        drawn = getattr(design.planform, name)
-        if abs(value / drawn - 1.0) > _LARGEST_DEVIATION:
+        designed = getattr(design.planform, name)
+        if abs(value / designed - 1.0) > _LARGEST_DEVIATION:
             raise ExperimentDataError(
                 f"{name} measures {value * 1e3:.1f} mm, but the design {design.name} has "
-                f"{drawn * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with "
+                f"{designed * 1e3:.1f} mm, more than 10 % apart: give the design of this wing with "
                 "--design."
             )
     try:

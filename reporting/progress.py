@@ -219,6 +219,7 @@ class RichProgress(Progress):
         console.print(message, markup=False, highlight=False, soft_wrap=True)
 
     def _start_bars(self) -> "RichBars":
+        """Start the display of bars on the terminal, and return it."""
         from rich import progress as rich
 
         bars = rich.Progress(

@@ -31,15 +31,15 @@ SCHEMA = "uav-twin calibration 2"
 
 _HASH = "content_sha256"
 _PLAIN_FIELDS = ("asset", "model", "model_hash", "design_hash", "procedure", "source", "seed")
-"""Fields of a calibration that are attributes of the root as they are."""
+"""Fields of a calibration that are stored as attributes of the root without conversion."""
 _ARRAY_FIELDS = ("samples", "prior_samples", "measured")
-"""Fields of a calibration that stand in groups."""
+"""Fields of a calibration that are stored in groups."""
 _JSON_FIELDS = {
     field.name: TypeAdapter(get_type_hints(Calibration)[field.name])
     for field in fields(Calibration)
     if field.name not in (*_PLAIN_FIELDS, *_ARRAY_FIELDS)
 }
-"""The other fields with their adapters; they are attributes of the root in JSON."""
+"""The other fields, with their pydantic adapters; they are stored as attributes in JSON."""
 
 Groups = Mapping[str, xr.Dataset]
 Root = Mapping[str, Any]
@@ -74,6 +74,7 @@ def result_bytes(calibration: Calibration) -> bytes:
 
 
 def _samples(calibration: Calibration, values: Float, what: str) -> xr.Dataset:
+    """Return samples (N, F) of all figures as a group with one chain, as ArviZ expects it."""
     return xr.Dataset(
         {
             figure.name: (
@@ -156,7 +157,7 @@ def check_folder(folder: Path, asset: str, *, wing: bool) -> None:
 
 
 def _calibration(groups: Groups, root: Root) -> Calibration:
-    """Return the calibration in the groups and the root's attributes of a file."""
+    """Return the calibration that the groups and the root attributes of a file describe."""
     values: dict[str, Any] = {}
     for name, adapter in _JSON_FIELDS.items():
         values[name] = adapter.validate_json(root[name])
@@ -177,11 +178,12 @@ def _calibration(groups: Groups, root: Root) -> Calibration:
 
 
 def _sample_columns(group: xr.Dataset, names: list[str]) -> Float:
-    """Return the samples (N, F) of a group, whose variables have one chain."""
+    """Return the samples (N, F) of the figures with given names in a group."""
     return np.column_stack([group[name].values[0] for name in names])
 
 
 def _read(path: Path) -> tuple[Groups, Root]:
+    """Return the groups and the root attributes of a calibration file."""
     if not path.is_file():
         state = "no file" if path.exists() else "not there"
         raise CalibrationRecordError(
@@ -200,9 +202,16 @@ def _read(path: Path) -> tuple[Groups, Root]:
 
 @lru_cache(maxsize=8)
 def _tree(path: Path, content: bytes) -> xr.DataTree:
-    """Return the groups of a file, read once for each hash of its content.
+    """Return the groups of a file, which are cached for each hash of its content.
 
     A run reads the same calibration some twenty times.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    content : bytes
+        The hash of its content; a changed file is read again.
     """
     return read_groups(path)
 
@@ -238,16 +247,16 @@ _GRID_POINTS = 401
 
 
 def tailoring(calibration: Calibration) -> dict[str, Any]:
-    """Return the options of `fmu_asset`'s `pack_wing` for the FMU of a calibrated wing.
+    """Return the arguments of `pack_wing` (`fmu_asset`) for the FMU of a calibrated wing.
 
-    The FMU starts at the means of e, masses and damping. Its description has the name of the wing
-    and the standard deviations, and its file `RESOURCE_NAME` the figures with intervals and
-    correlations. Equal calibrations give equal bytes.
+    The FMU starts at the posterior means of e, masses and damping. Its description contains the
+    name of the wing and the standard deviations. Its file `RESOURCE_NAME` contains all figures with
+    intervals and correlations. Equal calibrations give equal bytes.
     """
-    text = json.dumps(
+    record_text = json.dumps(
         plain_record(calibration), indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False
     )
-    resources = {RESOURCE_NAME: f"{text}\n".encode()}
+    resources = {RESOURCE_NAME: f"{record_text}\n".encode()}
     return {
         "state": calibration.mean_state(),
         "note": description(calibration),
@@ -269,7 +278,7 @@ def description(calibration: Calibration) -> str:
 
 
 def plain_record(calibration: Calibration) -> dict[str, Any]:
-    """Return the figures of a calibration with intervals, and the correlation of its parameters."""
+    """Return a calibration as plain data: its figures with intervals, and the correlations."""
     figures = {
         figure.name: {
             "title": figure.title,
@@ -282,10 +291,10 @@ def plain_record(calibration: Calibration) -> dict[str, Any]:
     }
     parameters = [prior.name for prior in calibration.priors]
     quantities = [figure.name for figure in calibration.quantities]
-    words = ("asset", "procedure", "seed", "model", "design_hash")
+    field_names = ("asset", "procedure", "seed", "model", "design_hash")
     return {
         "schema": SCHEMA,
-        **{name: getattr(calibration, name) for name in words},
+        **{name: getattr(calibration, name) for name in field_names},
         "samples": len(calibration.samples),
         "calibration_sha256": hash_bytes(result_bytes(calibration)),
         "campaign" if calibration.design is None else "laboratory": calibration.source,
@@ -333,7 +342,7 @@ def _prior_record(calibration: Calibration, name: str) -> dict[str, Any]:
 
 
 def _density(values: Float) -> dict[str, list[float]]:
-    """Return a Gaussian kernel density of samples (N,), or nothing if they do not vary."""
+    """Return a Gaussian kernel density of samples (N,); empty if they do not vary."""
     deviation = float(values.std())
     if deviation <= 1e-12 * abs(float(values.mean())):
         return {}

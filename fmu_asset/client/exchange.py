@@ -82,6 +82,11 @@ class Exchange:
         self.plan = self._plan(reply, configuration)
 
     def _plan(self, reply: ReplyBlock, configuration: list[InitialValue]) -> Plan:
+        """Return the plan of the instance, without its folder.
+
+        If the binding states no tolerance, our solver uses the declared one, but none above its
+        default.
+        """
         description = self.description
         header = self.binding.binding
         declared_tolerance = min(description.tolerance or 1.0, SOLVER_TOLERANCE)
@@ -122,12 +127,12 @@ class Exchange:
         return self.parameters.initial_values(parameters, health)
 
     def slot(self, role: str, name: str) -> InputSlot:
-        """Return how values of an input are checked, converted and placed.
+        """Return the slot of an input, which checks and converts its values.
 
         Parameters
         ----------
         role, name : str
-            Role and name in the binding.
+            The role and the name in the binding.
 
         Raises
         ------

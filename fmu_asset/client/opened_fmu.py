@@ -407,6 +407,7 @@ class OpenedFmu:
         return self._instance
 
     def _refuse_closed(self) -> None:
+        """Refuse to use an asset that is closed, or whose state could not be restored."""
         if self._phase == "broken":
             raise FmuStateError("A state could not be restored; reset the asset to go on.")
         if self._phase == "closed":

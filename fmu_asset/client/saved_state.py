@@ -116,14 +116,14 @@ class SavedState(PackedState):
         return self.index - self.first_index
 
     def refuse_other_outputs(self, outputs: bytes, names: Sequence[str]) -> None:
-        """Refuse a restored FMU that does not give the outputs that it gave when it was saved.
+        """Refuse a restored FMU whose outputs differ from those at the time of saving.
 
         Parameters
         ----------
         outputs : bytes
-            Its present outputs, as doubles.
+            The present outputs, as doubles.
         names : sequence of str
-            Names of the outputs.
+            The names of the outputs.
 
         Raises
         ------
@@ -137,24 +137,24 @@ class SavedState(PackedState):
         saved = np.frombuffer(self.outputs)
         present = np.frombuffer(outputs)
         # compare bits: 0.0 and -0.0 are equal numbers
-        differs = present.view(np.int64) != saved.view(np.int64)
-        first = int(np.flatnonzero(differs)[0])
+        has_other_bits = present.view(np.int64) != saved.view(np.int64)
+        output = int(np.flatnonzero(has_other_bits)[0])
         cause = "it does not give equal outputs for equal inputs, so that it cannot be resumed"
         if self.method == "serialised":
             cause = partial_state_sentence("does not restore all of its state")
         raise FmuStateError(
-            f"After the state was restored the FMU gives {names[first]} = "
-            f"{float(present[first])!r} instead of {float(saved[first])!r}: {cause}."
+            f"After the state was restored the FMU gives {names[output]} = "
+            f"{float(present[output])!r} instead of {float(saved[output])!r}: {cause}."
         )
 
 
 def partial_state_sentence(fault: str) -> str:
-    """Return the end of a sentence on an FMU that declares a state and does not keep all of it.
+    """Return the end of a sentence about an FMU that saves or restores only part of its state.
 
     Parameters
     ----------
     fault : str
-        What it does instead, such as "does not restore all of its state".
+        What the FMU does wrong, such as "does not restore all of its state".
     """
     return (
         f'it declares canGetAndSetFMUstate but {fault}; write `state = "replay"` into the table '
