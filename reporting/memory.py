@@ -27,12 +27,14 @@ def available_memory() -> float:
 
 
 def _available_memory_of_machine() -> float:
+    """Return the memory that the kernel can give to processes [bytes]."""
     text = Path("/proc/meminfo").read_text(encoding="ascii")
     kibibytes = text.split("MemAvailable:")[1].split()[0]
     return _KIBIBYTE * float(kibibytes)
 
 
 def _available_memory_of_container() -> float:
+    """Return the memory that the limit of the container (control group) leaves [bytes]."""
     limit = (_CONTROL_GROUP / "memory.max").read_text(encoding="ascii")
     used = (_CONTROL_GROUP / "memory.current").read_text(encoding="ascii")
     statistics = (_CONTROL_GROUP / "memory.stat").read_text(encoding="ascii")
@@ -50,18 +52,18 @@ def _do_nothing(_: object) -> None:
 
 
 class ResultCache:
-    """Results by key; the least recently used result goes when the cache is full.
+    """A cache of results by key, which drops the least recently used results when it is full.
 
     A copy that is sent to another process starts empty.
 
     Parameters
     ----------
     size : int
-        The total weight of results that the cache holds.
+        The largest total weight of the results in the cache.
     weight : callable
         Returns the weight of a result; 1 by default.
     end : callable
-        Is called with each result that the cache drops.
+        Called with each result that the cache drops.
     """
 
     def __init__(
@@ -80,7 +82,7 @@ class ResultCache:
         return vars(self) | {"_values": {}, "_total_weight": 0}
 
     def get(self, key: Hashable, make: Callable[[], _Value]) -> _Value:
-        """Return the result of a key; `make` computes it if the cache does not hold it."""
+        """Return the result of a key; if the cache does not hold it, `make` computes it."""
         if key in self._values:
             # Dictionaries keep the order of insertion: the last is the most recently used.
             cached: _Value = self._values.pop(key)
@@ -99,6 +101,7 @@ class ResultCache:
             self._drop_least_recently_used()
 
     def _drop_least_recently_used(self) -> None:
+        """Drop the result that was used least recently."""
         key = next(iter(self._values))
         value = self._values.pop(key)
         self._total_weight -= self._weight(value)

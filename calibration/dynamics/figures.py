@@ -51,6 +51,7 @@ def ring_down_figure(trials: Fits) -> Figure:
 def _draw_amplitude_dependence(
     panel: _AmplitudePanel, windows: list[RingDownMode], mean: float
 ) -> None:
+    """Draw a modal value of the windows over their amplitudes, and its mean over whole records."""
     axes = panel.axes
     amplitudes = [window.amplitude * _MILLIVOLTS for window in windows]
     values = [panel.scale * getattr(window, panel.quantity) for window in windows]
@@ -63,6 +64,7 @@ def _draw_amplitude_dependence(
 
 
 def _draw_record(axes: Axes, fit: RingDownFit) -> None:
+    """Draw a measured record, its fit, and the envelopes of the two modes."""
     time = fit.record.time
     measured = fit.record.signal * _MILLIVOLTS
     axes.plot(time, measured, ".", color=style.OBSERVED, ms=2.2, label="measured")
@@ -79,6 +81,7 @@ def _draw_record(axes: Axes, fit: RingDownFit) -> None:
 
 
 def _draw_spectra(axes: Axes, trials: Fits) -> None:
+    """Draw the spectra of all trials and the mean frequencies of the two modes."""
     spectra = [spectrum(fit.record) for fit in trials]
     for number, (frequency, amplitude) in enumerate(spectra):
         label = f"{len(spectra)} trials" if number == 0 else None

@@ -90,7 +90,7 @@ class ReplyBlock:
             definitions = resolver.description.units_of(selection.variable)
             to_fmu = conversion(unit, selection.variable, definitions, where=request.label)
             outputs.append(_ResolvedOutput(self.layout.positions(selection)[0], unit, to_fmu))
-        # an extra name that is there twice has its last value
+        # of several extra outputs with the same name, the last one is kept
         observed = outputs[: len(observations)]
         extra_outputs: dict[str, _ResolvedOutput] = {}
         for request, output in zip(extras, outputs[len(observations) :], strict=True):
@@ -115,7 +115,10 @@ def _observations(resolver: BindingResolver) -> list[_RequestedOutput]:
 
 
 def _extras(resolver: BindingResolver, ports: Sequence[PortQuantity]) -> list[_RequestedOutput]:
-    """Return the other outputs that are read: monitors, recorded variables and outputs of ports."""
+    """Return the outputs that are read beside the observations.
+
+    These are monitors, recorded variables and outputs of ports.
+    """
     requested = []
     for name, scalar in resolver.binding.monitor.items():
         requested.append(_RequestedOutput(name, scalar.variable, scalar.unit, f"monitor.{name}"))

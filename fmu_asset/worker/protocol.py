@@ -51,14 +51,15 @@ class Exit(IntEnum):
 
 
 _POLLING_TIME = 2.5e-4
-"""Seconds for which a message is awaited by polling.
+"""Time for which a message is awaited by repeated polling, before the process sleeps [s].
 
-To wake a process that sleeps on a pipe costs as much as a whole step. If twin and worker have a
-processor each, both therefore look again and again for a moment before they sleep.
+Waking a process that sleeps on a pipe takes as long as a whole step of an FMU. If there is a
+processor for each of twin and worker, both therefore poll for a moment first.
 """
 
 
 def _processor_count() -> int:
+    """Return the number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
@@ -111,10 +112,10 @@ def send(descriptor: int, *parts: bytes | bytearray | memoryview) -> None:
     BrokenPipeError
         If the other side is gone.
     """
-    sent = os.writev(descriptor, parts)
-    if sent < sum(len(part) for part in parts):
+    sent_bytes = os.writev(descriptor, parts)
+    if sent_bytes < sum(len(part) for part in parts):
         # only then are the parts copied
-        remaining = memoryview(b"".join(parts))[sent:]
+        remaining = memoryview(b"".join(parts))[sent_bytes:]
         while remaining:
             count = os.write(descriptor, remaining)
             remaining = remaining[count:]
