@@ -1,8 +1,7 @@
-"""The most probable hypotheses on the missing force, estimated again with their laws in the
-smoother.
+"""The most probable hypotheses on the missing force, estimated together with the motion.
 
-The search follows a hypothesis along a motion that is taken as known. Here its laws and the motion
-are estimated together.
+The search follows a hypothesis along a motion that is taken as known. Here its laws are inside of
+the smoother that estimates the motion.
 """
 
 from collections.abc import Callable, Sequence
