@@ -67,7 +67,8 @@ def step_matrices(
     """Return transitions and process noises of fine steps with laws, and fill `drift`.
 
     The force of the laws is linear in time over a step. As it depends on the state at the end, the
-    step is implicit: with begin and end matrices b and e, tangents T and pushes u,
+    step is implicit: with the matrices b and e of forces at its start and end, tangents T and
+    pushes u,
 
         (I - e T[j + 1]) z[j + 1] = (Phi + b T[j]) z[j] + (b u[j] + e u[j + 1] + drift) weights +
         noise.
@@ -83,7 +84,7 @@ def step_matrices(
     free_transition, free_noise : (K, n, n) ndarray
         The transition Phi and the process noise of a fine step without laws, by kind.
     push_at_begin, push_at_end : (K, n, P) ndarray
-        The change of the state over a fine step for a unit force at a port, at the begin and at the
+        The change of the state over a fine step for a unit force at a port, at the start and at the
         end of the step.
     tangents : (F, P, n) ndarray
         The derivative of the laws' force at a port by the state.
@@ -106,7 +107,7 @@ def step_matrices(
     for j in range(steps):
         kind = step_kind[j // parts + 1]
         begin, end = push_at_begin[kind], push_at_end[kind]
-        # right side: the laws' force at the begin of the step, and all drift
+        # right side: the laws' force at the start of the step, and all drift
         multiply(begin, tangents[j], explicit)
         explicit += free_transition[kind]
         for i in range(states):

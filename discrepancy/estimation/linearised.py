@@ -263,7 +263,7 @@ class LinearisedTrial:
         Parameters
         ----------
         begin, end : (K, n, n) array
-            The change of the state over a fine step for a unit input at its begin, or at its end,
+            The change of the state over a fine step for a unit input at its start, or at its end,
             by the kind of step.
         kind : (N,) array of int
             The kind of step that leads to each sample; steps of one kind have one length.
@@ -512,7 +512,7 @@ def push_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArra
     Returns
     -------
     by_begin, by_end : (K, n, n) array
-        The changes for an input of one at the begin of the step, falling to zero, and for an input
+        The changes for an input of one at the start of the step, falling to zero, and for an input
         of one at its end, rising from zero.
     """
     n = len(generator)

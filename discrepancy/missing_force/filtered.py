@@ -131,19 +131,23 @@ class ForceFilter:
         ]
         largest_rate = max(*largest_rates, 1e-300)
         units = np.full(state_count, largest_rate / highest_frequency)
-        has_positions = (
-            state_count % 2 == 0
-        )  # the first half are positions, the second their speeds
+        # with an even number of states, the first half are positions, the second half their speeds
+        has_positions = state_count % 2 == 0
         if has_positions:
             units[: state_count // 2] /= highest_frequency
         return units
 
     @cached_property
     def places(self) -> list[int]:
-        """The index of each missing force in the whole state; its further state follows it."""
-        counts = [len(process.generator) for _, process in self.processes]
-        begin = len(self.trial.system.generator)
-        return [begin + sum(counts[:number]) for number in range(len(counts))]
+        """The index of each missing force in the whole state.
+
+        A force that may not jump has a second state, which follows it.
+        """
+        state_counts = [len(process.generator) for _, process in self.processes]
+        first_force_state = len(self.trial.system.generator)
+        return [
+            first_force_state + sum(state_counts[:number]) for number in range(len(state_counts))
+        ]
 
     @cached_property
     def white(self) -> FloatArray:
@@ -218,8 +222,10 @@ class ForceFilter:
         """Return the filter's matrices by kind of step, with columns (K, N, C) to filter."""
         lengths, _ = self.trial.steps
         transitions, noises = discretised(self.system.generator, self.system.intensity, lengths)
-        whitened = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
-        return FilterSteps(transitions, noises, self.system.output_rows, self.trial.used, whitened)
+        scaled_columns = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
+        return FilterSteps(
+            transitions, noises, self.system.output_rows, self.trial.used, scaled_columns
+        )
 
     def products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the products of whitened columns, and half the log determinant of the readings.

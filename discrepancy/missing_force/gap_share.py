@@ -38,7 +38,7 @@ class GapShare:
         simulation.
     kind : str
         The gap, one of `OF_FORCE` (forces, weighted by what they do to the state), `OF_PREDICTIONS`
-        (changes of the readings by the forces in a block, from its begin) and `OF_READINGS`
+        (changes of the readings by the forces in a block, from its start) and `OF_READINGS`
         (differences between readings and simulation).
     tested : bool
         Whether the force of the law is large enough in these trials to be seen.

@@ -359,6 +359,8 @@ class ColumnBuilder:
         kind = self.problem.trials[number].trial.kind
         if kind not in acts_on or not len(patch):
             return TrialColumn(np.zeros_like(trial.residual))
+        # laws act along the motion; changes of the structure and of the clock are simulated; other
+        # errors of sensors act on the explained motion
         laws = patch.of(PortForce)
         if len(laws):
             return self._of_laws(trial, motion, laws)
@@ -369,7 +371,17 @@ class ColumnBuilder:
         return TrialColumn(self._of_sensors(trial, motion, number, sensors))
 
     def _of_laws(self, trial: SeenTrial, motion: TrialMotion, laws: ModelPatch) -> TrialColumn:
-        """Return the change of a trial by laws at ports, along a motion."""
+        """Return the change of a trial by laws at ports, along a motion.
+
+        Parameters
+        ----------
+        trial : SeenTrial
+            The trial.
+        motion : TrialMotion
+            The motion of its ports.
+        laws : ModelPatch
+            The laws.
+        """
         added_by_all = np.zeros_like(motion.added)
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
@@ -409,6 +421,7 @@ class ColumnBuilder:
         """
         shared = self.point.shared
         local = self.point.local[number]
+        # both responses are without the gains of the channels
         patched, _ = self.problem.response(number, shared, local, patch)
         response, _ = self.problem.response(number, shared, local, ModelPatch())
         gains = 1.0 + self.problem.shared.gains(shared, self.problem.trials[number].trial.channels)
@@ -441,6 +454,7 @@ class ColumnBuilder:
         # the true values at the sensors, and their rates
         response, rates = problem.response(number, shared, local, ModelPatch())
         gains = 1.0 + problem.shared.gains(shared, data.trial.channels)
+        # `readings` are divided by the noise and contain the gains: undo both
         change_by_laws = trial.readings(motion.explained, motion.laws) * trial.deviation / gains
         true_values = response + change_by_laws
         true_rates = None

@@ -207,6 +207,7 @@ def forward(
             place += 1
         if place == count:
             break
+        # a steady covariance stays so while the step and the used readings are the same
         same_step = k > first + 1 and step_of_sample[k] == step_of_sample[k - 1]
         is_like_last = same_step and bool(np.all(used[k] == used[k - 1]))
         steady = steady and is_like_last
@@ -257,7 +258,7 @@ def driven(
     transitions : (J, n, n) ndarray
         The transitions of the fine steps of different lengths.
     push_at_begin, push_at_end : (J, n, d) ndarray
-        The change of the state over a fine step for a unit of an input at its begin, or at its end.
+        The change of the state over a fine step for a unit of an input at its start, or at its end.
     step_of_sample : (N,) ndarray
         The index of the length of the interval that ends at each sample.
     start : (n,) ndarray

@@ -78,6 +78,7 @@ def ordering_variables(
     """
     scaled_position = position / max(float(np.std(position)), 1e-300)
     scaled_speed = speed / max(float(np.std(speed)), 1e-300)
+    # of a vibration; its force is compared by magnitude, since it changes its sign in a cycle
     amplitude = np.hypot(scaled_position, scaled_speed)
     shares = {
         "displacement": explained_variance(position, force),
@@ -147,7 +148,7 @@ class MissingForce:
 
 
 def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingForce | None:
-    """Return the missing force that a hypothesis explains, at one port.
+    """Return the missing force at one port, with the law that a hypothesis has there.
 
     The port is that of the law of the hypothesis if it has laws at one port only, otherwise the
     port with the most evidence. The share that the law explains is not computed here.
@@ -252,13 +253,13 @@ def _force_at_port(
     shares, ordered_by = ordering_variables(force, position, speed, time)
     # the trial and the sample with the largest force
     course = max(courses, key=lambda course: float(np.abs(course.force).max()))
-    k = int(np.abs(course.force).argmax())
+    sample_of_largest = int(np.abs(course.force).argmax())
     largest = ForceMoment(
         trial=course.trial,
-        time=float(course.time[k]),
-        force=float(course.force[k]),
-        displacement=float(course.position[k]),
-        speed=float(course.speed[k]),
+        time=float(course.time[sample_of_largest]),
+        force=float(course.force[sample_of_largest]),
+        displacement=float(course.position[sample_of_largest]),
+        speed=float(course.speed[sample_of_largest]),
     )
     return ForceAtPort(
         port=port,

@@ -226,7 +226,7 @@ class ForceShares:
 
 
 def _blocks(sample_count: int) -> Iterable[tuple[int, int]]:
-    """Return begin and end of each block of a trial, as indices of samples."""
+    """Return start and end of each block of a trial, as indices of samples."""
     count = min(WINDOWS, max(1, sample_count // SHORTEST))
     edges = np.linspace(0, sample_count, count + 1).astype(int)
     return pairwise(edges.tolist())

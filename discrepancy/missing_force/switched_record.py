@@ -2,7 +2,7 @@
 
 A path (N,) says for each sample whether the force of events is on; a stretch is a range of samples
 in which it stays on, or off. The filter of the readings before a moment and the backward filter of
-those after it are joined, so that the evidence of a stretch with any begin and any end needs no
+those after it are joined, so that the evidence of a stretch with any start and any end needs no
 further pass over the record.
 """
 
@@ -99,7 +99,7 @@ class SwitchedRecord:
     forces : (Process, Process)
         The force of events, and the force that may be missing throughout.
     others : sequence of Products
-        The products of the other trials, which inform on the shared unknowns.
+        The products of the other trials, which also depend on the shared unknowns.
     parts : int
         The number of steps into which each interval between samples is divided, so that a change
         can lie between samples.

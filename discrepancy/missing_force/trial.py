@@ -146,11 +146,11 @@ class SeenTrial:
 
     @cached_property
     def steps(self) -> tuple[FloatArray, IntArray]:
-        """The lengths (J,) of intervals between samples [s], and the index (N,) of each in them.
+        """The different lengths (J,) of intervals between samples [s], and an index (N,) into them.
 
-        Entry k of the index belongs to the interval that ends at sample k. The first sample has no
-        such interval; its entry is not used. Intervals within 0.1 % of their mean are taken as
-        equal, so that the matrices of a step are computed once.
+        Entry k of the index is for the interval that ends at sample k; entry 0 is not used.
+        Intervals within 0.1 % of their mean are taken as equal, so that they share the matrices of
+        a step.
         """
         lengths = np.diff(self.time)
         mean = float(lengths.mean())
@@ -163,10 +163,10 @@ class SeenTrial:
     def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """The matrices (J, n, n) by which the state advances over a fine step of each length.
 
-        They are the transition, and the derivatives of the state after the step by an input to its
-        rate at the begin and at the end of the step. The input is linear over the step (first-order
-        hold). All three follow from one exponential of the system with the input and its rate as
-        further states (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
+        They are the transition, and the derivatives of the next state by an input to the state's
+        rate at the start and at the end of the step. The input is linear over the step (first-order
+        hold). One exponential of the system, with the input and its rate as further states, gives
+        all three (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
         """
         n = len(self.system.generator)
         lengths = self.steps[0][:, None, None] / self.parts
@@ -180,7 +180,7 @@ class SeenTrial:
         by_constant_input = np.ascontiguousarray(exponential[:, state, input_])
         by_rising_input = np.ascontiguousarray(exponential[:, state, input_rate])
         # an input that rises from 0 to 1 stands for its value at the end of the step; a constant
-        # input minus a rising one falls from 1 to 0, which stands for its value at the begin
+        # input minus a rising one falls from 1 to 0, which stands for its value at the start
         return transition, by_constant_input - by_rising_input, by_rising_input
 
     @cached_property
@@ -317,12 +317,9 @@ class SeenTrial:
         return np.asarray(readings)
 
     def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
-        """Return the change of the readings (B, C) by forces over a block of B samples.
+        """Return the change of readings (B, C) by forces in a block of B samples, over the noise.
 
-        The change is divided by the noise.
-
-        The system is at rest at the begin of the block, so that forces before it have no part in
-        it.
+        The system is at rest at the start of the block, so that forces before it have no effect.
 
         Parameters
         ----------
@@ -569,6 +566,9 @@ def _ported(
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
     """Return the linear system with ports of a trial, and its derivatives by the shared unknowns.
 
+    A derivative is None if it is zero. The last unknowns are gains of channels, which do not change
+    the system.
+
     Parameters
     ----------
     problem : Problem
@@ -577,14 +577,6 @@ def _ported(
         The trial.
     shared : (K,) array
         The values of the shared unknowns.
-
-    Returns
-    -------
-    system : PortedSystem
-        The system.
-    slopes : list of PortedSystem or None
-        The derivative by each of the K unknowns; None if it is zero. The last unknowns are gains
-        of channels, which do not change the system.
     """
     unknowns = problem.shared
     outputs = problem.campaign.outputs(trial)
