@@ -350,6 +350,7 @@ class MotionEstimator:
         largest_evidence = self._evidence_beside(linear, processes)
         for factor in FACTORS:
             for port, quantity in product(tuple(processes), ("size", "time")):
+                # the first of a larger and a smaller value that is more probable is kept
                 for ratio in (factor, 1.0 / factor):
                     value = ratio * getattr(processes[port], quantity)
                     changed_processes = processes | {
@@ -401,6 +402,7 @@ class MotionEstimator:
                 for trial, local_unknowns in zip(linear.trials, local, strict=True)
             )
             evidence = solution.evidence + self._log_prior(start.processes)
+            # converged if neither an unknown, in posterior deviations, nor the evidence changes
             last_unknowns = np.concatenate((current.shared, current.effect))
             deviations = np.sqrt(np.diag(solution.covariance))
             largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
@@ -492,7 +494,7 @@ class MotionEstimator:
         The linear laws differ from the true ones at the end of a step. That difference acts like a
         further missing force, which the smoother does not know. The rms difference must not be
         larger than the standard deviation of the missing force. If no fraction of `STEP_FRACTIONS`
-        satisfies this, the smallest one is taken.
+        satisfies this, the smallest one at which the laws are possible is taken.
 
         Parameters
         ----------
@@ -512,6 +514,7 @@ class MotionEstimator:
         EstimatorStart or None
             The next start; None if the laws are not possible after any of the fractions.
         """
+        # no unknown of an effect moves by more than `LONGEST_STEP`
         change = estimate.effect - current.effect
         longest_change = float(np.max(np.abs(change), initial=0.0))
         largest_fraction = min(1.0, LONGEST_STEP / longest_change) if longest_change > 0.0 else 1.0
@@ -582,6 +585,7 @@ class MotionEstimator:
                 speed_change = (
                     stepped.trajectories[number].speeds[:, port] - trial.trajectory.speeds[:, port]
                 )
+                # the force that the linear law has after the step
                 linear_force = forces.along.force + forces.along.by_position * position_change
                 linear_force = linear_force + forces.along.by_speed * speed_change
                 for unknown, slope in forces.by_unknown.items():

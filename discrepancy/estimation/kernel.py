@@ -70,8 +70,8 @@ def step_matrices(
     step is implicit: with the matrices b and e of forces at its start and end, tangents T and
     pushes u,
 
-        (I - e T[j + 1]) z[j + 1] = (Phi + b T[j]) z[j] + (b u[j] + e u[j + 1] + drift) weights +
-        noise.
+        (I - e T[j + 1]) z[j + 1] = (Phi + b T[j]) z[j] + d weights + noise,
+        d = b u[j] + e u[j + 1] + drift[j].
 
     The matrix on the left is inverted by the Woodbury identity, with a system of P equations.
 

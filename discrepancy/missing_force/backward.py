@@ -49,13 +49,13 @@ def later(
         The smoothed state is the predicted one plus its covariance C times the addition. After the
         readings of the sample the covariance C becomes C - C information C.
     """
-    count = len(step_of_sample)
+    sample_count = len(step_of_sample)
     n = rows.shape[1]
-    additions = np.zeros((count, n))
-    informations = np.zeros((count, n, n))
+    additions = np.zeros((sample_count, n))
+    informations = np.zeros((sample_count, n, n))
     addition = np.zeros(n)
     information = np.zeros((n, n))
-    for k in range(count - 1, -1, -1):
+    for k in range(sample_count - 1, -1, -1):
         informations[k] = information
         # take in the readings of the sample, in reverse order
         for c in range(len(rows) - 1, -1, -1):
@@ -117,36 +117,36 @@ def backward(
         The information matrix, the information vectors of the columns, the products of the columns,
         and half a log determinant. All are zero for a place N, after which there are no readings.
     """
-    count = len(step_of_sample)
+    sample_count = len(step_of_sample)
     n = rows.shape[1]
-    width = columns.shape[2]
+    column_count = columns.shape[2]
     all_J = np.zeros((len(places), n, n))
-    all_h = np.zeros((len(places), n, width))
-    all_c = np.zeros((len(places), width, width))
+    all_h = np.zeros((len(places), n, column_count))
+    all_c = np.zeros((len(places), column_count, column_count))
     halves = np.zeros(len(places))
 
     J = np.zeros((n, n))
-    h = np.zeros((n, width))
-    c = np.zeros((width, width))
-    half = 0.0
+    h = np.zeros((n, column_count))
+    c = np.zeros((column_count, column_count))
+    half_log_determinant = 0.0
     # the matrices of a step, which are kept as long as J is steady and the step is the same
     root = np.zeros((n, n))
     inverse = np.zeros((n, n))
     carry_back = np.zeros((n, n))
     half_of_step = 0.0
 
-    place = np.searchsorted(places, count) - 1
+    place = np.searchsorted(places, sample_count) - 1
     next_step = -1
     steady = False
-    for k in range(count - 1, -1, -1):
-        reads_like_last = k < count - 1 and bool(np.all(used[k] == used[k + 1]))
+    for k in range(sample_count - 1, -1, -1):
+        reads_like_next = k < sample_count - 1 and bool(np.all(used[k] == used[k + 1]))
         # take in the readings of the sample
         for channel in range(len(rows)):
             if used[k, channel]:
                 h += np.outer(rows[channel], columns[k, channel])
                 c += np.outer(columns[k, channel], columns[k, channel])
         next_J = J
-        if not (steady and reads_like_last):
+        if not (steady and reads_like_next):
             J_with_readings = J.copy()
             for channel in range(len(rows)):
                 if used[k, channel]:
@@ -156,14 +156,14 @@ def backward(
             all_J[place] = J_with_readings
             all_h[place] = h
             all_c[place] = c
-            halves[place] = half
+            halves[place] = half_log_determinant
             place -= 1
         if place < 0:
             break
         # carry the information back over the step, with the process noise integrated out: with
         # noise G G^T and D = I + G^T J G, J - J G D^-1 G^T J in Joseph form, and half log det D
         step = step_of_sample[k]
-        if not (steady and reads_like_last and step == next_step):
+        if not (steady and reads_like_next and step == next_step):
             root = noise_roots[step]
             whitened_information = np.eye(n) + root.T @ J_with_readings @ root
             half_of_step = 0.5 * np.log(np.linalg.det(whitened_information))
@@ -177,10 +177,10 @@ def backward(
             )
             J = 0.5 * (J + J.T)
             carry_back = np.ascontiguousarray(transitions[step].T @ complement)
-            steady = reads_like_last and step == next_step and is_steady(J, next_J)
+            steady = reads_like_next and step == next_step and is_steady(J, next_J)
         h_along_root = root.T @ h
         c -= h_along_root.T @ inverse @ h_along_root
-        half += half_of_step
+        half_log_determinant += half_of_step
         h = carry_back @ h
         next_step = step
     return all_J, all_h, all_c, halves

@@ -27,10 +27,11 @@ from .switched_record import (
 from .view import View
 
 FINE = 4000
-"""Least number of places of a change; in a short record they lie between its samples too."""
+"""Approximate number of places of a change in a short record, which then lie between its samples
+too."""
 WORK = 4000
-"""Number of samples of all records in which events are looked for. Of longer records only every
-k-th sample is used, except in the last step."""
+"""Largest number of samples of all records together in which events are looked for. Of longer
+records only every k-th sample is used, except in the last step."""
 MOST_EVENTS = 6
 """Largest number of stretches of a record; more of them are a force that varies, not events."""
 EVENT_SIZE, STEADY_SIZE = 3.0, 0.003

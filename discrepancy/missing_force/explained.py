@@ -85,7 +85,7 @@ class ForceHypothesis:
 
         The process of a missing force is independent of the motion. If another law is missing, its
         force does depend on the motion, and a part of it may look like the laws of the hypothesis.
-        As much as a share `HIDDEN_PART` of the remaining force is assumed to be hidden so.
+        It is assumed that the rms of that part is `HIDDEN_PART` times that of the remaining force.
         """
         covariance = self.solution.covariance
         if not len(self.effect):

@@ -178,40 +178,40 @@ def forward(
     gains, variances : (B, c, n), (B, c) ndarray
         The gains and the variances of the innovations of that last sample.
     """
-    n, width = mean.shape
-    channels = len(rows)
-    count = len(places)
-    covariances = np.zeros((count, n, n))
-    means = np.zeros((count, n, width))
-    white = np.zeros((places[-1] - first, channels, width))
-    halves = np.full(count, np.inf)
-    all_gains = np.zeros((count, channels, n))
-    all_variances = np.ones((count, channels))
+    n, column_count = mean.shape
+    channel_count = len(rows)
+    place_count = len(places)
+    covariances = np.zeros((place_count, n, n))
+    means = np.zeros((place_count, n, column_count))
+    white = np.zeros((places[-1] - first, channel_count, column_count))
+    halves = np.full(place_count, np.inf)
+    all_gains = np.zeros((place_count, channel_count, n))
+    all_variances = np.ones((place_count, channel_count))
 
     covariance = covariance.copy()
     mean = mean.copy()
-    predicted = np.zeros((n, width))
-    gains = np.zeros((channels, n))
-    variances = np.ones(channels)
+    predicted = np.zeros((n, column_count))
+    gains = np.zeros((channel_count, n))
+    variances = np.ones(channel_count)
     half_log_determinant = 0.0
     place = 0
     steady = False
     for k in range(first, places[-1] + 1):
         # store the state before a place
-        while place < count and places[place] == k:
+        while place < place_count and places[place] == k:
             covariances[place] = covariance
             means[place] = mean
             halves[place] = half_log_determinant
             all_gains[place] = gains
             all_variances[place] = variances
             place += 1
-        if place == count:
+        if place == place_count:
             break
         # a steady covariance stays so while the step and the used readings are the same
         same_step = k > first + 1 and step_of_sample[k] == step_of_sample[k - 1]
-        is_like_last = same_step and bool(np.all(used[k] == used[k - 1]))
-        steady = steady and is_like_last
-        last_covariance = covariance
+        is_like_previous = same_step and bool(np.all(used[k] == used[k - 1]))
+        steady = steady and is_like_previous
+        previous_covariance = covariance
         # predict
         if k > 0:
             transition = transitions[step_of_sample[k]]
@@ -221,7 +221,7 @@ def forward(
                 covariance = transition @ covariance @ transition.T + noises[step_of_sample[k]]
                 covariance = 0.5 * (covariance + covariance.T)
         # take in the readings one at a time
-        for c in range(channels):
+        for c in range(channel_count):
             if not used[k, c]:
                 continue
             if not steady:
@@ -235,7 +235,7 @@ def forward(
             update_mean(gains[c], innovation, mean)
             innovation /= np.sqrt(variances[c])
             half_log_determinant += 0.5 * np.log(variances[c])
-        steady = steady or (is_like_last and is_steady(covariance, last_covariance))
+        steady = steady or (is_like_previous and is_steady(covariance, previous_covariance))
     return covariances, means, white, halves, all_gains, all_variances
 
 

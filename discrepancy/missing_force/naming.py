@@ -287,6 +287,7 @@ class ForceSearch(MissingForces):
             normal_equations = view_with_columns.products(
                 scaled(base.processes, size_factor, time_factor)
             )
+            # the unknowns of the base are fitted again with each column
             for number, term in enumerate(terms):
                 unknowns = [*range(known_count), known_count + number]
                 solution = normal_equations.solve(unknowns, view_with_columns.precisions[unknowns])
@@ -374,6 +375,7 @@ class ForceSearch(MissingForces):
             )
             step = hypothesis.solution.mean[len(view.shared_precision) :] - effect
             hypothesis = _without_unreached_evidence(hypothesis, step)
+            # the last iteration adds the step that remains
             if is_settled:
                 return replace(hypothesis, effect=effect + step)
             # the motion of the first step is that of the base, which follows the readings: its

@@ -190,6 +190,7 @@ class ProcessSearch:
             The values with one logarithm `DIFFERENCE` larger, or smaller.
         """
         offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
+        # central differences on the diagonal, forward ones of both logarithms off it
         curvature = np.diag(ahead + back - 2.0 * top)
         for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
             value_with_both_larger = self.value(logs + offsets[i] + offsets[k])

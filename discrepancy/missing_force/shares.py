@@ -93,6 +93,7 @@ class ForceShares:
         remaining_rms = _largest_rms([motion.left for motion in motions], ports)
         total_rms = _largest_rms([motion.forces for motion in motions_without], ports)
         law_rms = _largest_rms([motion.laws for motion in motions], ports)
+        # in trials where the force of the law is small, its share says nothing about it
         tested = not law_ports or law_rms**2 > TESTED * total_rms**2
         of_forces, of_predictions = self._block_sums(hypothesis, view, motions, motions_without)
         shares = []
@@ -161,6 +162,7 @@ class ForceShares:
             noise_forces = {}
             for (port, _), force in zip(force_filter.processes, smoothed.forces, strict=True):
                 noise_forces[port] = force
+            # in the order of `_BlockSums`: without a law, with the law, and of noise alone
             forces_of_kinds: tuple[PortForces, ...] = (
                 motion_without.forces,
                 motion.left,
@@ -187,6 +189,7 @@ class ForceShares:
         """
         if held_out not in self._without_effect:
             whole = self.search.whole
+            # an unknown without a prior has no bound
             bound = np.where(whole.view.shared_precision > 0.0, WITHIN, np.inf)
             mean = np.clip(whole.solution.mean, -bound, bound)
             bounded = replace(whole, solution=replace(whole.solution, mean=mean))
