@@ -129,7 +129,7 @@ class EffectLaws:
         shared: FloatArray,
         smoothing: float,
     ) -> dict[int, ForceAlong]:
-        """Return the forces of all laws as `forces` does; raise an error if an effect is not possible."""
+        """Return the forces of all laws as `forces` does, but raise if one is not possible."""
         patch = self.own_laws(shared) + self._patch(number, effect).of(PortForce)
         return self._along(number, trajectory, patch, smoothing)
 

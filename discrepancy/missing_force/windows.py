@@ -2,8 +2,8 @@
 
 They are found as events: of the missing force at the port with the most evidence or, if that is
 more probable, of an error of one channel, with all unknowns of the records integrated out. If the
-model does not describe how its ports move, events are looked for in the residuals of a fit, in
-that pattern over the channels which contains most of them.
+model does not describe how its ports move, events are looked for in the residuals of a fit:
+in the course of their strongest pattern over the channels (the first singular vector).
 """
 
 from collections.abc import Sequence
@@ -161,7 +161,7 @@ def residual_windows(
         process = hypothesis.processes[0]
         try:
             best_events = events(hypothesis.view, 0, process)
-        # residuals of millions of noise deviations are singular; they are taken as a gap throughout
+        # with residuals of millions of noise deviations matrices become singular: a gap throughout
         except np.linalg.LinAlgError:
             best_events = throughout(hypothesis.view, 0, process)
         residuals_by_pattern = hypothesis.motions[0].forces[0][:, None] * pattern
