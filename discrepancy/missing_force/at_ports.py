@@ -82,13 +82,13 @@ class MissingForces:
         If there are more than `MOST_PORTS` ports, those with the most evidence are taken.
         """
         best = self.best()
-        most_probable_ports = sorted(self.at.values(), key=lambda at_port: -at_port.log_evidence)[
+        best_ports = sorted(self.at.values(), key=lambda at_port: -at_port.log_evidence)[
             :MOST_PORTS
         ]
-        if len(most_probable_ports) == 1:
+        if len(best_ports) == 1:
             return best
         begin = dict(best.processes)
-        for at_port in most_probable_ports[1:]:
+        for at_port in best_ports[1:]:
             begin |= scaled(at_port.processes, BESIDE, 1.0)
         view = best.view
         # the second time along the motion that the first one has estimated
@@ -157,6 +157,7 @@ class MissingForces:
         for _ in range(2):
             self.point = self._point(hypothesis)
             view = self._linear_view()
+            # the model's own laws and the motion depend on each other: twice
             for _ in range(2):
                 _, _, motions = view.smoothed(hypothesis.processes)
                 view = self.columns.along(view, motions)

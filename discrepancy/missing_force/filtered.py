@@ -326,13 +326,13 @@ class ForceFilter:
             The covariance of the state at each sample, given all readings.
         """
         force_count = len(self.processes)
-        rows = np.zeros((2 * force_count, covariances.shape[-1]))
+        output_rows = np.zeros((2 * force_count, covariances.shape[-1]))
         for number, (port, process) in enumerate(self.processes):
-            rows[number, self.places[number]] = process.size
-            rows[force_count + number, : len(self.units)] = (
+            output_rows[number, self.places[number]] = process.size
+            output_rows[force_count + number, : len(self.units)] = (
                 self.trial.system.speeds[port] * self.units
             )
-        variances = np.sum((rows @ covariances) * rows, axis=-1)
+        variances = np.sum((output_rows @ covariances) * output_rows, axis=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
 
 
@@ -390,20 +390,26 @@ class Regression:
         """
         rows = np.array([0, *(1 + k for k in chosen)])
         products = self.products[np.ix_(rows, rows)]
-        prior = np.maximum(precision, LEAST_PRECISION)
+        prior_precision = np.maximum(precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
-        scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior)
-        normal = (products[1:, 1:] + np.diag(prior)) * np.outer(scale, scale)
-        factor = cho_factor(normal + ROUNDING * np.eye(len(scale)))
-        mean = scale * cho_solve(factor, scale * products[1:, 0])
-        covariance = np.outer(scale, scale) * cho_solve(factor, np.eye(len(prior)))
+        column_scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior_precision)
+        normal_matrix = (products[1:, 1:] + np.diag(prior_precision)) * np.outer(
+            column_scale, column_scale
+        )
+        factor = cho_factor(normal_matrix + ROUNDING * np.eye(len(column_scale)))
+        mean = column_scale * cho_solve(factor, column_scale * products[1:, 0])
+        covariance = np.outer(column_scale, column_scale) * cho_solve(
+            factor, np.eye(len(prior_precision))
+        )
         # Laplace's approximation of the evidence, which is exact for a linear model
         residual_weights = np.r_[1.0, -mean]
-        misfit = float(residual_weights @ products @ residual_weights + mean @ (prior * mean))
+        misfit = float(
+            residual_weights @ products @ residual_weights + mean @ (prior_precision * mean)
+        )
         evidence = -0.5 * misfit - self.log_determinant
         # half the log determinant of the unscaled normal equations
-        log_determinant = np.sum(np.log(np.diag(factor[0]) / scale))
-        evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior)))
+        log_determinant = np.sum(np.log(np.diag(factor[0]) / column_scale))
+        evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior_precision)))
         return Solution(evidence, mean, covariance)
 
 
@@ -430,16 +436,14 @@ def without(
     """
     if not len(precision):
         return products, halves
-    prior = np.maximum(precision, LEAST_PRECISION)
-    remaining_count = products.shape[-1] - len(prior)
+    prior_precision = np.maximum(precision, LEAST_PRECISION)
+    kept_count = products.shape[-1] - len(prior_precision)
     # Schur complement of the last columns
-    root = np.linalg.cholesky(products[..., remaining_count:, remaining_count:] + np.diag(prior))
-    projected = np.asarray(np.linalg.solve(root, products[..., remaining_count:, :remaining_count]))
+    root = np.linalg.cholesky(products[..., kept_count:, kept_count:] + np.diag(prior_precision))
+    projected = np.asarray(np.linalg.solve(root, products[..., kept_count:, :kept_count]))
     half_log_determinants = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
-    remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior).sum()
-    return products[
-        ..., :remaining_count, :remaining_count
-    ] - projected.mT @ projected, remaining_halves
+    remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior_precision).sum()
+    return products[..., :kept_count, :kept_count] - projected.mT @ projected, remaining_halves
 
 
 def regression(filtered: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:

@@ -212,12 +212,11 @@ class SwitchedRecord:
             The samples that follow the last ones of the stretches. No step follows the end of the
             record: its transition is the identity, without noise.
         """
+        # the kind of step as in `step_kinds`: the path is inverted before the end, not at it
         is_last = ends == len(on)
-        sample_at_end = np.where(is_last, 0, ends)
-        is_on_before_end = ~on[ends - 1]
-        kind = (
-            2 * is_on_before_end + on[sample_at_end]
-        ) * self.length_count + self.length_of_sample[sample_at_end]
+        end_sample = np.where(is_last, 0, ends)
+        was_on = ~on[ends - 1]
+        kind = (2 * was_on + on[end_sample]) * self.length_count + self.length_of_sample[end_sample]
         identity = np.eye(len(self.steps.rows[0]))
         transitions = np.where(is_last[:, None, None], identity, self.steps.moves[kind])
         noises = np.where(is_last[:, None, None], 0.0, self.steps.noises[kind])
