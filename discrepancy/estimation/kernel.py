@@ -327,7 +327,7 @@ def smooth_record(
                             - row[i] * information_gain[m]
                             - information_gain[i] * row[m]
                         )
-        # smoothed state: prediction + C r, with covariance C - C N C
+        # smoothed state: prediction + C r; its covariance is C - C N C
         multiply(covariances[j], information, work)
         for i in range(size):
             reduction = 0.0

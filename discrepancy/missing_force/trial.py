@@ -374,7 +374,7 @@ def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, flo
     ]
     if not 0.0 < covariances[2] < covariances[1]:
         return None
-    # of an autoregression of first order plus white noise c_1 = share c_0 decay, c_2 = c_1 decay
+    # for a first-order autoregression plus white noise, c_1 = share c_0 decay and c_2 = c_1 decay
     decay = covariances[2] / covariances[1]
     return min(covariances[1] / decay / covariances[0], 1.0 - LEAST_WHITE), -float(
         np.log(decay)
@@ -531,7 +531,7 @@ def _port_motion(
     Returns
     -------
     motion : (2, F, P) array
-        Positions and speeds of the P ports at the fine stamps [m or rad, and per s].
+        The positions and speeds of the P ports at the fine stamps [m or rad, and per s].
     by_unknowns : dict of int to (2, F, P) array
         The derivatives of the motion, by the number of the unknown in `SeenTrial.about`.
     """
