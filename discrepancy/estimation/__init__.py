@@ -1,1 +1,1 @@
-"""Trajectory, missing force and parameters of a hypothesis, estimated together."""
+"""The joint estimate of trajectory, missing force and unknowns of a hypothesis."""

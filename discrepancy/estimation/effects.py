@@ -1,4 +1,4 @@
-"""Effects of the catalogue as laws and sensors of a hypothesis, along a trajectory."""
+"""The effects of a hypothesis as forces at ports and errors of sensors along a trajectory."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,25 +19,25 @@ from .laws import ForceAlong, force_along
 from .linearised import Forces, SensorReadings, Trajectory
 
 STEP = 0.02
-"""Standard normal step of the derivatives of an effect by its unknowns."""
+"""Half the difference of a standard normal unknown in derivatives by it."""
 
 
 @dataclass(frozen=True, eq=False)
 class EffectLaws:
-    """The effects of a candidate beside the laws that the model has itself.
+    """The laws and sensor errors of a candidate's effects, together with the model's own laws.
 
     Attributes
     ----------
     columns : ColumnBuilder
-        Makes what sensors do to readings.
+        The builder of the changes of readings by errors of sensors.
     trials : tuple of SeenTrial
-        Dynamic trials.
+        The dynamic trials.
     candidate : Candidate
-        Effects at places.
+        The effects at their places.
     own_laws : callable
-        Takes shared unknowns (K,); returns the laws that the model has itself.
+        The function that takes shared unknowns (K,), and returns the model's own laws.
     adjustable : tuple of int
-        Shared unknowns by which these change.
+        The numbers of the shared unknowns that change the model's own laws.
     """
 
     columns: ColumnBuilder
@@ -48,7 +48,7 @@ class EffectLaws:
 
     @property
     def size(self) -> int:
-        """Number E of unknowns of the effects."""
+        """The number E of unknowns of the effects."""
         return self.candidate.size
 
     def along(
@@ -59,9 +59,26 @@ class EffectLaws:
         shared: FloatArray,
         smoothing: float,
     ) -> tuple[Mapping[int, Forces], SensorReadings] | None:
-        """Return forces at ports and readings of a trial along a trajectory.
+        """Return forces at ports and changes of readings along a trajectory, and derivatives.
 
-        None where they cannot be.
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        trajectory : Trajectory
+            The motion of the trial.
+        effect : (E,) array
+            The values of the effects' unknowns.
+        shared : (K,) array
+            The values of the shared unknowns.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        (mapping of int to Forces, SensorReadings) or None
+            The forces by the number of the port, and the changes of the readings; None if an effect
+            is not possible at these values.
         """
         try:
             forces = self._forces(number, trajectory, effect, shared, smoothing)
@@ -77,7 +94,26 @@ class EffectLaws:
         shared: FloatArray,
         smoothing: float,
     ) -> Mapping[int, ForceAlong] | None:
-        """Return the forces of all laws at ports along a trajectory; None where they cannot be."""
+        """Return the forces of all laws at ports along a trajectory, not their derivatives.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        trajectory : Trajectory
+            The motion of the trial.
+        effect : (E,) array
+            The values of the effects' unknowns.
+        shared : (K,) array
+            The values of the shared unknowns.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        mapping of int to ForceAlong or None
+            The forces by the number of the port; None if an effect is not possible at these values.
+        """
         try:
             return self._forces_at(number, trajectory, effect, shared, smoothing)
         except (DiscrepancyError, InvalidPatchError):
@@ -93,7 +129,7 @@ class EffectLaws:
         shared: FloatArray,
         smoothing: float,
     ) -> dict[int, ForceAlong]:
-        """Return the forces of all laws at ports along a trajectory."""
+        """Return the forces of all laws as `forces` does, but raise if one is not possible."""
         patch = self.own_laws(shared) + self._patch(number, effect).of(PortForce)
         return self._along(number, trajectory, patch, smoothing)
 
@@ -105,26 +141,33 @@ class EffectLaws:
         shared: FloatArray,
         smoothing: float,
     ) -> dict[int, Forces]:
-        """Return the forces of all laws at ports, with their derivatives by unknowns."""
+        """Return the forces of all laws, by port, with their central differences by unknowns.
+
+        The parameters are those of `along`. Unknowns are numbered with the K shared ones first,
+        then those of the effects.
+        """
 
         def at(values: FloatArray, parameters: FloatArray) -> dict[int, ForceAlong]:
             return self._forces_at(number, trajectory, values, parameters, smoothing)
 
-        along = at(effect, shared)
-        slopes: dict[int, dict[int, FloatArray]] = {port: {} for port in along}
+        forces = at(effect, shared)
+        slopes_by_port: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
         for k in range(self.size):
             above, below = (
                 at(with_step(effect, k, STEP), shared),
                 at(with_step(effect, k, -STEP), shared),
             )
-            self._take_slopes(slopes, len(shared) + k, above, below)
+            self._take_slopes(slopes_by_port, len(shared) + k, above, below)
         for k in self.adjustable:
             above, below = (
                 at(effect, with_step(shared, k, STEP)),
                 at(effect, with_step(shared, k, -STEP)),
             )
-            self._take_slopes(slopes, k, above, below)
-        return {port: Forces(force, slopes[port]) for port, force in along.items()}
+            self._take_slopes(slopes_by_port, k, above, below)
+        return {
+            port: Forces(force_at_port, slopes_by_port[port])
+            for port, force_at_port in forces.items()
+        }
 
     @staticmethod
     def _take_slopes(
@@ -133,26 +176,50 @@ class EffectLaws:
         above: Mapping[int, ForceAlong],
         below: Mapping[int, ForceAlong],
     ) -> None:
-        """Add the derivatives of forces by an unknown where they are not zero."""
-        for port, of_port in slopes.items():
+        """Store the derivatives of forces by an unknown in `slopes`, unless they are zero.
+
+        Parameters
+        ----------
+        slopes : mapping of int to dict of int to (F,) array
+            The derivatives by port and unknown, which are extended.
+        unknown : int
+            The number of the unknown.
+        above, below : mapping of int to ForceAlong
+            The forces with the unknown `STEP` above and below its value, by port.
+        """
+        for port, slopes_at_port in slopes.items():
             if port in above and port in below:
                 slope = (above[port].force - below[port].force) / (2.0 * STEP)
                 if np.any(slope):
-                    of_port[unknown] = slope
+                    slopes_at_port[unknown] = slope
 
     def _patch(self, number: int, effect: FloatArray) -> ModelPatch:
-        """Return what the effects add to the model in a trial."""
+        """Return the change of the model by the effects (E,) in a trial, given by its index."""
         trial = self.columns.problem.trials[self.columns.numbers[number]].trial
         patch = ModelPatch()
-        for term, part in self.candidate.split(effect):
+        for term, term_values in self.candidate.split(effect):
             if trial.kind in term.effect.acts_on:
-                patch = patch + term.patch(self.columns.problem.setting, part).in_trial(trial.name)
+                patch = patch + term.patch(self.columns.problem.setting, term_values).in_trial(
+                    trial.name
+                )
         return patch
 
     def _along(
         self, number: int, trajectory: Trajectory, patch: ModelPatch, smoothing: float
     ) -> dict[int, ForceAlong]:
-        """Return the forces of a patch's laws, by port."""
+        """Return the forces of a patch's laws along a trajectory, summed by the number of the port.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        trajectory : Trajectory
+            The motion of the trial.
+        patch : ModelPatch
+            The patch; what is not a law at a port is left out.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+        """
         trial = self.trials[number]
         forces: dict[int, ForceAlong] = {}
         for law in self.columns.problem.model.at_ports(patch):
@@ -172,33 +239,60 @@ class EffectLaws:
     # ------------------------------------------------------------ sensors
 
     def _readings(self, number: int, trajectory: Trajectory, effect: FloatArray) -> SensorReadings:
-        """Return what effects of sensors do to readings, with derivatives by their unknowns."""
+        """Return the changes of a trial's readings by errors of sensors, with their derivatives.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        trajectory : Trajectory
+            The motion of the trial.
+        effect : (E,) array
+            The values of the effects' unknowns.
+        """
         trial = self.trials[number]
-        known = np.zeros_like(trial.residual)
-        by_unknown: dict[int, FloatArray] = {}
+        change = np.zeros_like(trial.residual)
+        slopes: dict[int, FloatArray] = {}
         first_unknown = len(trial.shared)
         motion = seen_motion(trajectory)
-        for term, part in self.candidate.split(effect):
-            if not len(term.patch(self.columns.problem.setting, part).of(PortForce)):
-                known = known + self._shown(number, motion, term, part)
-                for k in range(len(part)):
-                    above = self._shown(number, motion, term, with_step(part, k, STEP))
-                    below = self._shown(number, motion, term, with_step(part, k, -STEP))
-                    by_unknown[first_unknown + k] = (above - below) / (2.0 * STEP)
-            first_unknown += len(part)
-        return SensorReadings(known, by_unknown)
+        for term, term_values in self.candidate.split(effect):
+            # an effect without a law at a port changes readings only
+            if not len(term.patch(self.columns.problem.setting, term_values).of(PortForce)):
+                change = change + self._shown(number, motion, term, term_values)
+                for k in range(len(term_values)):
+                    above = self._shown(number, motion, term, with_step(term_values, k, STEP))
+                    below = self._shown(number, motion, term, with_step(term_values, k, -STEP))
+                    slopes[first_unknown + k] = (above - below) / (2.0 * STEP)
+            first_unknown += len(term_values)
+        return SensorReadings(change, slopes)
 
     def _shown(
         self, number: int, motion: TrialMotion, term: EffectTerm, values: FloatArray
     ) -> FloatArray:
-        """Return what one effect does to the readings (N, C) of a trial, over their noise."""
+        """Return the change (N, C) of a trial's readings by one effect, divided by the noise.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        motion : TrialMotion
+            The motion that the sensors measure.
+        term : EffectTerm
+            The effect.
+        values : array
+            The values of its unknowns.
+        """
         patch = term.patch(self.columns.problem.setting, values)
-        part = self.columns.part(self.trials[number], motion, number, patch, term.effect.acts_on)
-        return part.readings
+        column = self.columns.part(self.trials[number], motion, number, patch, term.effect.acts_on)
+        return column.readings
 
 
 def seen_motion(trajectory: Trajectory) -> TrialMotion:
-    """Return a trajectory as sensors see it: what laws and missing forces add."""
+    """Return the motion that sensors measure along a trajectory, for the columns of sensor errors.
+
+    All that laws and missing forces add counts as explained here, since it is part of the
+    trajectory.
+    """
     return TrialMotion(
         added=trajectory.added,
         forces=trajectory.forces,

@@ -1,11 +1,11 @@
-"""Trajectory, missing force and unknowns of a hypothesis, estimated together, with the evidence.
+"""The joint estimate of trajectory, missing force and unknowns of a hypothesis, with its evidence.
 
-Gauss-Newton on the trajectory: the trials are made linear along the last trajectory, one filter and
-one smoother give the next, until nothing moves. This is the iterated Kalman smoother (Bell 1994,
-SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It begins with a large
-missing force, with which a trajectory follows the readings whatever the law, and lowers it step by
-step (continuation). The innovations at the end give the evidence by Laplace's approximation, which
-chooses how large the missing force is.
+It is Gauss-Newton on the trajectory: the trials are linearised along the last trajectory, and one
+filter and one smoother give the next one, until nothing changes. This is the iterated Kalman
+smoother (Bell 1994, SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It
+begins with a large missing force, with which the trajectory follows the readings whatever the law,
+and lowers that force in steps (continuation). The innovations at the end give the evidence by
+Laplace's approximation, and the size of the missing force is that with the largest evidence.
 """
 
 from collections.abc import Mapping
@@ -31,32 +31,34 @@ from .laws import ForceAlong
 from .linearised import Forces, LinearisedTrial, SensorReadings, SmoothedTrial, Trajectory
 
 SHARES_OF_SIZE = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
-"""Deviations of the missing force, over the first one, through which it is lowered."""
+"""Standard deviations of the missing force, over the first one, through which it is lowered."""
 SMOOTHINGS = (0.1, 0.02, 0.005)
-"""Half windows of speeds, over the usual speed, over which laws of speed are averaged: wide ones
-first."""
+"""Half windows of speeds over which laws of the speed are averaged, over the rms speed. They become
+narrower from one estimate to the next."""
 ITERATIONS = 12
-"""Linearisations at one size of the missing force, at most."""
+"""Largest number of linearisations at one size of the missing force."""
 SETTLED = 0.02
-"""Step of the unknowns, in their standard deviations, below which nothing moves any more."""
+"""Step of an unknown, in posterior standard deviations, below which the iteration has converged."""
 LEVEL = 0.05
-"""Change of the evidence [nat] below which nothing moves any more."""
+"""Change of the log evidence below which the iteration has converged [nat]."""
 STEP_FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
-"""Parts of a step that are tried in turn."""
+"""Fractions of a step that are tried in turn."""
 LONGEST_STEP = 2.0
-"""Longest step of the unknown of an effect, in deviations of its prior."""
+"""Longest step of the unknown of an effect, in prior standard deviations."""
 FACTORS = (3.0, 1.7, 1.3)
-"""Of size and time of a missing force, by which the most probable ones are looked for."""
+"""Factors on size and time of a missing force in the search for its most probable values, in
+turn."""
 DECLINE = 12.0
-"""Evidence [nat] below the best by which lower missing forces are given up."""
+"""Difference of log evidence to the best size of the missing force, from which on smaller sizes are
+not tried [nat]."""
 
 
 class HypothesisLaws(Protocol):
-    """The laws and sensors of a hypothesis, as the estimator asks for them."""
+    """The laws and sensor errors of a hypothesis, as the estimator needs them."""
 
     @property
     def size(self) -> int:
-        """Number E of unknowns of its effects, each of standard normal prior."""
+        """The number E of unknowns of its effects, each with a standard normal prior."""
 
     def along(
         self,
@@ -66,9 +68,26 @@ class HypothesisLaws(Protocol):
         shared: FloatArray,
         smoothing: float,
     ) -> tuple[Mapping[int, Forces], SensorReadings] | None:
-        """Return forces at ports and readings of a trial along a trajectory.
+        """Return forces at ports and changes of readings along a trajectory, and derivatives.
 
-        None where they cannot be.
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        trajectory : Trajectory
+            The motion of the trial.
+        effect : (E,) array
+            The values of the effects' unknowns.
+        shared : (K,) array
+            The values of the shared unknowns.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        (mapping of int to Forces, SensorReadings) or None
+            The forces by the number of the port, and the changes of the readings; None if an effect
+            is not possible at these values.
         """
 
     def forces(
@@ -79,29 +98,48 @@ class HypothesisLaws(Protocol):
         shared: FloatArray,
         smoothing: float,
     ) -> Mapping[int, ForceAlong] | None:
-        """Return the forces at ports of a trial along a trajectory; None where they cannot be."""
+        """Return the forces of all laws at ports along a trajectory, not their derivatives.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        trajectory : Trajectory
+            The motion of the trial.
+        effect : (E,) array
+            The values of the effects' unknowns.
+        shared : (K,) array
+            The values of the shared unknowns.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        mapping of int to ForceAlong or None
+            The forces by the number of the port; None if an effect is not possible at these values.
+        """
 
 
 @dataclass(frozen=True, eq=False)
 class MotionEstimate:
-    """A hypothesis at its most probable values.
+    """A hypothesis at its most probable values, estimated together with the motion of the trials.
 
     Attributes
     ----------
     effect : (E,) ndarray
-        Unknowns of its effects, standard normal before the readings.
+        The unknowns of its effects, with standard normal prior.
     shared : (K,) ndarray
-        Unknowns of all trials.
+        The unknowns that all trials share.
     local : tuple of (L,) ndarray
-        Unknowns of each trial.
+        The unknowns of each trial alone.
     covariance : (K + E, K + E) ndarray
         The covariance of shared unknowns and effect parameters.
     processes : mapping of int to Process
-        Missing forces beside its laws, by the numbers of their ports.
+        The forces that remain missing with its laws, by the numbers of their ports.
     log_evidence : float
-        Logarithm of the evidence [nat], with the priors of the processes.
+        The log evidence with the priors of the processes [nat].
     trials : tuple of SmoothedTrial
-        TrialMotion and missing forces of each trial.
+        The motion and the missing forces of each trial.
     converged : bool
         Whether the last step was short enough.
     """
@@ -118,52 +156,81 @@ class MotionEstimate:
 
 @dataclass(frozen=True, eq=False)
 class Linearisation:
-    """All trials, linear along their trajectories."""
+    """All trials, linear along their trajectories.
+
+    Attributes
+    ----------
+    trials : tuple of LinearisedTrial
+        The trials.
+    precision : (K + E,) ndarray
+        The prior precisions of the shared unknowns, and of those of the effects.
+    """
 
     trials: tuple[LinearisedTrial, ...]
     precision: FloatArray
 
     def solve(self) -> tuple[Solution, list[FloatArray]]:
-        """Return shared unknowns and those of effects, and the unknowns of each trial."""
-        total = np.zeros((1 + len(self.precision),) * 2)
-        half = 0.0
+        """Return the most probable values of all unknowns.
+
+        Returns
+        -------
+        solution : Solution
+            The shared unknowns, then those of effects.
+        local : list of (L,) array
+            The unknowns of each trial alone.
+        """
+        sum_of_products = np.zeros((1 + len(self.precision),) * 2)
+        half_log_determinant = 0.0
         for linear_trial in self.trials:
             products, half_of_trial = linear_trial.products
             local_precision = linear_trial.trial.local_precision
             without_local, half_without_local = without(
                 products, np.asarray(half_of_trial), local_precision
             )
-            total += without_local
-            half += float(half_without_local)
-        solution = Regression(total, half).solve(range(len(self.precision)), self.precision)
+            sum_of_products += without_local
+            half_log_determinant += float(half_without_local)
+        solution = Regression(sum_of_products, half_log_determinant).solve(
+            range(len(self.precision)), self.precision
+        )
         return solution, [self._local(linear_trial, solution.mean) for linear_trial in self.trials]
 
     def beside(self, processes: Mapping[int, Process]) -> "Linearisation":
-        """Return the same with other missing forces."""
+        """Return the same linear trials with other missing forces."""
         trials = tuple(replace(trial, processes=processes) for trial in self.trials)
         return Linearisation(trials, self.precision)
 
     def _local(self, linear_trial: LinearisedTrial, known: FloatArray) -> FloatArray:
-        """Return the unknowns (L,) of a trial, given the others."""
+        """Return the most probable unknowns (L,) of a trial alone, given the others.
+
+        Parameters
+        ----------
+        linear_trial : LinearisedTrial
+            The trial.
+        known : (K + E,) array
+            The values of the shared unknowns, and of those of effects.
+        """
+        # the last rows of the normal equations, with the known values on the right side
         products, _ = linear_trial.products
-        first = 1 + len(known)
+        first_local = 1 + len(known)
         precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
-        right = products[first:, 0] - products[first:, 1:first] @ known
-        return np.linalg.solve(products[first:, first:] + np.diag(precision), right)
+        right_side = products[first_local:, 0] - products[first_local:, 1:first_local] @ known
+        return np.linalg.solve(
+            products[first_local:, first_local:] + np.diag(precision), right_side
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class EstimatorStart:
-    """Where an estimate begins.
+    """The values and trajectories with which an estimate begins.
 
     Attributes
     ----------
     effect, shared : (E,), (K,) ndarray
-        Unknowns.
+        The unknowns of effects, and those that all trials share.
     trajectories : tuple of Trajectory
         The trajectory of each trial.
     processes : mapping of int to Process
-        Missing forces, large enough that the trajectory follows the readings.
+        The missing forces, so large that the trajectory can follow the readings whatever the laws.
     """
 
     effect: FloatArray
@@ -173,7 +240,7 @@ class EstimatorStart:
 
 
 def start_after(estimate: MotionEstimate) -> EstimatorStart:
-    """Return the start of an estimate that begins where another one ended."""
+    """Return the start of an estimate that continues from the result of another one."""
     return EstimatorStart(
         estimate.effect,
         estimate.shared,
@@ -184,16 +251,16 @@ def start_after(estimate: MotionEstimate) -> EstimatorStart:
 
 @dataclass(frozen=True, eq=False)
 class MotionEstimator:
-    """Estimates hypotheses on the same trials.
+    """The estimator of hypotheses on the same trials.
 
     Attributes
     ----------
     trials : tuple of SeenTrial
-        Dynamic trials.
+        The dynamic trials.
     shared_precision : (K,) ndarray
-        Prior precision of the shared unknowns.
+        The prior precisions of the shared unknowns.
     usual : mapping of int to Process
-        Medians of the priors of missing forces, by port.
+        The prior medians of the missing forces, by the number of the port.
     """
 
     trials: tuple[SeenTrial, ...]
@@ -201,16 +268,22 @@ class MotionEstimator:
     usual: Mapping[int, Process]
 
     def estimate(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
-        """Return a hypothesis at its most probable values; None where its laws cannot be followed.
+        """Return a hypothesis at its most probable values.
 
         Parameters
         ----------
         laws : HypothesisLaws
-            The laws and sensors of the hypothesis.
+            The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The values and trajectories to begin with.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if the laws are not possible along the trajectories.
         """
         current = start
+        # with wide windows of speeds first, so that a jump of a law does not stop the iteration
         for smoothing in SMOOTHINGS[:-1]:
             smoothed = self._iterated(laws, current, smoothing)
             if smoothed is None:
@@ -225,8 +298,19 @@ class MotionEstimator:
         """Return the estimate with the most probable of several sizes of the missing force.
 
         With a large missing force the trajectory follows the readings whatever the laws are. The
-        size is then lowered step by step, and each estimate begins where the last one ended. None
-        if the laws cannot be followed even at the first size.
+        size is then lowered in steps, and each estimate begins where the last one ended.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The values to begin with, and the first size.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if the laws are not possible even at the first size.
         """
         best: MotionEstimate | None = None
         current = start
@@ -246,25 +330,35 @@ class MotionEstimator:
         return best
 
     def _tuned(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
-        """Return an estimate with size and time of its missing forces at the most probable values.
+        """Return an estimate with the most probable sizes and times of its missing forces.
 
-        A pattern search by ever smaller factors; the trials stay linear along one trajectory
-        meanwhile.
+        A pattern search with decreasing factors. In it the trials stay linear along one trajectory;
+        the result is then estimated anew, and returned if it is more probable.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        estimate : MotionEstimate
+            The estimate with the present sizes and times.
         """
         start = start_after(estimate)
         linear = self.linearised(laws, start, SMOOTHINGS[-1])
         if linear is None:
             return estimate
         processes = dict(start.processes)
-        top = self._evidence_beside(linear, processes)
+        largest_evidence = self._evidence_beside(linear, processes)
         for factor in FACTORS:
-            for port, name in product(tuple(processes), ("size", "time")):
-                for change in (factor, 1.0 / factor):
-                    value = change * getattr(processes[port], name)
-                    changed = processes | {port: replace(processes[port], **{name: value})}
-                    evidence = self._evidence_beside(linear, changed)
-                    if evidence > top:
-                        processes, top = changed, evidence
+            for port, quantity in product(tuple(processes), ("size", "time")):
+                # the first of a larger and a smaller value that is more probable is kept
+                for ratio in (factor, 1.0 / factor):
+                    value = ratio * getattr(processes[port], quantity)
+                    changed_processes = processes | {
+                        port: replace(processes[port], **{quantity: value})
+                    }
+                    evidence = self._evidence_beside(linear, changed_processes)
+                    if evidence > largest_evidence:
+                        processes, largest_evidence = changed_processes, evidence
                         break
         tuned = self._iterated(laws, replace(start, processes=processes), SMOOTHINGS[-1])
         return (
@@ -274,7 +368,23 @@ class MotionEstimator:
     def _iterated(
         self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
     ) -> MotionEstimate | None:
-        """Return the estimate beside given missing forces, by Gauss-Newton steps."""
+        """Return the estimate with given missing forces, by damped Gauss-Newton steps.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The values and trajectories to begin with, and the missing forces.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The last estimate; None if the laws are not possible along the first trajectories, or if
+            the first evidence is not finite.
+        """
         current = start
         last_evidence = -inf
         estimate: MotionEstimate | None = None
@@ -285,20 +395,21 @@ class MotionEstimator:
             solution, local = linear.solve()
             if not np.isfinite(solution.evidence):
                 return estimate
-            count = len(self.shared_precision)
+            shared_count = len(self.shared_precision)
             unknowns = solution.mean
             smoothed = tuple(
                 trial.smoothed(np.concatenate((unknowns, local_unknowns)))
                 for trial, local_unknowns in zip(linear.trials, local, strict=True)
             )
             evidence = solution.evidence + self._log_prior(start.processes)
+            # converged if neither an unknown, in posterior deviations, nor the evidence changes
             last_unknowns = np.concatenate((current.shared, current.effect))
             deviations = np.sqrt(np.diag(solution.covariance))
-            largest_move = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
-            is_settled = largest_move < SETTLED and abs(evidence - last_evidence) < LEVEL
+            largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
+            is_settled = largest_step < SETTLED and abs(evidence - last_evidence) < LEVEL
             estimate = MotionEstimate(
-                effect=unknowns[count:],
-                shared=unknowns[:count],
+                effect=unknowns[shared_count:],
+                shared=unknowns[:shared_count],
                 local=tuple(local),
                 covariance=solution.covariance,
                 processes=start.processes,
@@ -316,14 +427,37 @@ class MotionEstimator:
         return estimate
 
     def _evidence_beside(self, linear: Linearisation, processes: Mapping[int, Process]) -> float:
-        """Return the evidence of trials that stay as they are beside other missing forces [nat]."""
+        """Return log evidence plus log prior of missing forces, with the linearisation kept [nat].
+
+        Parameters
+        ----------
+        linear : Linearisation
+            The trials.
+        processes : mapping of int to Process
+            The missing forces, by the number of the port.
+        """
         solution, _ = linear.beside(processes).solve()
         return solution.evidence + self._log_prior(processes)
 
     def linearised(
         self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
     ) -> Linearisation | None:
-        """Return all trials, linear along trajectories; None where the laws cannot be followed."""
+        """Return all trials with a hypothesis' laws, linearised along trajectories.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        start : EstimatorStart
+            The trajectories, the values of unknowns and the missing forces.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        Linearisation or None
+            The linear trials; None if the laws are not possible in one of them.
+        """
         linear_trials = []
         for number, trial in enumerate(self.trials):
             forces_and_sensors = laws.along(
@@ -343,6 +477,7 @@ class MotionEstimator:
                     start.shared,
                 )
             )
+        # the unknowns of effects have standard normal priors, of precision one
         precision = np.concatenate((self.shared_precision, np.ones(laws.size)))
         return Linearisation(tuple(linear_trials), precision)
 
@@ -354,23 +489,43 @@ class MotionEstimator:
         linear: Linearisation,
         smoothing: float,
     ) -> EstimatorStart | None:
-        """Return the longest part of a step whose linear laws err by less than the missing force.
+        """Return the start of the next iteration: the longest admissible fraction of a step.
 
-        Where a law is not what it was linearised to, the difference acts as a further missing force
-        of which the smoother does not know. In no step is it larger than the missing force that the
-        hypothesis admits.
+        The linear laws differ from the true ones at the end of a step. That difference acts like a
+        further missing force, which the smoother does not know. The rms difference must not be
+        larger than the standard deviation of the missing force. If no fraction of `STEP_FRACTIONS`
+        satisfies this, the smallest one at which the laws are possible is taken.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        current : EstimatorStart
+            The values and trajectories before the step.
+        estimate : MotionEstimate
+            Those at the end of the whole step.
+        linear : Linearisation
+            The trials, linear about `current`.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        EstimatorStart or None
+            The next start; None if the laws are not possible after any of the fractions.
         """
+        # no unknown of an effect moves by more than `LONGEST_STEP`
         change = estimate.effect - current.effect
-        longest = float(np.max(np.abs(change), initial=0.0))
-        most = min(1.0, LONGEST_STEP / longest) if longest > 0.0 else 1.0
-        chosen: EstimatorStart | None = None
+        longest_change = float(np.max(np.abs(change), initial=0.0))
+        largest_fraction = min(1.0, LONGEST_STEP / longest_change) if longest_change > 0.0 else 1.0
+        next_start: EstimatorStart | None = None
         for fraction in STEP_FRACTIONS:
-            taken = min(fraction, most)
+            fraction_taken = min(fraction, largest_fraction)
             stepped = EstimatorStart(
-                current.effect + taken * change,
-                current.shared + taken * (estimate.shared - current.shared),
+                current.effect + fraction_taken * change,
+                current.shared + fraction_taken * (estimate.shared - current.shared),
                 tuple(
-                    trajectory.toward(smoothed.trajectory, taken)
+                    trajectory.toward(smoothed.trajectory, fraction_taken)
                     for trajectory, smoothed in zip(
                         current.trajectories, estimate.trials, strict=True
                     )
@@ -380,10 +535,10 @@ class MotionEstimator:
             error = self._error_of_laws(laws, current, stepped, linear, smoothing)
             if error is None:
                 continue
-            chosen = stepped
+            next_start = stepped
             if error <= 1.0:
                 break
-        return chosen
+        return next_start
 
     def _error_of_laws(
         self,
@@ -393,33 +548,52 @@ class MotionEstimator:
         linear: Linearisation,
         smoothing: float,
     ) -> float | None:
-        """Return the rms error of the linear laws over the deviation of the missing force."""
-        worst = 0.0
+        """Return the largest rms error of the linear laws, over the deviation of the missing force.
+
+        Parameters
+        ----------
+        laws : HypothesisLaws
+            The laws and sensor errors of the hypothesis.
+        current, stepped : EstimatorStart
+            The values and trajectories before and after a step.
+        linear : Linearisation
+            The trials, linear about `current`.
+        smoothing : float
+            Half the window of speeds over which laws of the speed are averaged, over the rms speed.
+
+        Returns
+        -------
+        float or None
+            The largest ratio of all trials and ports; None if the laws are not possible after the
+            step.
+        """
+        largest_ratio = 0.0
         for number, trial in enumerate(linear.trials):
             forces_after = laws.forces(
                 number, stepped.trajectories[number], stepped.effect, stepped.shared, smoothing
             )
             if forces_after is None:
                 return None
-            change = np.concatenate(
+            unknowns_change = np.concatenate(
                 (stepped.shared - current.shared, stepped.effect - current.effect)
             )
             for port, forces in trial.forces.items():
-                position = (
+                position_change = (
                     stepped.trajectories[number].positions[:, port]
                     - trial.trajectory.positions[:, port]
                 )
-                speed = (
+                speed_change = (
                     stepped.trajectories[number].speeds[:, port] - trial.trajectory.speeds[:, port]
                 )
-                expected = forces.along.force + forces.along.by_position * position
-                expected = expected + forces.along.by_speed * speed
+                # the force that the linear law has after the step
+                linear_force = forces.along.force + forces.along.by_position * position_change
+                linear_force = linear_force + forces.along.by_speed * speed_change
                 for unknown, slope in forces.by_unknown.items():
-                    expected = expected + change[unknown] * slope
-                error = float(np.sqrt(np.mean((forces_after[port].force - expected) ** 2)))
-                size = max(process.size for process in stepped.processes.values())
-                worst = max(worst, error / size)
-        return worst
+                    linear_force = linear_force + unknowns_change[unknown] * slope
+                error = float(np.sqrt(np.mean((forces_after[port].force - linear_force) ** 2)))
+                largest_deviation = max(process.size for process in stepped.processes.values())
+                largest_ratio = max(largest_ratio, error / largest_deviation)
+        return largest_ratio
 
     def _log_prior(self, processes: Mapping[int, Process]) -> float:
         """Return the logarithm of the prior of missing forces [nat], up to a constant."""

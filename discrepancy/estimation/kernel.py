@@ -1,16 +1,14 @@
-"""Compiled loops of the estimator.
-
-Step matrices with laws in them, a Kalman filter, and its smoother.
+"""Compiled loops of the estimator: steps with laws in them, a Kalman filter, and its smoother.
 
 The system of a trial is linear along a trajectory and changes in time:
 
     z[j + 1] = transition[j] z[j] + drift[j] weights + process noise,
     columns weights = rows z + noise of variance one.
 
-`weights` is (1, w): a one for what is known, and the W - 1 unknowns of the hypothesis; `columns` is
-what each leaves of a reading. The filter carries what each weight does to the state beside the
-state itself (de Jong 1991, Annals of Statistics 19, 1073-1083), so that unknowns that are constant
-in time are estimated by one regression after one pass, without being states.
+The first of the W weights is one and stands for what is known; the others are the unknowns of the
+hypothesis. The filter carries the response of the state to each weight along with the state (de
+Jong 1991, Annals of Statistics 19, 1073-1083). Unknowns that are constant in time then follow from
+one regression after one pass, and need not be states.
 
 Shapes: F fine stamps, N samples, n states, C channels, W weights, P ports with a law.
 """
@@ -23,35 +21,35 @@ from fe.compilation import callable_when_compiled, compiled
 
 @callable_when_compiled
 def multiply(left: FloatArray, right: FloatArray, product: FloatArray) -> None:
-    """Fill the product of two small matrices.
+    """Fill `product` with the product of two small matrices.
 
-    A loop is several times faster than a call of BLAS.
+    For these, a loop is several times faster than a call of BLAS.
     """
     for i in range(left.shape[0]):
         for k in range(right.shape[1]):
-            total = 0.0
+            element = 0.0
             for j in range(left.shape[1]):
-                total += left[i, j] * right[j, k]
-            product[i, k] = total
+                element += left[i, j] * right[j, k]
+            product[i, k] = element
 
 
 @callable_when_compiled
 def carry(
     transition: FloatArray, covariance: FloatArray, room: FloatArray, carried: FloatArray
 ) -> None:
-    """Fill transition covariance transition^T, symmetric to the bit.
+    """Fill `carried` (n, n) with transition @ covariance @ transition.T, exactly symmetric.
 
-    `room` (n, n) is used meanwhile.
+    `room` (n, n) is overwritten as working memory.
     """
     size = len(transition)
     multiply(transition, covariance, room)
     for i in range(size):
         for k in range(i + 1):
-            total = 0.0
+            element = 0.0
             for j in range(size):
-                total += room[i, j] * transition[k, j]
-            carried[i, k] = total
-            carried[k, i] = total
+                element += room[i, j] * transition[k, j]
+            carried[i, k] = element
+            carried[k, i] = element
 
 
 @compiled
@@ -66,67 +64,71 @@ def step_matrices(
     pushes: FloatArray,
     drift: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transition and process noise of each fine step with the laws' tangents in them.
+    """Return transitions and process noises of fine steps with laws, and fill `drift`.
 
-    Fill its drift.
+    The force of the laws is linear in time over a step. As it depends on the state at the end, the
+    step is implicit: with the matrices b and e of forces at its start and end, tangents T and
+    pushes u,
 
-    The force of a law is linear between two stamps. That at the end of a step depends on the state
-    there, so each step is implicit; its small system is solved by the Woodbury identity.
+        (I - e T[j + 1]) z[j + 1] = (Phi + b T[j]) z[j] + d weights + noise,
+        d = b u[j] + e u[j + 1] + drift[j].
+
+    The matrix on the left is inverted by the Woodbury identity, with a system of P equations.
 
     Parameters
     ----------
     parts : int
-        Fine steps between two samples.
+        The number of fine steps between two samples.
     step_kind : (N,) ndarray of int
-        Kind of step that leads to each sample; steps of one kind have one length.
+        The kind of step that leads to each sample; steps of one kind have one length.
     free_transition, free_noise : (K, n, n) ndarray
-        Transition and process noise of a fine step without laws, by kind.
+        The transition Phi and the process noise of a fine step without laws, by kind.
     push_at_begin, push_at_end : (K, n, P) ndarray
-        State that a unit force at a port adds over a fine step, from its value at the begin and at
-        the end.
+        The change of the state over a fine step for a unit force at a port, at the start and at the
+        end of the step.
     tangents : (F, P, n) ndarray
-        Change of the force of the laws at a port by the state.
+        The derivative of the laws' force at a port by the state.
     pushes : (F, P, W) ndarray
-        Force of the laws at a port at state zero, by weight.
+        The laws' force at a port at state zero, for a unit of each weight.
     drift : (F - 1, n, W) ndarray
-        State that each weight adds in a fine step besides; filled with all that it adds.
+        The state that each weight adds in a fine step without laws; filled with that with laws.
 
     Returns
     -------
     transition, noise : (F - 1, n, n) ndarray
-        Of each fine step.
+        The transition and the covariance of the process noise of each fine step.
     """
     steps, ports, states = len(tangents) - 1, tangents.shape[1], tangents.shape[2]
     transition = np.empty((steps, states, states))
     noise = np.empty((steps, states, states))
-    implicit, explicit, room = np.empty((3, states, states))
+    inverse, explicit, work = np.empty((3, states, states))
     coupling = np.empty((ports, ports))
-    drifted = np.empty((states, drift.shape[2]))
+    explicit_drift = np.empty((states, drift.shape[2]))
     for j in range(steps):
         kind = step_kind[j // parts + 1]
         begin, end = push_at_begin[kind], push_at_end[kind]
-        # explicit part: the laws' force at the begin of the step
+        # right side: the laws' force at the start of the step, and all drift
         multiply(begin, tangents[j], explicit)
         explicit += free_transition[kind]
         for i in range(states):
             for w in range(drift.shape[2]):
-                total = drift[j, i, w]
+                element = drift[j, i, w]
                 for p in range(ports):
-                    total += begin[i, p] * pushes[j, p, w] + end[i, p] * pushes[j + 1, p, w]
-                drifted[i, w] = total
-        # implicit part: (I - end tangent)^-1 = I + end (I - tangent end)^-1 tangent
+                    element += begin[i, p] * pushes[j, p, w] + end[i, p] * pushes[j + 1, p, w]
+                explicit_drift[i, w] = element
+        # inverse of the left side: (I - end tangent)^-1 = I + end (I - tangent end)^-1 tangent
         tangent = tangents[j + 1]
         multiply(tangent, end, coupling)
         if ports == 1:
-            inner = tangent / (1.0 - coupling[0, 0])
+            inverse_tangent = tangent / (1.0 - coupling[0, 0])
         else:
-            inner = np.linalg.solve(np.eye(ports) - coupling, tangent)
-        multiply(end, inner, implicit)
+            inverse_tangent = np.linalg.solve(np.eye(ports) - coupling, tangent)
+        multiply(end, inverse_tangent, inverse)
         for i in range(states):
-            implicit[i, i] += 1.0
-        multiply(implicit, explicit, transition[j])
-        multiply(implicit, drifted, drift[j])
-        carry(implicit, free_noise[kind], room, noise[j])
+            inverse[i, i] += 1.0
+        multiply(inverse, explicit, transition[j])
+        multiply(inverse, explicit_drift, drift[j])
+        carry(inverse, free_noise[kind], work, noise[j])
     return transition, noise
 
 
@@ -138,32 +140,43 @@ def take_reading(
     innovation: FloatArray,
     gain: FloatArray,
 ) -> float:
-    """Take one reading into covariance (n, n) and mean (n, W).
+    """Take one reading into covariance (n, n) and means (n, W) in place, and return its variance.
 
-    Fill its gain (n,), return its variance.
+    Parameters
+    ----------
+    covariance : (n, n) ndarray
+        The covariance of the state.
+    mean : (n, W) ndarray
+        The mean of the state for a unit of each weight.
+    row : (n,) ndarray
+        The reading for a unit of each state.
+    innovation : (W,) ndarray
+        The reading minus its prediction, for a unit of each weight.
+    gain : (n,) ndarray
+        The gain of the reading, which is filled.
     """
     states = len(row)
-    weight = np.empty(states)
+    covariance_row = np.empty(states)
     variance = 1.0
     for i in range(states):
-        weight[i] = 0.0
+        covariance_row[i] = 0.0
         for j in range(states):
-            weight[i] += covariance[i, j] * row[j]
-        variance += row[i] * weight[i]
+            covariance_row[i] += covariance[i, j] * row[j]
+        variance += row[i] * covariance_row[i]
     for i in range(states):
-        gain[i] = weight[i] / variance
-    # Joseph form: from both sides in turn, so that the second takes what rounding left of the
-    # first
-    for i in range(states):
-        for j in range(states):
-            covariance[i, j] -= gain[i] * weight[j]
-    for i in range(states):
-        weight[i] = 0.0
-        for j in range(states):
-            weight[i] += covariance[i, j] * row[j]
+        gain[i] = covariance_row[i] / variance
+    # Joseph form (I - g h^T) C (I - g h^T)^T + g g^T, one factor after the other: a rounding error
+    # of the first one is reduced by the second
     for i in range(states):
         for j in range(states):
-            covariance[i, j] += (gain[i] - weight[i]) * gain[j]
+            covariance[i, j] -= gain[i] * covariance_row[j]
+    for i in range(states):
+        covariance_row[i] = 0.0
+        for j in range(states):
+            covariance_row[i] += covariance[i, j] * row[j]
+    for i in range(states):
+        for j in range(states):
+            covariance[i, j] += (gain[i] - covariance_row[i]) * gain[j]
     for i in range(states):
         for w in range(mean.shape[1]):
             mean[i, w] += gain[i] * innovation[w]
@@ -182,30 +195,31 @@ def filter_record(
     covariance: FloatArray,
     mean: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return what the filter predicts at each fine stamp, and the innovations of all readings.
+    """Return the predicted state at each fine stamp, and the innovations of all readings.
 
     Parameters
     ----------
     parts : int
-        Fine steps between two samples.
+        The number of fine steps between two samples.
     transition, noise, drift : (F - 1, n, n), (F - 1, n, n), (F - 1, n, W) ndarray
-        The matrices that `step_matrices` returns.
+        The matrices of each fine step, see `step_matrices`.
     rows, columns : (N, C, n), (N, C, W) ndarray
-        What a reading shows of the state, and what each weight leaves of it, over the deviation of
-        its noise.
+        The readings for a unit of each state, and the residuals for a unit of each weight, divided
+        by the deviation of the noise.
     used : (N, C) ndarray of bool
-        Readings that count.
+        Whether each reading counts.
     covariance, mean : (n, n), (n, W) ndarray
-        State before the first reading.
+        The state before the first reading.
 
     Returns
     -------
     means, covariances : (F, n, W), (F, n, n) ndarray
-        State at each fine stamp before the readings there.
+        The state at each fine stamp before the readings there.
     innovations : (N, C, W) ndarray
-        Readings minus their prediction; zero where one does not count.
+        The readings minus their predictions, for a unit of each weight; zero if a reading does not
+        count.
     gains, variances : (N, C, n), (N, C) ndarray
-        Of each reading.
+        The gain of each reading, and the variance of its innovation.
     """
     stamps, states, width = len(transition) + 1, mean.shape[0], mean.shape[1]
     samples, channels = columns.shape[0], columns.shape[1]
@@ -215,10 +229,11 @@ def filter_record(
     gains = np.zeros((samples, channels, states))
     variances = np.ones((samples, channels))
     mean, covariance = mean.copy(), covariance.copy()
-    room = np.empty((states, states))
+    work = np.empty((states, states))
     for j in range(stamps):
         means[j] = mean
         covariances[j] = covariance
+        # every `parts`-th fine stamp is a sample: take in its readings
         if j % parts == 0:
             k = j // parts
             for c in range(channels):
@@ -230,12 +245,13 @@ def filter_record(
                     variances[k, c] = take_reading(
                         covariance, mean, rows[k, c], innovations[k, c], gains[k, c]
                     )
+        # predict over the fine step
         if j < stamps - 1:
-            before = mean.copy()
-            multiply(transition[j], before, mean)
+            filtered_mean = mean.copy()
+            multiply(transition[j], filtered_mean, mean)
             mean += drift[j]
-            before_covariance = covariance.copy()
-            carry(transition[j], before_covariance, room, covariance)
+            filtered_covariance = covariance.copy()
+            carry(transition[j], filtered_covariance, work, covariance)
             covariance += noise[j]
     return means, covariances, innovations, gains, variances
 
@@ -254,24 +270,24 @@ def smooth_record(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the smoothed state at each fine stamp, and its variances.
 
-    The fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
-    1085-1088), which inverts no covariance.
+    This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
+    1085-1088), which inverts no covariance. In his letters `adjoint` is r, and `information` is N.
 
     Parameters
     ----------
     parts, transition, rows, used
         The arguments of `filter_record`.
     states : (F, n) ndarray
-        Predicted states at the values of all weights.
+        The predicted states at the values of all weights.
     covariances, gains, variances
         The arrays that `filter_record` returns.
     innovations : (N, C) ndarray
-        Innovations at the values of all weights.
+        The innovations at the values of all weights.
 
     Returns
     -------
     smoothed, variance : (F, n), (F, n) ndarray
-        State, and variance of each of its entries, given all readings.
+        The state given all readings, and the variance of each of its entries.
     """
     stamps, size = states.shape
     channels = rows.shape[1]
@@ -279,40 +295,45 @@ def smooth_record(
     variance = np.empty((stamps, size))
     adjoint = np.zeros(size)
     information = np.zeros((size, size))
-    room, carried = np.empty((2, size, size))
-    along = np.empty(size)
+    work, carried = np.empty((2, size, size))
+    information_gain = np.empty(size)
     for j in range(stamps - 1, -1, -1):
+        # carry both back over the fine step
         if j < stamps - 1:
             backward = np.ascontiguousarray(transition[j].T)
             adjoint = backward @ adjoint
-            carry(backward, information, room, carried)
+            carry(backward, information, work, carried)
             information[:] = carried
+        # take in the readings of a sample, in reverse order
         if j % parts == 0:
             k = j // parts
             for c in range(channels - 1, -1, -1):
                 if not used[k, c]:
                     continue
                 row, gain = rows[k, c], gains[k, c]
-                scale, explained = 1.0 / variances[k, c], 0.0
+                row_information, later_correction = 1.0 / variances[k, c], 0.0
                 for i in range(size):
-                    along[i] = 0.0
+                    information_gain[i] = 0.0
                     for m in range(size):
-                        along[i] += information[i, m] * gain[m]
-                    scale += gain[i] * along[i]
-                    explained += gain[i] * adjoint[i]
-                surprise = innovations[k, c] / variances[k, c] - explained
+                        information_gain[i] += information[i, m] * gain[m]
+                    row_information += gain[i] * information_gain[i]
+                    later_correction += gain[i] * adjoint[i]
+                correction = innovations[k, c] / variances[k, c] - later_correction
                 for i in range(size):
-                    adjoint[i] += row[i] * surprise
+                    adjoint[i] += row[i] * correction
                     for m in range(size):
                         information[i, m] += (
-                            scale * row[i] * row[m] - row[i] * along[m] - along[i] * row[m]
+                            row_information * row[i] * row[m]
+                            - row[i] * information_gain[m]
+                            - information_gain[i] * row[m]
                         )
-        multiply(covariances[j], information, room)
+        # smoothed state: prediction + C r; its covariance is C - C N C
+        multiply(covariances[j], information, work)
         for i in range(size):
             reduction = 0.0
             smoothed[j, i] = states[j, i]
             for m in range(size):
                 smoothed[j, i] += covariances[j, i, m] * adjoint[m]
-                reduction += room[i, m] * covariances[j, m, i]
+                reduction += work[i, m] * covariances[j, m, i]
             variance[j, i] = max(covariances[j, i, i] - reduction, 0.0)
     return smoothed, variance

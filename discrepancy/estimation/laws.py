@@ -1,7 +1,4 @@
-"""The force of a law along a motion, and its tangents.
-
-What a filter needs to have the law inside of it.
-"""
+"""The force of a law along a motion, and its derivatives by the motion (tangents)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,14 +14,15 @@ from fe.runtime.laws.interface import PARAMETERS, PortForce
 from fe.runtime.laws.speed import steady_force
 
 NODES = 8
-"""Speeds of a window over which a law of speed is averaged."""
+"""Number of speeds in the window over which a law of the speed is averaged."""
 NUDGE = 1e-4
-"""Step of the tangent of a law of speed by the position, over the usual position."""
+"""Half the difference of the position in the tangent of a law of the speed, over the rms
+position."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForceAlong:
-    """The force of laws at a port along its motion, against the motion.
+    """The force of laws at a port along its motion, counted positive against the motion.
 
     Attributes
     ----------
@@ -39,7 +37,7 @@ class ForceAlong:
     by_speed: FloatArray
 
     def plus(self, other: "ForceAlong") -> "ForceAlong":
-        """Return the sum with other laws at the same port."""
+        """Return the sum with the force of other laws at the same port."""
         return ForceAlong(
             self.force + other.force,
             self.by_position + other.by_position,
@@ -60,11 +58,30 @@ def along(
     by_position: FloatArray,
     by_speed: FloatArray,
 ) -> None:
-    """Fill force and tangents (F,) of a law along positions and speeds (F,).
+    """Fill the force of a law along a motion of its port, and its tangents.
 
-    A law of speed is averaged over a window of speeds, so that the step of dry friction has a
-    tangent. The tangent of a law with memory is that at its present state: how the past would have
-    changed is left out.
+    A law of the speed is averaged over a window of speeds, so that the jump of dry friction has a
+    finite tangent. The tangent of a law with memory is that in its present state; that an earlier
+    motion changes the memory is neglected.
+
+    Parameters
+    ----------
+    number : int
+        The index of the law's class in `LAWS`.
+    of_speed : bool
+        Whether the law is one of the speed, which has no memory.
+    law : (R,) array
+        The parameter row of the law.
+    positions, speeds : (F,) array
+        The motion of the port [m or rad, and per s].
+    half_width : float
+        Half the window of speeds [m/s or rad/s].
+    nudge : float
+        Half the difference of the position in a tangent [m or rad].
+    memory : (M,) array
+        The memory of the law, which is changed.
+    force, by_position, by_speed : (F,) array
+        The force and its derivatives by position and speed, which are filled.
     """
     for j in range(len(positions)):
         x, v = positions[j], speeds[j]
@@ -75,18 +92,25 @@ def along(
             continue
         total = 0.0
         for i in range(NODES):
+            # midpoints of `NODES` equal parts of the window
             offset = half_width * ((2.0 * i + 1.0) / NODES - 1.0)
             total += steady_force(law, x, v + offset)
         force[j] = total / NODES
-        ends = steady_force(law, x, v + half_width) - steady_force(law, x, v - half_width)
-        by_speed[j] = ends / (2.0 * half_width)
+        # the exact derivative of the mean over the window
+        difference_over_window = steady_force(law, x, v + half_width) - steady_force(
+            law, x, v - half_width
+        )
+        by_speed[j] = difference_over_window / (2.0 * half_width)
         if law[2] != 0.0:
-            beside = steady_force(law, x + nudge, v) - steady_force(law, x - nudge, v)
-            by_position[j] = beside / (2.0 * nudge)
+            difference_by_position = steady_force(law, x + nudge, v) - steady_force(
+                law, x - nudge, v
+            )
+            by_position[j] = difference_by_position / (2.0 * nudge)
 
 
 @cache
 def _compiled_along() -> Callable[..., None]:
+    """Return `along`, compiled if numba is installed."""
     return compiled(along, law_functions())
 
 
@@ -95,34 +119,34 @@ def force_along(
 ) -> ForceAlong:
     """Return the force of a law along a motion of its port, and its tangents.
 
-    Zero outside of its windows.
+    Both are zero outside of the law's windows in time.
 
     Parameters
     ----------
     law : PortForce
-        The law with its numbers.
+        The law with its parameters.
     time, positions, speeds : (F,) ndarray
-        Fine stamps [s], and the motion of the port there [m or rad, and per s].
+        The fine stamps [s], and the motion of the port there [m or rad, and per s].
     smoothing : float
-        Half the window of speeds over which a law of speed is averaged, over the usual speed.
+        Half the window of speeds over which a law of the speed is averaged, over the rms speed.
     """
     row = law.parameter_row
     memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
     force, by_position, by_speed = np.zeros((3, len(time)))
-    usual_speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-300)
-    usual_position = max(float(np.sqrt(np.mean(positions**2))), 1e-300)
+    rms_speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-300)
+    rms_position = max(float(np.sqrt(np.mean(positions**2))), 1e-300)
     _compiled_along()(
         LAWS.index(type(law)),
         type(law).depends_on_speed,
         row,
         np.ascontiguousarray(positions),
         np.ascontiguousarray(speeds),
-        smoothing * usual_speed,
-        NUDGE * usual_position,
+        smoothing * rms_speed,
+        NUDGE * rms_position,
         memory,
         force,
         by_position,
         by_speed,
     )
-    acts = law.acts_at(time)
-    return ForceAlong(force * acts, by_position * acts, by_speed * acts)
+    is_acting = law.acts_at(time)
+    return ForceAlong(force * is_acting, by_position * is_acting, by_speed * is_acting)

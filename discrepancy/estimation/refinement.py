@@ -1,4 +1,8 @@
-"""Hypotheses that followed the missing force, estimated with their laws in the smoother."""
+"""The most probable hypotheses on the missing force, estimated together with the motion.
+
+The search follows a hypothesis along a motion that is taken as known. Here its laws are inside of
+the smoother that estimates the motion.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -18,9 +22,9 @@ from .estimator import EstimatorStart, MotionEstimate, MotionEstimator
 from .linearised import SmoothedTrial, Trajectory
 
 REFINED = 4
-"""Hypotheses that are estimated, the most probable first."""
+"""Largest number of hypotheses that are estimated, the most probable first."""
 CLOSE = 60.0
-"""Logarithm of the probability below the best hypothesis from which on none is estimated [nat]."""
+"""Log probability below the best hypothesis from which on none is estimated [nat]."""
 
 
 def refined(
@@ -29,14 +33,12 @@ def refined(
     effect_count: int,
     on_progress: Callable[[str], None] = lambda message: None,
 ) -> list[ForceHypothesis]:
-    """Return hypotheses, the most probable first, with the best ones estimated anew.
+    """Return hypotheses, the most probable first, the best ones estimated with the motion.
 
-    The laws of these are inside the smoother.
-
-    Along a motion that is taken as known a law that changes much within a step of time, as dry
-    friction does where the motion turns, is followed to the wrong values: a free exponent then
-    explains more than the law. A hypothesis keeps what it was followed to where the estimate is
-    less probable.
+    The search follows a law along a motion that is taken as known. That gives wrong values for a
+    law that changes much within a time step, such as dry friction at a reversal of the motion; a
+    free exponent then explains more than the true law. A hypothesis is replaced by its estimate
+    only if the estimate is more probable.
 
     Parameters
     ----------
@@ -45,21 +47,21 @@ def refined(
     ranked : sequence of ForceHypothesis
         The hypotheses, the most probable first.
     effect_count : int
-        The number of effects that were looked for, for the prior of a hypothesis.
+        The number of effects that were compared, for the prior of a hypothesis.
     on_progress : callable
-        Takes a line that says what is estimated.
+        The function that takes a line on what is estimated.
     """
 
     def score(hypothesis: ForceHypothesis) -> float:
         return search.score(hypothesis, effect_count)
 
     with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
-    close = []
+    nearly_best = []
     for hypothesis in with_effects:
         if score(hypothesis) > score(with_effects[0]) - CLOSE:
-            close.append(hypothesis)
+            nearly_best.append(hypothesis)
     hypotheses = list(ranked)
-    for hypothesis in close[:REFINED]:
+    for hypothesis in nearly_best[:REFINED]:
         on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
         refined_hypothesis = estimated(search, hypothesis)
         if refined_hypothesis is None:
@@ -72,9 +74,19 @@ def refined(
 
 
 def estimated(search: ForceSearch, followed: ForceHypothesis) -> ForceHypothesis | None:
-    """Return a hypothesis estimated from where it was followed to.
+    """Return a hypothesis whose effects and motion are estimated together.
 
-    None where its laws cannot be.
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    followed : ForceHypothesis
+        The result of the search for this hypothesis, from which the estimate begins.
+
+    Returns
+    -------
+    ForceHypothesis or None
+        The hypothesis; None if its laws are not possible along the motion.
     """
     trials = tuple(followed.view.trials)
     problem = search.problem
@@ -88,7 +100,8 @@ def estimated(search: ForceSearch, followed: ForceHypothesis) -> ForceHypothesis
         Trajectory(motion.added, motion.positions, motion.speeds, motion.forces)
         for motion in followed.motions
     )
-    # large enough that the trajectory follows the readings, whatever the law was followed to
+    # missing forces as large as without any effect: the trajectory then follows the readings even
+    # if the parameters of the law are still wrong
     processes = {
         port: replace(process, size=max(process.size, search.whole_size(port)))
         for port, process in followed.processes.items()
@@ -100,7 +113,7 @@ def estimated(search: ForceSearch, followed: ForceHypothesis) -> ForceHypothesis
 
 
 def adjustable_laws(search: ForceSearch) -> tuple[int, ...]:
-    """Return the shared unknowns by which the laws change that the model has itself."""
+    """Return the numbers of the shared unknowns that change the model's own laws."""
     shared = search.point.shared
     laws_at_point = search.own_laws(shared)
     return tuple(
@@ -113,7 +126,22 @@ def adjustable_laws(search: ForceSearch) -> tuple[int, ...]:
 def _explained(
     search: ForceSearch, followed: ForceHypothesis, estimate: MotionEstimate
 ) -> ForceHypothesis | None:
-    """Return an estimate as a hypothesis of the search, which others may be added to."""
+    """Return an estimate as a hypothesis of the search, to which further effects may be added.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    followed : ForceHypothesis
+        The hypothesis before the estimate.
+    estimate : MotionEstimate
+        The estimate.
+
+    Returns
+    -------
+    ForceHypothesis or None
+        The hypothesis; None if its effects cannot act along the estimated motion.
+    """
     motions = [
         _smoothed_motion(trial, smoothed)
         for trial, smoothed in zip(followed.view.trials, estimate.trials, strict=True)
@@ -135,10 +163,17 @@ def _explained(
 
 
 def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> TrialMotion:
-    """Return the smoothed motion of a trial in the form in which the search follows hypotheses.
+    """Return the smoothed motion of a trial in the form that the search for effects uses.
 
-    The search asks which part of the motion the hypothesis explains: all but what the missing
-    force, which none of its laws is, adds to the state.
+    The search distinguishes the part of the added state that the hypothesis explains: all but that
+    of the missing force which none of its laws explains.
+
+    Parameters
+    ----------
+    trial : SeenTrial
+        The trial.
+    smoothed : SmoothedTrial
+        Its smoothed trajectory and forces.
     """
     trajectory = smoothed.trajectory
     state_by_missing_force = np.zeros_like(trajectory.added)
@@ -160,9 +195,18 @@ def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> TrialMotion:
 
 
 def _speed_deviation(trial: SeenTrial, port: int, state_deviation: FloatArray) -> float:
-    """Return how well the speed of a port is known, at most.
+    """Return the median standard deviation of the speed of a port over time [per s].
 
-    As if errors of states were independent.
+    Correlations between the states are neglected, as only their variances are computed.
+
+    Parameters
+    ----------
+    trial : SeenTrial
+        The trial.
+    port : int
+        The number of the port.
+    state_deviation : (F, n) array
+        The standard deviations of the states.
     """
     row = trial.system.speeds[port]
     return float(np.median(np.sqrt(np.square(state_deviation) @ np.square(row))))

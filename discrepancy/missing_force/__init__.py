@@ -1,1 +1,1 @@
-"""The force that a model lacks: seen in time, found at a port, named by the laws it follows."""
+"""The force that a model lacks: its course in time, its port, and the laws that explain it."""

@@ -1,4 +1,4 @@
-"""Missing forces at the ports of a model: at each alone, at all together, at one that jumps."""
+"""The missing forces at the ports of a model: at one port, at all, or at one with jumps."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -21,9 +21,10 @@ from .hypotheses import ColumnBuilder, scaled
 from .view import View
 
 MOST_PORTS = 4
-"""Ports at which forces may be missing at once."""
+"""Largest number of ports at which forces are missing at once."""
 BESIDE = 0.1
-"""First size of a force beside the largest one, over its size alone."""
+"""Factor on the size of a further port's missing force, estimated alone, with which the search for
+all of them together begins."""
 
 
 class MissingForces:
@@ -32,22 +33,22 @@ class MissingForces:
     Parameters
     ----------
     problem : Problem
-        A problem with trials in motion, and with a model that has ports.
+        A problem with trials in motion, whose model has ports.
 
     Attributes
     ----------
     at : dict of str to ForceHypothesis
-        The missing force at each port alone: first along the model's own motion, for the initial
-        states; then along the motion that was, with the parameters about where they are, and with
-        the model's own laws.
+        The missing force at each port alone. It is estimated twice: first along the motion of the
+        model, for the initial states of the trials; then along the motion estimated so, with the
+        parameters linear about their estimates, and with the model's own laws.
     ports : tuple of str
         The names of the ports.
     laws : ModelPatch
-        The model's own laws at its ports.
+        The model's own laws at its ports, which its linear system does not contain.
     point : Point
         The unknowns about which the trials are linear.
     columns : ColumnBuilder
-        Computes the columns of effects in these trials.
+        The builder of the columns of effects in these trials.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -76,34 +77,49 @@ class MissingForces:
 
     @cached_property
     def whole(self) -> ForceHypothesis:
-        """The missing forces at all ports at once, or of many ports at those with most evidence."""
+        """The missing forces at all ports at once.
+
+        If there are more than `MOST_PORTS` ports, those with the most evidence are taken.
+        """
         best = self.best()
-        ranked = sorted(self.at.values(), key=lambda at_port: -at_port.log_evidence)[:MOST_PORTS]
-        if len(ranked) == 1:
+        best_ports = sorted(self.at.values(), key=lambda at_port: -at_port.log_evidence)[
+            :MOST_PORTS
+        ]
+        if len(best_ports) == 1:
             return best
         begin = dict(best.processes)
-        for at_port in ranked[1:]:
+        for at_port in best_ports[1:]:
             begin |= scaled(at_port.processes, BESIDE, 1.0)
         view = best.view
+        # the second time along the motion that the first one has estimated
         for near in (False, True):
             median = self.prior_processes(begin)
-            together = with_most_probable_forces(view, median, begin, near=near)
-            view = self.columns.along(view, together.motions)
-            begin = dict(together.processes)
-        return together
+            hypothesis = with_most_probable_forces(view, median, begin, near=near)
+            view = self.columns.along(view, hypothesis.motions)
+            begin = dict(hypothesis.processes)
+        return hypothesis
 
     def best(self) -> ForceHypothesis:
         """Return the missing force at one port that has the largest evidence."""
         return max(self.at.values(), key=lambda at_port: at_port.log_evidence)
 
     def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
-        """Return the prior medians of missing forces at ports, by the number of the port."""
+        """Return the prior medians of missing forces, by the number of the port.
+
+        The median size is 5 % of the elastic force at the port; the median time is that of a radian
+        of the vibration, or the duration of the trials if there is no frequency.
+
+        Parameters
+        ----------
+        ports : iterable of int
+            The numbers of the ports.
+        """
         scales = self.problem.setting.scales
         processes = {}
         for port in ports:
             scale = scales.ports[self.ports[port]]
-            pace = scale.angular_frequency or 1.0 / scales.duration
-            processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / pace)
+            rate = scale.angular_frequency or 1.0 / scales.duration
+            processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
         return processes
 
     def own_laws(self, shared: FloatArray) -> ModelPatch:
@@ -112,21 +128,36 @@ class MissingForces:
         return self.model.own_laws(parameters) + self.model.patch.of(PortForce)
 
     def whole_size(self, port: int) -> float:
-        """Return the deviation of the missing force at a port without any effect [N or N m]."""
+        """Return the standard deviation of the missing force at a port without any effect.
+
+        Its unit is N, N m or the port's flow. It is the prior median if no force was estimated
+        there.
+
+        Parameters
+        ----------
+        port : int
+            The number of the port.
+        """
         process = self.whole.processes.get(port)
         if process is None:
             process = self.prior_processes((port,))[port]
         return process.size
 
     def rough(self, port: str) -> ForceHypothesis:
-        """Return the missing force at a port as one that may jump.
+        """Return the missing force at a port as a process that may jump.
 
-        The trials are linear about the motion that it gives.
+        The trials are made linear about the motion that it gives, twice.
+
+        Parameters
+        ----------
+        port : str
+            The name of the port.
         """
         hypothesis = self.at[port]
         for _ in range(2):
             self.point = self._point(hypothesis)
             view = self._linear_view()
+            # the model's own laws and the motion depend on each other: twice
             for _ in range(2):
                 _, _, motions = view.smoothed(hypothesis.processes)
                 view = self.columns.along(view, motions)
@@ -137,21 +168,29 @@ class MissingForces:
         return hypothesis
 
     def whole_point(self, hypothesis: ForceHypothesis) -> Point:
-        """Return the point of a hypothesis, from which its fit to the readings may begin."""
+        """Return the unknowns of a hypothesis with its effects, from which a fit may begin.
+
+        Parameters
+        ----------
+        hypothesis : ForceHypothesis
+            The hypothesis.
+        """
         point = self._point(hypothesis)
         return Point(hypothesis.shared.copy(), point.local, hypothesis.effect.copy())
 
     def _linear_view(self) -> View:
-        """Return the trials, linear about the point, and build columns there from now on."""
+        """Return the trials, linear about `point`, and rebuild `columns` there."""
         self.columns = ColumnBuilder(self.problem, self.numbers, self.point, self.laws)
         return self.columns.bare()
 
     def _point(self, hypothesis: ForceHypothesis) -> Point:
-        """Return the unknowns of a hypothesis without its effects, within their ranges."""
+        """Return the unknowns of a hypothesis without its effects, clipped to their ranges."""
         local = [np.zeros(data.unknowns.size) for data in self.problem.trials]
         for number, values in zip(self.numbers, hypothesis.local, strict=True):
             local[number] = values
         low, high = self.problem.shared.ends
+        # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
+        # within two prior standard deviations
         low = np.maximum(low + PARAMETER_STEP, -2.0)
         high = np.minimum(high - PARAMETER_STEP, 2.0)
         return Point(np.clip(hypothesis.shared, low, high), tuple(local), np.zeros(0))

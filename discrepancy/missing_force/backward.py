@@ -1,7 +1,8 @@
-"""What readings tell of the state before them: the passes of a record from its end to its begin.
+"""Backward passes over a record: what later readings say of the state at a moment.
 
-Shapes: n states, c channels, N samples, W columns that are filtered alike, S different steps, B
-places.
+Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
+derivatives by unknowns), S different steps, B places. A place is a sample whose state is asked for.
+Readings are divided by the deviation of the white part of their noise.
 """
 
 import numpy as np
@@ -22,40 +23,54 @@ def later(
     gains: FloatArray,
     variances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the smoothing additions and informations of all samples, in a backward pass.
+    """Return, for each sample, the vector and matrix by which later readings correct its state.
 
-    By de Jong (1989, J. American Statistical Association 84, 1085-1088), without an inverse, from
-    what `forward` makes of all samples of one column. In his letters: r (n,) is the addition, N (n,
-    n) the information.
+    This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
+    1085-1088), which inverts no covariance. In his letters the addition is r, the information N,
+    the innovation divided by its variance v / F, and the gain K.
+
+    Parameters
+    ----------
+    transitions : (S, n, n) ndarray
+        The transitions of the different steps.
+    step_of_sample : (N,) ndarray
+        The step that leads to each sample.
+    rows : (c, n) ndarray
+        The readings for a unit of each state.
+    used : (N, c) ndarray of bool
+        Whether each reading counts.
+    white, gains, variances : (N, c, 1), (N, c, n), (N, c) ndarray
+        The results of `forward` for all samples of one column: innovations divided by their
+        deviations, gains, and variances of the innovations.
 
     Returns
     -------
     additions, informations : (N, n), (N, n, n) ndarray
-        The smoothed state is the prediction and its covariance C times the addition; after the
-        sample's own readings its covariance is C - C information C.
+        The smoothed state is the predicted one plus its covariance C times the addition. After the
+        readings of the sample the covariance C becomes C - C information C.
     """
-    count = len(step_of_sample)
+    sample_count = len(step_of_sample)
     n = rows.shape[1]
-    additions = np.zeros((count, n))
-    informations = np.zeros((count, n, n))
+    additions = np.zeros((sample_count, n))
+    informations = np.zeros((sample_count, n, n))
     addition = np.zeros(n)
     information = np.zeros((n, n))
-    for k in range(count - 1, -1, -1):
+    for k in range(sample_count - 1, -1, -1):
         informations[k] = information
         # take in the readings of the sample, in reverse order
         for c in range(len(rows) - 1, -1, -1):
             if used[k, c]:
                 row = rows[c]
                 gain = gains[k, c]
-                innovation = white[k, c, 0] / np.sqrt(variances[k, c])
-                addition = addition + row * (innovation - gain @ addition)
-                along = information @ gain
-                size = gain @ along + 1.0 / variances[k, c]
+                scaled_innovation = white[k, c, 0] / np.sqrt(variances[k, c])
+                addition = addition + row * (scaled_innovation - gain @ addition)
+                information_gain = information @ gain
+                innovation_information = gain @ information_gain + 1.0 / variances[k, c]
                 information = (
                     information
-                    - np.outer(row, along)
-                    - np.outer(along, row)
-                    + size * np.outer(row, row)
+                    - np.outer(row, information_gain)
+                    - np.outer(information_gain, row)
+                    + innovation_information * np.outer(row, row)
                 )
         additions[k] = addition
         # carry both back over the step
@@ -75,84 +90,97 @@ def backward(
     columns: FloatArray,
     places: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the information on the state from all readings after some samples.
+    """Return the information on the state from all readings at and after some samples.
 
-    This is an information filter, run backwards from the end of the record.
-
-    `noise_roots` (S, n, n) are roots of the noises. Given a state z (n,), the logarithm of the
-    density of these readings is, for columns in the weights w (W,):
+    This is an information filter that runs backwards from the end of the record. Given the state z
+    (n,), and the readings as the combination of the W columns with weights w (W,), the log density
+    of these readings is
 
         w^T h^T z - z^T J z / 2 - w^T c w / 2 - half.
+
+    Parameters
+    ----------
+    transitions : (S, n, n) ndarray
+        The transitions of the different steps.
+    noise_roots : (S, n, n) ndarray
+        The roots of the covariances of their process noise: root @ root.T is the covariance.
+    step_of_sample : (N,) ndarray
+        The step that leads to each sample.
+    rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+        The readings for a unit of each state; whether each reading counts; the columns.
+    places : (B,) ndarray
+        The samples whose information is asked for, ascending.
 
     Returns
     -------
     J, h, c, half : (B, n, n), (B, n, W), (B, W, W), (B,) ndarray
-        The information, its vector, the products of columns, and half a log determinant; all
-        zero from sample N on.
+        The information matrix, the information vectors of the columns, the products of the columns,
+        and half a log determinant. All are zero for a place N, after which there are no readings.
     """
-    count = len(step_of_sample)
+    sample_count = len(step_of_sample)
     n = rows.shape[1]
-    width = columns.shape[2]
+    column_count = columns.shape[2]
     all_J = np.zeros((len(places), n, n))
-    all_h = np.zeros((len(places), n, width))
-    all_c = np.zeros((len(places), width, width))
+    all_h = np.zeros((len(places), n, column_count))
+    all_c = np.zeros((len(places), column_count, column_count))
     halves = np.zeros(len(places))
 
     J = np.zeros((n, n))
-    h = np.zeros((n, width))
-    c = np.zeros((width, width))
-    half = 0.0
-    # what a step of one kind does, kept where information and step are those of the sample before
+    h = np.zeros((n, column_count))
+    c = np.zeros((column_count, column_count))
+    half_log_determinant = 0.0
+    # the matrices of a step, which are kept as long as J is steady and the step is the same
     root = np.zeros((n, n))
     inverse = np.zeros((n, n))
     carry_back = np.zeros((n, n))
     half_of_step = 0.0
 
-    place = np.searchsorted(places, count) - 1
-    last_step = -1
+    place = np.searchsorted(places, sample_count) - 1
+    next_step = -1
     steady = False
-    for k in range(count - 1, -1, -1):
-        reads_like_last = k < count - 1 and bool(np.all(used[k] == used[k + 1]))
+    for k in range(sample_count - 1, -1, -1):
+        reads_like_next = k < sample_count - 1 and bool(np.all(used[k] == used[k + 1]))
         # take in the readings of the sample
         for channel in range(len(rows)):
             if used[k, channel]:
                 h += np.outer(rows[channel], columns[k, channel])
                 c += np.outer(columns[k, channel], columns[k, channel])
-        last_J = J
-        if not (steady and reads_like_last):
+        next_J = J
+        if not (steady and reads_like_next):
             J_with_readings = J.copy()
             for channel in range(len(rows)):
                 if used[k, channel]:
                     J_with_readings += np.outer(rows[channel], rows[channel])
-        # hand out what is known where it is asked for
+        # store the results at a place
         if place >= 0 and places[place] == k:
             all_J[place] = J_with_readings
             all_h[place] = h
             all_c[place] = c
-            halves[place] = half
+            halves[place] = half_log_determinant
             place -= 1
         if place < 0:
             break
-        # carry it back over the step with its noise integrated out (Joseph form of the information)
+        # carry the information back over the step, with the process noise integrated out: with
+        # noise G G^T and D = I + G^T J G, J - J G D^-1 G^T J in Joseph form, and half log det D
         step = step_of_sample[k]
-        if not (steady and reads_like_last and step == last_step):
+        if not (steady and reads_like_next and step == next_step):
             root = noise_roots[step]
-            inner = np.eye(n) + root.T @ J_with_readings @ root
-            half_of_step = 0.5 * np.log(np.linalg.det(inner))
-            inverse = np.ascontiguousarray(np.linalg.inv(inner))
+            whitened_information = np.eye(n) + root.T @ J_with_readings @ root
+            half_of_step = 0.5 * np.log(np.linalg.det(whitened_information))
+            inverse = np.ascontiguousarray(np.linalg.inv(whitened_information))
             gain = J_with_readings @ root @ inverse
-            keep = np.eye(n) - gain @ root.T
+            complement = np.eye(n) - gain @ root.T
             J = (
                 transitions[step].T
-                @ (keep @ J_with_readings @ keep.T + gain @ gain.T)
+                @ (complement @ J_with_readings @ complement.T + gain @ gain.T)
                 @ transitions[step]
             )
             J = 0.5 * (J + J.T)
-            carry_back = np.ascontiguousarray(transitions[step].T @ keep)
-            steady = reads_like_last and step == last_step and is_steady(J, last_J)
+            carry_back = np.ascontiguousarray(transitions[step].T @ complement)
+            steady = reads_like_next and step == next_step and is_steady(J, next_J)
         h_along_root = root.T @ h
         c -= h_along_root.T @ inverse @ h_along_root
-        half += half_of_step
+        half_log_determinant += half_of_step
         h = carry_back @ h
-        last_step = step
+        next_step = step
     return all_J, all_h, all_c, halves

@@ -1,4 +1,4 @@
-"""Whether a covariance or an information has become steady."""
+"""A test of whether a covariance or an information matrix has converged in time."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from discrepancy.campaign.records import FloatArray
 from fe.compilation import callable_when_compiled
 
 STEADY = 1e-9
-"""A covariance that moves less than this, over the deviations that it holds, is steady."""
+"""Largest change of a converged covariance, divided by the standard deviations of its entries."""
 
 
 @callable_when_compiled
 def is_steady(one: FloatArray, other: FloatArray) -> bool:
-    """Return whether two covariances (n, n) are the same within `STEADY`."""
-    squares = np.diag(one)
-    return not np.any(np.abs(one - other) > STEADY * np.sqrt(np.outer(squares, squares)))
+    """Return whether two covariances (n, n) differ by no more than `STEADY`, entry by entry."""
+    variances = np.diag(one)
+    return not np.any(np.abs(one - other) > STEADY * np.sqrt(np.outer(variances, variances)))

@@ -1,8 +1,9 @@
-"""Since when, until when: stretches of a record in which a force acts that does not act otherwise.
+"""Events: the stretches of a record in which a force acts that does not act in the others.
 
-Beside a force of small size that may be missing throughout, a second one, larger, is on or off.
-Which it is in a stretch is weighed with all unknowns of the records. Stretches are turned on or
-off, one after the other, while that gains more than the places of their ends cost.
+Besides a small force that may be missing throughout, a second and larger one is on or off. Whether
+it is on in a stretch is decided by the evidence, with all unknowns of the records integrated out.
+Stretches are turned on or off one after the other, as long as that raises the log evidence by more
+than the price of the changes. A path (N,) says for each sample whether the force is on.
 """
 
 from collections.abc import Sequence
@@ -26,46 +27,49 @@ from .switched_record import (
 from .view import View
 
 FINE = 4000
-"""Places of a change in a short record: between its samples too."""
+"""Approximate number of places of a change in a short record, which then lie between its samples
+too."""
 WORK = 4000
-"""Samples of all records between which events are looked for; of more, some are left out until the
-last."""
+"""Largest number of samples of all records together in which events are looked for. Of longer
+records only every k-th sample is used, except in the last step."""
 MOST_EVENTS = 6
-"""Stretches of a record: more are no events, but a force that varies."""
+"""Largest number of stretches of a record; more of them are a force that varies, not events."""
 EVENT_SIZE, STEADY_SIZE = 3.0, 0.003
-"""Sizes of both forces with which the search begins, over the process: of the event's, of the
-other."""
+"""Initial standard deviations of the force of events and of the force throughout, over that of the
+given process."""
 NONE = 1e-3
-"""Size of no force over one."""
+"""Standard deviation that stands for no force, over that of the given process."""
 GROUND = 3.0
-"""Evidence over no missing force [nat] from which there is one in a record."""
+"""Log evidence over no missing force [nat] from which on there is one in a record."""
 FEW_PASSES, MOST_PASSES = 30, 60
-"""Evaluations of the evidence in a fit of sizes and times: of a first one, of a later one."""
+"""Numbers of evaluations of the evidence in the first fit of the forces, and in later fits."""
 ROUNDS = 5
-"""Searches of stretches, each beside the forces of the one before, at most."""
+"""Largest number of rounds; each looks for stretches with the forces of the last one."""
 LEAST_GAIN = 0.5
-"""Evidence [nat] that a round must gain for another one."""
+"""Least gain of log evidence in a round after which another one follows [nat]."""
 FIRST_MOVES = np.array([0.9, 0.7, 0.9, 0.7])
-"""First moves of the logarithms of sizes and times in a fit."""
+"""Initial steps of the simplex search in the logarithms of the forces: size and time of the event,
+size and time of the force throughout."""
 PRIOR_DEVIATIONS = np.array([SIZE_DEVIATION, 3.0, SIZE_DEVIATION, TIME_DEVIATION])
-"""Prior deviations of these logarithms; an event may be a push that stays as it is."""
+"""Prior standard deviations of these logarithms. That of the event's time is wide, as an event may
+be a force that stays constant."""
 LARGEST_LOGARITHM = 14.0
-"""Of sizes and times over those of the process."""
+"""Bound of these logarithms, which are relative to the given process."""
 
 
 class EventSearch(EventTrials):
-    """Looks for events at a view's port.
+    """The search for events at a port.
 
     Parameters
     ----------
     view : View
-        Trials, unknowns, what is known to act.
+        The trials, and the columns of all unknowns and of the forces known to act.
     port : int
-        Number of the port.
+        The number of the port.
     process : Process
-        A force that acts throughout: the scale of both forces' priors.
+        A force that acts throughout; its size and time are the prior medians of both forces.
     every : int
-        The step between readings that are looked at; 1 for all.
+        The step between samples that are used; 1 uses all.
     """
 
     def __init__(self, view: View, port: int, process: Process, *, every: int = 1) -> None:
@@ -73,7 +77,7 @@ class EventSearch(EventTrials):
         self.process = process
 
     def products(self, forces: Forces, paths: Sequence[BoolArray]) -> list[Products]:
-        """Return what each trial tells of the shared unknowns."""
+        """Return the information of each trial on the shared unknowns, given forces and paths."""
         return [
             SwitchedRecord(self, number, forces).products(on) for number, on in enumerate(paths)
         ]
@@ -81,21 +85,42 @@ class EventSearch(EventTrials):
     def fitted(
         self, begin: Forces, paths: Sequence[BoolArray], passes: int
     ) -> tuple[Forces, float]:
-        """Return the most probable forces given events, and ln evidence less the events' price."""
+        """Return the most probable forces for given events, by a simplex search.
+
+        Parameters
+        ----------
+        begin : (Process, Process)
+            The forces to begin with: that of events, and that throughout.
+        paths : sequence of (N,) array of bool
+            The events: whether the force is on at each sample, for each trial.
+        passes : int
+            The largest number of evaluations of the evidence.
+
+        Returns
+        -------
+        forces : (Process, Process)
+            The most probable forces.
+        score : float
+            The log evidence with the priors of the forces, minus the price of all changes [nat].
+        """
         scale = np.tile((self.process.size, self.process.time), 2)
-        values = [value for force in begin for value in (force.size, force.time)]
-        first = np.log(np.array(values) / scale)
+        initial_values = [value for force in begin for value in (force.size, force.time)]
+        initial_logarithms = np.log(np.array(initial_values) / scale)
 
         def forces(moves: FloatArray) -> Forces:
-            """Return both forces, by moves of the logarithms in units of the first ones."""
-            logs = np.clip(first + moves * FIRST_MOVES, -LARGEST_LOGARITHM, LARGEST_LOGARITHM)
+            """Return both forces at moves (4,) of their logarithms in units of `FIRST_MOVES`."""
+            logs = np.clip(
+                initial_logarithms + moves * FIRST_MOVES, -LARGEST_LOGARITHM, LARGEST_LOGARITHM
+            )
             event_size, event_time, steady_size, steady_time = (np.exp(logs) * scale).tolist()
             event = replace(self.process, size=event_size, time=event_time)
             return event, replace(self.process, size=steady_size, time=steady_time)
 
         def objective(moves: FloatArray) -> float:
-            prior = float(0.5 * np.sum(((first + moves * FIRST_MOVES) / PRIOR_DEVIATIONS) ** 2))
-            return prior - float(self.evidence(self.products(forces(moves), paths)))
+            minus_log_prior = float(
+                0.5 * np.sum(((initial_logarithms + moves * FIRST_MOVES) / PRIOR_DEVIATIONS) ** 2)
+            )
+            return minus_log_prior - float(self.evidence(self.products(forces(moves), paths)))
 
         simplex = np.vstack((np.zeros(4), np.eye(4)))
         options = {"xatol": 0.05, "fatol": 0.2, "maxfev": passes, "initial_simplex": simplex}
@@ -103,36 +128,44 @@ class EventSearch(EventTrials):
         return forces(fit.x), -float(fit.fun) - price_of_changes(paths)
 
     def switched(self, forces: Forces, paths: Sequence[BoolArray]) -> list[BoolArray]:
-        """Return paths with stretches turned on or off, one after the other, each of which pays."""
+        """Return more probable paths, by inverting one stretch after the other.
+
+        Parameters
+        ----------
+        forces : (Process, Process)
+            The force of events, and the force throughout.
+        paths : sequence of (N,) array of bool
+            The path of each trial to begin with.
+        """
         new_paths = list(paths)
         products = self.products(forces, paths)
         for number, on in enumerate(paths):
-            others = products[:number] + products[number + 1 :]
-            record = SwitchedRecord(self, number, forces, others)
-            better: BoolArray | None = on
+            products_of_others = products[:number] + products[number + 1 :]
+            record = SwitchedRecord(self, number, forces, products_of_others)
+            better_path: BoolArray | None = on
             for _ in range(2 * MOST_EVENTS):
-                if better is None:
+                if better_path is None:
                     break
-                new_paths[number] = record.with_changes_placed(better)
-                better = record.with_best_stretch_switched(new_paths[number])
+                new_paths[number] = record.with_changes_placed(better_path)
+                better_path = record.with_best_stretch_switched(new_paths[number])
             products[number] = record.products(new_paths[number])
         return new_paths
 
 
 @dataclass(frozen=True, eq=False)
 class Events:
-    """Events at a view's port: whether the force acts from each sample on, by trial.
+    """The events at a port, as a path for each trial.
 
     Attributes
     ----------
     search : EventSearch
         The search that found them.
     forces : (Process, Process)
-        That of events, and what may be missing throughout.
+        The force of events, and the force that may be missing throughout.
     paths : sequence of (N,) ndarray of bool
-        Whether the force acts from each sample on, for each trial.
+        Whether the force of events is on at each sample, for each trial.
     score : float
-        ln evidence less the prices of all changes, priors of the forces included [nat].
+        The log evidence with the priors of the forces, minus the price of all changes [nat].
     """
 
     search: EventSearch
@@ -141,13 +174,21 @@ class Events:
     score: float
 
     def record(self, number: int, parts: int) -> SwitchedRecord:
-        """Return a trial in finer steps, beside the others."""
+        """Return a trial with its filters, in which changes may lie between samples.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        parts : int
+            The number of steps into which an interval between samples is divided.
+        """
         products = self.search.products(self.forces, self.paths)
-        others = products[:number] + products[number + 1 :]
-        return SwitchedRecord(self.search, number, self.forces, others, parts)
+        products_of_others = products[:number] + products[number + 1 :]
+        return SwitchedRecord(self.search, number, self.forces, products_of_others, parts)
 
     def moments(self, number: int) -> FloatArray:
-        """Return median and both ends of the 90 % interval (C, 3) of each change in a trial [s]."""
+        """Return median and ends of the 90 % interval (C, 3) of the C changes in a trial [s]."""
         on = self.paths[number]
         time = self.search.trials[number].time
         parts = max(1, FINE // len(on))
@@ -157,10 +198,10 @@ class Events:
         for change in range(len(moments)):
             places, log_evidence = record.evidence_by_place(fine_path, change)
             place_times = np.interp(places / parts, np.arange(len(on)), time)
-            # the posterior of the moment, integrated by the trapezoidal rule
+            # the posterior density of the moment, integrated by the trapezoidal rule
             density = np.exp(log_evidence - log_evidence.max())
-            steps = 0.5 * (density[1:] + density[:-1]) * np.diff(place_times)
-            distribution = np.r_[0.0, np.cumsum(steps)]
+            probabilities = 0.5 * (density[1:] + density[:-1]) * np.diff(place_times)
+            distribution = np.r_[0.0, np.cumsum(probabilities)]
             moments[change] = np.interp(
                 (0.5, 0.05, 0.95), distribution / distribution[-1], place_times
             )
@@ -168,25 +209,26 @@ class Events:
 
 
 def events(view: View, port: int, process: Process, least: float = -np.inf) -> Events:
-    """Return the most probable events at a view's port.
+    """Return the most probable events at a port, or a force throughout if that is more probable.
 
     Parameters
     ----------
     view : View
-        Trials, unknowns.
+        The trials, and the columns of all unknowns and of the forces known to act.
     port : int
-        Number of the port.
+        The number of the port.
     process : Process
         A force that acts throughout.
     least : float
-        Evidence of what else explains all [nat]: with less there are no events.
+        The log evidence of another explanation [nat]; events with a lower score are not returned.
 
     Returns
     -------
     Events
-        With changes where these tell more than a force that acts throughout the records that have
-        one.
+        Events with changes if these are more probable than `least` and than a force that acts
+        throughout the records that have one; otherwise such a force.
     """
+    # rounded up
     every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
     search = EventSearch(view, port, process, every=every)
     never = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
@@ -195,10 +237,10 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
     forces = (event, replace(process, size=STEADY_SIZE * process.size))
     best = _round(search, forces, never, FEW_PASSES)
     for _ in range(ROUNDS):
-        again = _round(search, best.forces, best.paths, MOST_PASSES)
-        if again.score < best.score + LEAST_GAIN:
+        next_events = _round(search, best.forces, best.paths, MOST_PASSES)
+        if next_events.score < best.score + LEAST_GAIN:
             break
-        best = again
+        best = next_events
     if every > 1:
         best = _among_all_samples(best, every)
         steady = _among_all_samples(steady, every)
@@ -207,13 +249,21 @@ def events(view: View, port: int, process: Process, least: float = -np.inf) -> E
 
 
 def throughout(view: View, port: int, process: Process) -> Events:
-    """Return a force that acts in all records from the first sample to the last."""
+    """Return a force that acts in all records from the first sample to the last, as events."""
     always = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
     return Events(EventSearch(view, port, process), (process, process), always, -np.inf)
 
 
 def _among_all_samples(coarse: Events, every: int) -> Events:
-    """Return events found in a part of the readings, placed among all."""
+    """Return events of a part of the samples, with changes placed among all samples.
+
+    Parameters
+    ----------
+    coarse : Events
+        The events.
+    every : int
+        The step between the samples in which they were found.
+    """
     search = EventSearch(coarse.search.view, coarse.search.port, coarse.search.process)
     paths = [
         np.repeat(on, every)[: len(trial.time)]
@@ -227,22 +277,42 @@ def _among_all_samples(coarse: Events, every: int) -> Events:
 
 
 def _throughout_some(search: EventSearch, never: Sequence[BoolArray]) -> Events:
-    """Return a force that acts throughout the records in which there is one."""
-    nothing_else = replace(search.process, size=NONE * search.process.size)
+    """Return a force that acts throughout those records whose evidence needs it.
+
+    Parameters
+    ----------
+    search : EventSearch
+        The search, with the samples that are used.
+    never : sequence of (N,) array of bool
+        The path of each trial without any force.
+    """
+    negligible_force = replace(search.process, size=NONE * search.process.size)
     paths = [~off for off in never]
-    (event, _), score = search.fitted((search.process, nothing_else), paths, FEW_PASSES)
-    forces = (event, nothing_else)
+    (event, _), score = search.fitted((search.process, negligible_force), paths, FEW_PASSES)
+    forces = (event, negligible_force)
     for number, off in enumerate(never):
-        without_it = [*paths[:number], off, *paths[number + 1 :]]
-        evidence_without = search.evidence(search.products(forces, without_it))
+        paths_without = [*paths[:number], off, *paths[number + 1 :]]
+        evidence_without = search.evidence(search.products(forces, paths_without))
         evidence_with = search.evidence(search.products(forces, paths))
         if evidence_without > evidence_with - GROUND:
-            paths = without_it
+            paths = paths_without
     return Events(search, forces, paths, score)
 
 
 def _round(search: EventSearch, forces: Forces, paths: Sequence[BoolArray], passes: int) -> Events:
-    """Return events with new stretches beside given forces, and the forces fitted to these."""
+    """Return events after one round: new stretches, then the forces fitted to them.
+
+    Parameters
+    ----------
+    search : EventSearch
+        The search.
+    forces : (Process, Process)
+        The force of events, and the force throughout.
+    paths : sequence of (N,) array of bool
+        The path of each trial to begin with.
+    passes : int
+        The largest number of evaluations of the evidence in the fit.
+    """
     new_paths = search.switched(forces, paths)
     new_forces, score = search.fitted(forces, new_paths, passes)
     return Events(search, new_forces, new_paths, score)

@@ -1,4 +1,4 @@
-"""A hypothesis along the missing force: effects, the force missing beside them, and the motion."""
+"""A hypothesis that is fitted along the missing force: effects, remaining force and motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,32 +16,32 @@ from .view import TrialMotion, View
 NOTHING = Candidate()
 """The candidate without effects."""
 NO_VALUES = np.zeros(0)
-"""Its parameters."""
+"""The effect parameters of the candidate without effects."""
 HIDDEN_PART = 0.5
-"""Part of the remaining force that may be hidden along a named law. Without it, intervals beside a
-weaker law hold 4 of 9 hidden values."""
+"""Share of the remaining force that may be hidden along a law of the hypothesis. Without it, the
+intervals of a weaker law contain only 4 of 9 hidden values."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForceHypothesis:
-    """A hypothesis that was fitted to the missing force: its effects act along the motion that was.
+    """A hypothesis fitted to the missing force: effects that act along the estimated motion.
 
     Attributes
     ----------
     candidate : Candidate
-        The effects; without any, there are missing forces alone.
+        The effects; without any, all of the force is missing.
     effect : (E,) array
-        The scaled effect parameters.
+        The scaled effect parameters, with standard normal prior.
     processes : mapping of int to Process
-        The missing forces beside the effects, by the numbers of their ports.
+        The forces that remain missing with the effects, by the numbers of their ports.
     log_evidence : float
         The log evidence, with the prior of the processes [nat].
     view : View
-        The trials and the columns of the effects.
+        The trials, with the columns of the effects.
     solution : Solution
-        The values of shared unknowns and effect parameters, in this order.
+        The K shared unknowns, then the E effect parameters.
     local : sequence of (L,) array
-        The unknowns of each trial.
+        The unknowns of each trial alone.
     motions : sequence of TrialMotion
         The motion of each trial.
     """
@@ -57,15 +57,16 @@ class ForceHypothesis:
 
     @property
     def effect_covariance(self) -> FloatArray:
-        """The covariance (E, E) of the effect parameters, beside the missing force as it is."""
+        """The covariance (E, E) of the effect parameters, given the missing force's process."""
         first_effect = len(self.view.shared_precision)
         return self.solution.covariance[first_effect:, first_effect:]
 
     @cached_property
     def shared(self) -> FloatArray:
-        """The shared unknowns (K,) at the values of the effects, which may not have converged.
+        """The shared unknowns (K,) given the values `effect` of the effect parameters.
 
-        They are the conditional mean of the solution, given the effect parameters.
+        The iteration may have ended before `effect` reached the mean of the solution. The shared
+        unknowns are then moved along: to their conditional mean given `effect`.
         """
         first_effect = len(self.view.shared_precision)
         mean = self.solution.mean
@@ -73,15 +74,18 @@ class ForceHypothesis:
         if not len(self.effect):
             return mean[:first_effect]
         residual = self.effect - mean[first_effect:]
-        weights = np.linalg.solve(covariance[first_effect:, first_effect:], residual)
-        return np.asarray(mean[:first_effect] + covariance[:first_effect, first_effect:] @ weights)
+        weighted_residual = np.linalg.solve(covariance[first_effect:, first_effect:], residual)
+        return np.asarray(
+            mean[:first_effect] + covariance[:first_effect, first_effect:] @ weighted_residual
+        )
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """The covariance (K + E, K + E) of all unknowns, with room for a hidden force.
+        """The covariance (K + E, K + E) of all unknowns, widened for a hidden force.
 
-        The process of a missing force has nothing to do with the motion. What remains of another
-        law has: as much of it as is seen beside the named laws may be hidden along them.
+        The process of a missing force is independent of the motion. If another law is missing, its
+        force does depend on the motion, and a part of it may look like the laws of the hypothesis.
+        It is assumed that the rms of that part is `HIDDEN_PART` times that of the remaining force.
         """
         covariance = self.solution.covariance
         if not len(self.effect):
@@ -94,21 +98,31 @@ class ForceHypothesis:
         return np.asarray(covariance + regression @ hidden @ regression.T)
 
     def _covariance_of_hidden_force(self) -> FloatArray:
-        """Return the covariance (E, E) of effect parameters that a hidden force adds."""
+        """Return the covariance (E, E) that a hidden force adds to the effect parameters."""
         hidden = np.zeros((len(self.effect),) * 2)
         for port, process in self.processes.items():
-            columns = self._effect_forces(port)
-            acting = np.flatnonzero(columns.any(axis=1))
+            forces_by_parameter = self._effect_forces(port)
+            acting = np.flatnonzero(forces_by_parameter.any(axis=1))
             if not len(acting):
                 continue
             variance = (HIDDEN_PART * process.size) ** 2
-            gram = columns[acting] @ columns[acting].T / columns.shape[1]
-            regularised = gram + variance * np.eye(len(acting))
+            mean_products = (
+                forces_by_parameter[acting]
+                @ forces_by_parameter[acting].T
+                / forces_by_parameter.shape[1]
+            )
+            # one parameter: the change whose force has the hidden rms has the variance (hidden
+            # variance) / (mean square force per unit); the added variance keeps it below the prior
+            # variance of one
+            regularised = mean_products + variance * np.eye(len(acting))
             hidden[np.ix_(acting, acting)] += variance * np.linalg.inv(regularised)
         return hidden
 
     def _effect_forces(self, port: int) -> FloatArray:
-        """Return the forces (E, T) of a unit of each effect parameter at a port, at all samples."""
+        """Return the forces (E, T) for a unit of each effect parameter at a port.
+
+        T is the number of samples of all trials together.
+        """
         by_trial = []
         for number, trial in enumerate(self.view.trials):
             no_force = np.zeros(len(trial.fine_time))
@@ -127,12 +141,12 @@ def with_most_probable_forces(
     near: bool = False,
     most_steps: int = MOST_STEPS,
 ) -> ForceHypothesis:
-    """Return a hypothesis beside the most probable missing forces.
+    """Return a hypothesis with the most probable sizes and times of its missing forces.
 
     Parameters
     ----------
     view : View
-        The trials and the columns of the effects.
+        The trials, with the columns of the effects.
     median : mapping of int to Process
         The prior medians of the missing forces, by the numbers of their ports.
     begin : mapping of int to Process
@@ -142,7 +156,7 @@ def with_most_probable_forces(
     effect : (E,) array
         The scaled effect parameters about which the view is linear.
     near : bool
-        Whether the search begins at `begin` itself, not at the best of a grid around it.
+        Whether the search begins at `begin` itself, not at the best point of a grid around it.
     most_steps : int
         The largest number of steps of Newton's method.
     """

@@ -1,10 +1,10 @@
-"""The Kalman filter with missing forces at ports.
+"""The Kalman filter of a trial with missing forces at ports: evidence, smoothed forces and states.
 
-Evidence of columns, and the forces and the motion seen.
-
-A force is a Gaussian process in time of deviation `size` and correlation time `time`: Matern 3/2,
-two states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning for Signal Processing),
-or 1/2. Unknowns that act in proportion follow from what whitened readings and columns share.
+A missing force is a Gaussian process in time with standard deviation `size` and correlation time
+`time`: Matern 3/2 with two states (Hartikainen and Sarkka 2010, IEEE Workshop on Machine Learning
+for Signal Processing), or Matern 1/2 with one state. The filter whitens the residuals and the
+columns, which are the derivatives of the readings by unknowns; the unknowns follow from a linear
+regression of the whitened residuals on the whitened columns.
 """
 
 from collections.abc import Sequence
@@ -25,16 +25,16 @@ from .trial import SeenTrial
 
 @dataclass(frozen=True)
 class Process:
-    """The missing force as a process.
+    """The statistics of a missing force as a Gaussian process in time.
 
     Attributes
     ----------
     size : float
-        Deviation [N, N m or the port's flow].
+        The standard deviation of the force [N, N m or the port's flow].
     time : float
-        Correlation time [s].
+        The correlation time [s].
     rough : bool
-        Whether it may jump (Matern 1/2), not bend only (3/2).
+        Whether the force may jump (Matern 1/2). Otherwise it is differentiable (Matern 3/2).
     """
 
     size: float
@@ -43,7 +43,7 @@ class Process:
 
     @property
     def generator(self) -> FloatArray:
-        """Of its states (1 or 2), the force over `size` first."""
+        """The rate matrix (1 or 2 rows) [1/s]; the first state is the force over `size`."""
         if self.rough:
             return np.array([[-1.0 / self.time]])
         rate = np.sqrt(3.0) / self.time
@@ -56,16 +56,19 @@ class Process:
 
 
 class ForceStateSpace(NamedTuple):
-    """A trial's system with missing forces and coloured noises as states (n,), scaled to size one.
+    """The system of a trial, its missing forces and its coloured noises as n scaled states.
 
     Attributes
     ----------
-    generator, intensity : (n, n) ndarray
-        Rates of the state, and the spectral density of the white noise that drives it.
+    generator : (n, n) ndarray
+        The rate matrix [1/s].
+    intensity : (n, n) ndarray
+        The spectral density of the white noise that drives the state [1/s].
     output_rows : (C, n) ndarray
-        The rows by which readings show the state, over the white part of their noise.
+        The readings for a unit of each state, divided by the deviation of the white part of their
+        noise.
     start_covariance : (n, n) ndarray
-        Covariance of the state at the first sample.
+        The covariance of the state at the first sample.
     """
 
     generator: FloatArray
@@ -75,16 +78,19 @@ class ForceStateSpace(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """What readings show of a trial of F fine stamps and N samples, with P missing forces.
+    """The added state and the missing forces of a trial given all of its readings.
+
+    Shapes: F fine stamps, N samples, n states of the system, P missing forces.
 
     Attributes
     ----------
     state : (F, n) ndarray
-        State that the missing forces add.
+        The state that the missing forces add to the response of the model.
     forces : (P, F) ndarray
-        The missing forces.
+        The missing forces [N, N m or the port's flow].
     deviations : (2 P, N) ndarray
-        Standard deviations of the forces, then of the speeds of their ports, at the samples.
+        The posterior standard deviations at the samples: of the forces, then of the speeds of their
+        ports.
     """
 
     state: FloatArray
@@ -94,14 +100,14 @@ class Smoothed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ForceFilter:
-    """A trial with missing forces at ports.
+    """The Kalman filter of a trial with missing forces at ports.
 
     Attributes
     ----------
     trial : SeenTrial
         The trial.
     processes : sequence of (int, Process)
-        Forces, each with the number of its port; there may be several at one port.
+        The missing forces, each with the number of its port. Several may act at one port.
     """
 
     trial: SeenTrial
@@ -109,33 +115,47 @@ class ForceFilter:
 
     @cached_property
     def units(self) -> FloatArray:
-        """Units (n,) of the state: those of a force of `size` at the frequencies of the system."""
+        """The unit (n,) of each state of the system, by which the state is divided.
+
+        A force of `size` at the highest natural frequency moves a speed by (force / frequency) and
+        a position by that over the frequency, so that scaled states are about of size one.
+        """
         system = self.trial.system
         state_count = len(system.generator)
-        fastest = max(float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9)
-        pushes = [
+        highest_frequency = max(
+            float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9
+        )
+        largest_rates = [
             np.abs(system.actions[port]).max(initial=0.0) * process.size
             for port, process in self.processes
         ]
-        largest_push = max(*pushes, 1e-300)
-        units = np.full(state_count, largest_push / fastest)
-        has_positions = (
-            state_count % 2 == 0
-        )  # the first half are positions, the second their speeds
+        largest_rate = max(*largest_rates, 1e-300)
+        units = np.full(state_count, largest_rate / highest_frequency)
+        # with an even number of states, the first half are positions, the second half their speeds
+        has_positions = state_count % 2 == 0
         if has_positions:
-            units[: state_count // 2] /= fastest
+            units[: state_count // 2] /= highest_frequency
         return units
 
     @cached_property
     def places(self) -> list[int]:
-        """Index of each force in the whole state."""
-        counts = [len(process.generator) for _, process in self.processes]
-        begin = len(self.trial.system.generator)
-        return [begin + sum(counts[:number]) for number in range(len(counts))]
+        """The index of each missing force in the whole state.
+
+        A force that may not jump has a second state, which follows it.
+        """
+        state_counts = [len(process.generator) for _, process in self.processes]
+        first_force_state = len(self.trial.system.generator)
+        return [
+            first_force_state + sum(state_counts[:number]) for number in range(len(state_counts))
+        ]
 
     @cached_property
     def white(self) -> FloatArray:
-        """Standard deviation (C,) of each channel's noise over that of its white part."""
+        """The standard deviation (C,) of each channel's noise divided by that of its white part.
+
+        The filter counts readings in deviations of the white part, while `SeenTrial` counts them in
+        deviations of the whole noise: this is the factor between both.
+        """
         ratios = np.ones(len(self.trial.deviation))
         for channel, coloured_share, _ in self.trial.coloured:
             ratios[channel] = 1.0 / np.sqrt(1.0 - coloured_share)
@@ -143,71 +163,102 @@ class ForceFilter:
 
     @cached_property
     def system(self) -> ForceStateSpace:
-        """The system, its missing forces and the coloured parts of noises, in this order."""
+        """The state space: states of the system, missing forces, coloured noises, in this order."""
         trial = self.trial
-        motion = slice(0, len(trial.system.generator))
-        first_noise = motion.stop + sum(len(process.generator) for _, process in self.processes)
-        size = first_noise + len(trial.coloured)
-        generator = np.zeros((size, size))
-        intensity = np.zeros((size, size))
-        start = np.zeros((size, size))
-        rows = np.zeros((len(trial.deviation), size))
-        # the motion
-        generator[motion, motion] = trial.system.generator * self.units / self.units[:, None]
-        rows[:, motion] = trial.system.outputs * self.units / trial.deviation[:, None]
-        # the missing forces, which push it and are seen directly where a reading is an acceleration
-        for (port, process), place in zip(self.processes, self.places, strict=True):
-            force = slice(place, place + len(process.generator))
-            generator[motion, place] = -trial.system.actions[port] * process.size / self.units
-            generator[force, force] = process.generator
-            intensity[force.stop - 1, force.stop - 1] = process.intensity
-            rows[:, place] = -trial.system.through[port] * process.size / trial.deviation
-            start[force, force] = np.eye(len(process.generator))
-            if trial.settled:  # the trial begins at rest under the missing force too
+        system_states = slice(0, len(trial.system.generator))
+        first_noise_state = system_states.stop + sum(
+            len(process.generator) for _, process in self.processes
+        )
+        state_count = first_noise_state + len(trial.coloured)
+        generator = np.zeros((state_count, state_count))
+        intensity = np.zeros((state_count, state_count))
+        start_covariance = np.zeros((state_count, state_count))
+        output_rows = np.zeros((len(trial.deviation), state_count))
+        # the system
+        generator[system_states, system_states] = (
+            trial.system.generator * self.units / self.units[:, None]
+        )
+        output_rows[:, system_states] = trial.system.outputs * self.units / trial.deviation[:, None]
+        # the missing forces: they drive the system, and an acceleration shows them directly
+        for (port, process), index in zip(self.processes, self.places, strict=True):
+            force_states = slice(index, index + len(process.generator))
+            generator[system_states, index] = (
+                -trial.system.actions[port] * process.size / self.units
+            )
+            generator[force_states, force_states] = process.generator
+            intensity[force_states.stop - 1, force_states.stop - 1] = process.intensity
+            output_rows[:, index] = -trial.system.through[port] * process.size / trial.deviation
+            start_covariance[force_states, force_states] = np.eye(len(process.generator))
+            # a settled trial begins at rest under the missing force f: A s + b f = 0
+            if trial.settled:
                 at_rest = np.linalg.lstsq(
-                    generator[motion, motion], -generator[motion, place], rcond=1e-12
+                    generator[system_states, system_states],
+                    -generator[system_states, index],
+                    rcond=1e-12,
                 )[0]
-                start[motion, motion] += np.outer(at_rest, at_rest)
-                start[motion, place] = at_rest
-                start[place, motion] = at_rest
-        # the coloured parts of noises, which decay
-        for place, (channel, coloured_share, rate) in enumerate(trial.coloured, first_noise):
-            generator[place, place] = -rate
-            intensity[place, place] = 2.0 * rate
-            start[place, place] = 1.0
-            rows[channel, place] = np.sqrt(coloured_share)
-        rows *= self.white[:, None]
-        return ForceStateSpace(generator, intensity, rows, start)
+                start_covariance[system_states, system_states] += np.outer(at_rest, at_rest)
+                start_covariance[system_states, index] = at_rest
+                start_covariance[index, system_states] = at_rest
+        # the correlated parts of noises: first-order processes of variance one
+        for index, (channel, coloured_share, rate) in enumerate(trial.coloured, first_noise_state):
+            generator[index, index] = -rate
+            intensity[index, index] = 2.0 * rate
+            start_covariance[index, index] = 1.0
+            output_rows[channel, index] = np.sqrt(coloured_share)
+        output_rows *= self.white[:, None]
+        return ForceStateSpace(generator, intensity, output_rows, start_covariance)
 
     @property
     def key(self) -> tuple[bytes, ...]:
-        """What trials of one system and one grid of samples share; they are filtered together."""
+        """A key that is equal for trials with the same system, steps and used readings.
+
+        Such trials have the same gains, and are filtered in one pass.
+        """
         return tuple(
             array.tobytes() for array in (*self.system, *self.trial.steps, self.trial.used)
         )
 
     def steps(self, columns: FloatArray) -> FilterSteps:
-        """Return the record with columns (K, N, C) to be filtered."""
+        """Return the filter's matrices by kind of step, with columns (K, N, C) to filter."""
         lengths, _ = self.trial.steps
         transitions, noises = discretised(self.system.generator, self.system.intensity, lengths)
-        whitened = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
-        return FilterSteps(transitions, noises, self.system.output_rows, self.trial.used, whitened)
+        scaled_columns = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
+        return FilterSteps(
+            transitions, noises, self.system.output_rows, self.trial.used, scaled_columns
+        )
 
     def products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return products (K, K) of whitened columns (K, N, C), and half a log determinant [nat].
+        """Return the products of whitened columns, and half the log determinant of the readings.
 
-        Half the sum of the logarithms of the readings' variances given those before: infinite under
-        forces far larger than what is read.
+        Parameters
+        ----------
+        columns : (K, N, C) array
+            The residual and the derivatives by unknowns, divided by the noise deviations.
+
+        Returns
+        -------
+        products : (K, K) array
+            The inner products of all pairs of whitened columns.
+        half_log_determinant : float
+            Half the sum of the logarithms of the variances of the readings, each given those before
+            it [nat]. It is infinite if a force is so large that rounding loses the readings.
         """
         steps = self.steps(columns)
         _, step_of_sample = self.trial.steps
         end = np.array([len(step_of_sample)])
         begin = steps.begin(self.system.start_covariance)
-        _, _, products, halves = steps.before(step_of_sample, 0, begin, end)
-        return products[0], halves[0] - np.sum(np.log(self.white) * self.trial.used)
+        _, _, products, half_log_determinants = steps.before(step_of_sample, 0, begin, end)
+        # the filter's readings are multiplied by `white`, which multiplies their deviations too
+        return products[0], half_log_determinants[0] - np.sum(np.log(self.white) * self.trial.used)
 
     def smoothed(self, readings: FloatArray) -> Smoothed:
-        """Return the state and forces that readings (N, C) show, and how well they are known."""
+        """Return the added state and the missing forces given all readings.
+
+        Parameters
+        ----------
+        readings : (N, C) array
+            The residuals that the missing forces are to explain, divided by the noise deviations.
+        """
         steps = self.steps(readings[None])
         _, step_of_sample = self.trial.steps
         covariance, mean, *_ = steps.begin(self.system.start_covariance)
@@ -220,6 +271,7 @@ class ForceFilter:
             steps.moves, step_of_sample, steps.rows, steps.used, white, gains, variances
         )
         states = self._between_samples(means, covariances, additions)
+        # de Jong's smoother: the covariance given all readings, see `later`
         posterior = covariances - covariances @ informations @ covariances
         sizes = np.array([process.size for _, process in self.processes])
         return Smoothed(
@@ -231,59 +283,77 @@ class ForceFilter:
     def _between_samples(
         self, means: FloatArray, covariances: FloatArray, additions: FloatArray
     ) -> FloatArray:
-        """Return the smoothed state (F, n) at all fine stamps.
+        """Return the smoothed state (F, n) at all fine stamps, from the results at the samples.
 
         Parameters
         ----------
         means, covariances : (N, n, 1), (N, n, n) ndarray
-            State after the readings of each sample.
+            The filtered state: after the readings of each sample.
         additions : (N, n) ndarray
-            The smoothing additions of each sample, see `later`.
+            De Jong's vector r of each sample, by which later readings correct the state; see
+            `later`.
         """
         parts = self.trial.parts
         lengths, step_of_sample = self.trial.steps
         fine_transitions, fine_noises = discretised(
             self.system.generator, self.system.intensity, lengths / parts
         )
-        kind = step_of_sample[1:]
-        transitions = fine_transitions[kind]
+        step_kind = step_of_sample[1:]
+        transitions = fine_transitions[step_kind]
         # what later readings add, carried back from the next sample to each fine stamp before it
         carried_back = [additions[1:, :, None]]
         for _ in range(parts):
             carried_back.append(transitions.mT @ carried_back[-1])
         # the state, carried forward from each sample with what it may have gathered on the way
         state = means[:-1] + covariances[:-1] @ carried_back[-1]
-        gathered = np.zeros_like(fine_transitions)
+        gathered_noise = np.zeros_like(fine_transitions)
         fine_states = []
-        for addition in carried_back[:0:-1]:
-            fine_states.append(state + gathered[kind] @ addition)
+        for correction in carried_back[:0:-1]:
+            fine_states.append(state + gathered_noise[step_kind] @ correction)
             state = transitions @ state
-            gathered = fine_transitions @ gathered @ fine_transitions.mT + fine_noises
-        size = means.shape[1]
-        return np.concatenate((np.stack(fine_states, axis=1).reshape(-1, size), means[-1:, :, 0]))
+            gathered_noise = fine_transitions @ gathered_noise @ fine_transitions.mT + fine_noises
+        state_count = means.shape[1]
+        return np.concatenate(
+            (np.stack(fine_states, axis=1).reshape(-1, state_count), means[-1:, :, 0])
+        )
 
     def _deviations(self, covariances: FloatArray) -> FloatArray:
-        """Return deviations (2 P, N) of forces and speeds, given state covariances (N, n, n)."""
-        count = len(self.processes)
-        rows = np.zeros((2 * count, covariances.shape[-1]))
+        """Return the deviations (2 P, N) of the forces, then of the speeds of their ports.
+
+        Parameters
+        ----------
+        covariances : (N, n, n) ndarray
+            The covariance of the state at each sample, given all readings.
+        """
+        force_count = len(self.processes)
+        output_rows = np.zeros((2 * force_count, covariances.shape[-1]))
         for number, (port, process) in enumerate(self.processes):
-            rows[number, self.places[number]] = process.size
-            rows[count + number, : len(self.units)] = self.trial.system.speeds[port] * self.units
-        variances = np.sum((rows @ covariances) * rows, axis=-1)
+            output_rows[number, self.places[number]] = process.size
+            output_rows[force_count + number, : len(self.units)] = (
+                self.trial.system.speeds[port] * self.units
+            )
+        variances = np.sum((output_rows @ covariances) * output_rows, axis=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
 
 
 ROUNDING = 1e-12
-"""Share of the squared size of a column that rounding may have made."""
+"""Relative error of the squared norm of a column by rounding."""
 LEAST_PRECISION = 1e-10
-"""Of an unknown of which nothing is known before."""
+"""Prior precision that stands for an unknown of which nothing is known in advance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Unknowns given the readings.
+    """The K unknowns of a linear model given the readings.
 
-    Log evidence [nat, up to a constant], mean (K,) and covariance (K, K).
+    Attributes
+    ----------
+    evidence : float
+        The log evidence [nat], up to a constant.
+    mean : (K,) ndarray
+        The posterior mean.
+    covariance : (K, K) ndarray
+        The posterior covariance.
     """
 
     evidence: float
@@ -293,69 +363,116 @@ class Solution:
 
 @dataclass(frozen=True, eq=False)
 class Regression:
-    """Products of the whitened residual (first) and K columns, summed over trials.
+    """The normal equations of a linear model with K unknowns, summed over trials.
 
     Attributes
     ----------
     products : (1 + K, 1 + K) ndarray
-        Unknowns of single trials are gone from it.
+        The inner products of the whitened residual (first) and of the whitened columns of the
+        unknowns. Unknowns of single trials have been eliminated.
     log_determinant : float
-        Half the log determinant of the covariance of the readings and those unknowns [nat].
+        Half the log determinant of the covariance of the readings, with the contribution of the
+        eliminated unknowns [nat].
     """
 
     products: FloatArray
     log_determinant: float
 
     def solve(self, chosen: Sequence[int], precision: FloatArray) -> Solution:
-        """Return evidence and values of some of the unknowns, given their prior precisions (K,)."""
+        """Return evidence and values of some of the unknowns; the others are zero.
+
+        Parameters
+        ----------
+        chosen : sequence of int
+            The K numbers of the unknowns.
+        precision : (K,) array
+            Their prior precisions.
+        """
         rows = np.array([0, *(1 + k for k in chosen)])
         products = self.products[np.ix_(rows, rows)]
-        prior = np.maximum(precision, LEAST_PRECISION)
+        prior_precision = np.maximum(precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
-        scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior)
-        normal = (products[1:, 1:] + np.diag(prior)) * np.outer(scale, scale)
-        factor = cho_factor(normal + ROUNDING * np.eye(len(scale)))
-        mean = scale * cho_solve(factor, scale * products[1:, 0])
-        covariance = np.outer(scale, scale) * cho_solve(factor, np.eye(len(prior)))
-        # Laplace's evidence, exact for a linear model
-        combination = np.r_[1.0, -mean]
-        misfit = float(combination @ products @ combination + mean @ (prior * mean))
+        column_scale = 1.0 / np.sqrt(np.diag(products)[1:] + prior_precision)
+        normal_matrix = (products[1:, 1:] + np.diag(prior_precision)) * np.outer(
+            column_scale, column_scale
+        )
+        factor = cho_factor(normal_matrix + ROUNDING * np.eye(len(column_scale)))
+        mean = column_scale * cho_solve(factor, column_scale * products[1:, 0])
+        covariance = np.outer(column_scale, column_scale) * cho_solve(
+            factor, np.eye(len(prior_precision))
+        )
+        # Laplace's approximation of the evidence, which is exact for a linear model
+        residual_weights = np.r_[1.0, -mean]
+        misfit = float(
+            residual_weights @ products @ residual_weights + mean @ (prior_precision * mean)
+        )
         evidence = -0.5 * misfit - self.log_determinant
-        log_determinant = np.sum(np.log(np.diag(factor[0]) / scale))
-        evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior)))
+        # half the log determinant of the unscaled normal equations
+        log_determinant = np.sum(np.log(np.diag(factor[0]) / column_scale))
+        evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior_precision)))
         return Solution(evidence, mean, covariance)
 
 
 def without(
     products: FloatArray, halves: FloatArray, precision: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return products (..., W, W) and half log determinants (...) with unknowns eliminated."""
+    """Return products and half log determinants with the last unknowns integrated out.
+
+    Parameters
+    ----------
+    products : (..., W, W) array
+        The inner products of the whitened residual and the columns of the unknowns.
+    halves : (...) array
+        Half the log determinants of the covariance of the readings [nat].
+    precision : (L,) array
+        The prior precisions of the last L unknowns.
+
+    Returns
+    -------
+    products : (..., W - L, W - L) array
+        The products with the last L columns projected out (Schur complement).
+    halves : (...) array
+        Half the log determinants, with the contribution of these unknowns [nat].
+    """
     if not len(precision):
         return products, halves
-    prior = np.maximum(precision, LEAST_PRECISION)
-    count = products.shape[-1] - len(prior)
+    prior_precision = np.maximum(precision, LEAST_PRECISION)
+    kept_count = products.shape[-1] - len(prior_precision)
     # Schur complement of the last columns
-    root = np.linalg.cholesky(products[..., count:, count:] + np.diag(prior))
-    projected = np.asarray(np.linalg.solve(root, products[..., count:, :count]))
+    root = np.linalg.cholesky(products[..., kept_count:, kept_count:] + np.diag(prior_precision))
+    projected = np.asarray(np.linalg.solve(root, products[..., kept_count:, :kept_count]))
     half_log_determinants = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
-    remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior).sum()
-    return products[..., :count, :count] - projected.mT @ projected, remaining_halves
+    remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior_precision).sum()
+    return products[..., :kept_count, :kept_count] - projected.mT @ projected, remaining_halves
 
 
 def regression(filtered: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:
-    """Return the products of residuals and columns (1 + K + L, N, C) of all trials."""
-    alike: dict[tuple[bytes, ...], list[tuple[ForceFilter, FloatArray]]] = {}
-    for trial, columns in zip(filtered, rows, strict=True):
-        alike.setdefault(trial.key, []).append((trial, columns))
+    """Return the normal equations of all trials, without the unknowns of single trials.
+
+    Parameters
+    ----------
+    filtered : sequence of ForceFilter
+        The filter of each trial.
+    rows : sequence of (1 + K + L, N, C) array
+        The residual of each trial, and its columns of the K common and the trial's own L unknowns.
+    """
+    groups: dict[tuple[bytes, ...], list[tuple[ForceFilter, FloatArray]]] = {}
+    for trial_filter, columns in zip(filtered, rows, strict=True):
+        groups.setdefault(trial_filter.key, []).append((trial_filter, columns))
     total: FloatArray | float = 0.0
     log_determinant = 0.0
-    for group in alike.values():
-        first_trial, _ = group[0]
-        together, half = first_trial.products(np.concatenate([columns for _, columns in group]))
+    # trials of one group have the same gains: one pass of the filter whitens the columns of all
+    for group in groups.values():
+        first_filter, _ = group[0]
+        products_of_group, half_log_determinant = first_filter.products(
+            np.concatenate([columns for _, columns in group])
+        )
         ends = np.cumsum([0, *(len(columns) for _, columns in group)]).tolist()
-        for (trial, _), (begin, end) in zip(group, pairwise(ends), strict=True):
-            of_trial = together[begin:end, begin:end]
-            products, half_with_local = without(of_trial, half, trial.trial.local_precision)
+        for (trial_filter, _), (begin, end) in zip(group, pairwise(ends), strict=True):
+            products_of_trial = products_of_group[begin:end, begin:end]
+            products, half_with_local_unknowns = without(
+                products_of_trial, half_log_determinant, trial_filter.trial.local_precision
+            )
             total = total + products
-            log_determinant += float(half_with_local)
+            log_determinant += float(half_with_local_unknowns)
     return Regression(np.asarray(total), log_determinant)

@@ -1,4 +1,4 @@
-"""A share of the gap that a hypothesis explains, with its interval by a block bootstrap."""
+"""The share of a gap that a hypothesis explains, with its interval by a block bootstrap."""
 
 from dataclasses import dataclass
 
@@ -10,34 +10,38 @@ OF_FORCE = "the missing force"
 OF_PREDICTIONS = "what the missing force does to predictions"
 OF_READINGS = "the gap"
 DRAWS = 2000
-"""Draws of the bootstrap."""
+"""Number of draws of the bootstrap."""
 SEED = 0
-"""Seed of the bootstrap, and of the noise that is simulated."""
+"""Seed of the bootstrap, and of simulated noise."""
 
 
 @dataclass(frozen=True, eq=False)
 class GapShare:
-    """A share of the gap that a hypothesis explains: 1 - mean square after over mean square before.
+    """The share of a gap that a hypothesis explains: 1 - mean square after / mean square before.
+
+    The gap is a missing force, or a difference between readings and predictions. Its mean squares
+    are reduced by what noise alone would give.
 
     Attributes
     ----------
     before, after : (B,) array
-        The sums of squares of each block without and with the hypothesis.
+        The sum of squares of the gap in each of B blocks, without and with the hypothesis.
     noise : (B,) array
-        The part of these sums that the noise of the readings alone makes.
+        The sum of squares that the noise of the readings alone gives in each block.
     held_out : bool
         Whether the trials were held out.
     trial_count : int
         The number of trials.
     remaining_rms, total_rms : float
-        The rms of the force at the port of the law (or where most is missing), beside the law and
-        without it [N, N m or the port's flow]; or of the gap between readings and simulation.
+        The rms of the missing force with and without the law, at the port of the law or where most
+        force is missing [N, N m or the port's flow]; or that of the gap between readings and
+        simulation.
     kind : str
-        What it is a share of: of the forces, weighted by what they do to the state; of what they do
-        to the readings over a block, from its begin (the error of predictions); or of the gap
-        between readings and simulation.
+        The gap, one of `OF_FORCE` (forces, weighted by what they do to the state), `OF_PREDICTIONS`
+        (changes of the readings by the forces in a block, from its start) and `OF_READINGS`
+        (differences between readings and simulation).
     tested : bool
-        Whether the law has a force in these trials that could be seen.
+        Whether the force of the law is large enough in these trials to be seen.
     """
 
     before: FloatArray
@@ -52,24 +56,26 @@ class GapShare:
 
     @property
     def value(self) -> float:
-        """The share."""
+        """The share over all blocks."""
         return float(_share_of(self.before.sum(), self.after.sum(), self.noise.sum()))
 
     def bootstrap_draws(self) -> FloatArray:
-        """Return the share (DRAWS,) at draws of blocks with replacement.
+        """Return the share (DRAWS,) of random sets of blocks, drawn with replacement.
 
-        A block bootstrap (Kuensch 1989, Ann. Statist. 17, 1217-1241); all shares draw the same
-        blocks.
+        A block bootstrap (Kuensch 1989, Ann. Statist. 17, 1217-1241). The seed is fixed, so that
+        all shares of the same number of blocks draw the same ones and can be compared draw by draw.
         """
-        count = len(self.before)
+        block_count = len(self.before)
         generator = np.random.default_rng(SEED)
-        times_drawn = generator.multinomial(count, np.full(count, 1.0 / count), DRAWS)
+        times_drawn = generator.multinomial(
+            block_count, np.full(block_count, 1.0 / block_count), DRAWS
+        )
         return _share_of(
             times_drawn @ self.before, times_drawn @ self.after, times_drawn @ self.noise
         )
 
     def is_larger_than(self, other: "GapShare") -> bool:
-        """Return whether this share is larger than another one beyond chance (5 %)."""
+        """Return whether this share is significantly larger than another one (level 5 %)."""
         difference = self.bootstrap_draws() - other.bootstrap_draws()
         return bool(np.quantile(difference, 0.05) > 0.0)
 
@@ -81,9 +87,18 @@ class GapShare:
 
 
 def _share_of(before: FloatArray, after: FloatArray, noise: FloatArray) -> FloatArray:
-    """Return 1 - (after - noise) / (before - noise), and 0 where nothing is missing."""
+    """Return the share 1 - (after - noise) / (before - noise), element by element.
+
+    The numerator is at least zero. The share is zero if `before` is not larger than the noise: then
+    nothing is missing.
+
+    Parameters
+    ----------
+    before, after, noise : array
+        The sums of squares without and with the hypothesis, and of noise alone.
+    """
     gap = before - noise
-    remaining = np.divide(
+    remaining_ratio = np.divide(
         np.maximum(after - noise, 0.0), gap, out=np.ones_like(gap), where=gap > 0.0
     )
-    return 1.0 - remaining
+    return 1.0 - remaining_ratio

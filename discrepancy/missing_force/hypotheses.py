@@ -1,7 +1,7 @@
-"""Sets of effects as hypotheses on the missing force: prior, values that are tried, and columns.
+"""Sets of effects as hypotheses on the missing force: their priors, trial values and columns.
 
-A law acts along a motion that is known: its force is what it would have been, had the port moved
-so.
+The force of a law is evaluated along a motion that is taken as known: the estimated motion of its
+port. A column is the change of each trial for a unit of an unknown.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -37,18 +37,18 @@ from .trial import SeenTrial, TrialColumn, seen_trial
 from .view import EffectColumn, TrialMotion, View, combined
 
 LEVELS = (-1.3, -0.4, 0.4, 1.3)
-"""Standard normal values at which the parameters of an effect that are no magnitudes are tried."""
+"""Standard normal values at which a parameter that is not a magnitude is tried."""
 MOST_VALUES = 16
-"""Largest number of values of all parameters at which an effect is tried."""
+"""Largest number of combinations of parameter values at which an effect is tried."""
 AWAY = 0.5
-"""Standard normal value of a magnitude at which an effect is tried; the middle of a prior of both
-signs would be no effect."""
+"""Standard normal value at which a magnitude is tried. At zero, the middle of a prior with both
+signs, the effect would do nothing."""
 
 
 def sees_forces(problem: Problem) -> bool:
-    """Return whether missing forces can be seen.
+    """Return whether missing forces can be estimated in a problem.
 
-    In trials in motion, of a model that says how ports move.
+    That needs trials in motion, and a model that describes how its ports move.
     """
     model = problem.model
     has_motion = any(data.trial.is_dynamic for data in problem.trials)
@@ -56,10 +56,19 @@ def sees_forces(problem: Problem) -> bool:
 
 
 def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
-    """Return the log prior probability of a candidate at its places, among `count` effects.
+    """Return the log prior probability of a candidate [nat].
 
-    All sets of the same length have the same prior, and so have all places of an effect. A free
-    shape has to gain what the shape test asks for.
+    All sets with the same number of effects have the same prior, and so have all places of an
+    effect. An effect with a free shape has the smaller prior that the shape test asks for.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        The effects at their places.
+    count : int
+        The number of effects that are compared.
+    setting : Setting
+        The setting of the problem, which says at which places an effect may act.
     """
     terms = candidate.terms
     if not terms:
@@ -67,24 +76,34 @@ def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
     log_places = sum(log(len(term.effect.places(setting))) for term in terms)
     shape_price = sum(SHAPE_GAIN for term in terms if term.free_shape)
     probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_shares[len(terms) - 1]
-    set_count = comb(max(count, len(terms)), len(terms))
-    return log(probability_of_length / set_count) - log_places - shape_price
+    number_of_sets = comb(max(count, len(terms)), len(terms))
+    return log(probability_of_length / number_of_sets) - log_places - shape_price
 
 
 def trial_values(term: EffectTerm) -> list[FloatArray]:
-    """Return standard normal values (E,) of a term's parameters at which it is tried."""
-    others = [number for number, parameter in enumerate(term.parameters) if not parameter.magnitude]
-    levels = LEVELS if len(others) < 2 else LEVELS[::3]
+    """Return sets of standard normal parameter values (E,) at which an effect is tried."""
+    shape_parameters = [
+        number for number, parameter in enumerate(term.parameters) if not parameter.magnitude
+    ]
+    levels = LEVELS if len(shape_parameters) < 2 else LEVELS[::3]
     values_to_try = []
-    for chosen in list(product(levels, repeat=len(others)))[:MOST_VALUES]:
+    for shape_values in list(product(levels, repeat=len(shape_parameters)))[:MOST_VALUES]:
         values = np.full(len(term.parameters), AWAY)
-        values[others] = chosen
+        values[shape_parameters] = shape_values
         values_to_try.append(values)
     return values_to_try
 
 
 def scaled(processes: Processes, size_factor: float, time_factor: float) -> Mapping[int, Process]:
-    """Return processes with other sizes and correlation times."""
+    """Return processes with their sizes and correlation times multiplied by factors.
+
+    Parameters
+    ----------
+    processes : mapping of int to Process
+        The processes, by the number of the port.
+    size_factor, time_factor : float
+        The factors.
+    """
     scaled_processes = {}
     for port, process in processes.items():
         scaled_processes[port] = replace(
@@ -96,11 +115,11 @@ def scaled(processes: Processes, size_factor: float, time_factor: float) -> Mapp
 # ---------------------------------------------------------------- force of a law along a motion
 
 WIDER = 10.0
-"""Factor on the deviation of the speed, which is too small: the process of a force does not know of
-steps."""
+"""Factor on the posterior deviation of a speed. That deviation is too small, since the process of a
+missing force has no steps."""
 SLOW = 0.02
-"""Share of the usual speed below which a body creeps before it slides, and no law of the speed
-holds."""
+"""Share of the rms speed below which a body creeps before it slides, so that no law of the speed is
+valid."""
 
 
 def fill_course(
@@ -112,22 +131,22 @@ def fill_course(
     memory: FloatArray,
     course: FloatArray,
 ) -> None:
-    """Fill `course` (F,) with the force of a law along positions and speeds (F,).
+    """Fill `course` with the force of a law along a motion of its port.
 
     Parameters
     ----------
     number : int
-        The index of the law's kind in `LAWS`.
+        The index of the law's class in `LAWS`.
     of_speed : bool
-        Whether it is a law of the speed.
+        Whether the law is one of the speed, which has no memory.
     law : (R,) array
-        The row of the law.
+        The parameter row of the law.
     positions, speeds : (F,) array
-        The motion of its port.
+        The motion of the port at the fine stamps [m or rad, and per s].
     memory : (M,) array
         The memory of the law, which is changed.
     course : (F,) array
-        The force.
+        The force to fill [N or N m].
     """
     for k in range(len(positions)):
         if of_speed:
@@ -140,7 +159,7 @@ def fill_course(
 
 @cache
 def _compiled_fill_course() -> Callable[..., None]:
-    """Return `fill_course`, compiled where numba is there."""
+    """Return `fill_course`, compiled if numba is installed."""
     return compiled(fill_course, law_functions())
 
 
@@ -152,17 +171,18 @@ def law_course(
     speed_deviation: float = 0.0,
     holding_force: FloatArray | float = 0.0,
 ) -> FloatArray:
-    """Return the force (F,) of a law along a motion of its port; zero outside of the law's windows.
+    """Return the force (F,) of a law along a motion of its port [N or N m].
 
-    Where the speed may be zero within its deviation, a law of the speed that has a force at rest
-    holds the port: its force is then the holding force, up to its own largest.
+    The force is zero outside of the law's windows in time. A law of the speed with a force at rest,
+    such as dry friction, holds the port if its speed may be zero within its uncertainty: the force
+    is then the holding force, up to the force of the law.
 
     Parameters
     ----------
     law : PortForce
         The law.
     time, position, speed : (F,) array
-        The motion of its port.
+        The fine stamps [s], and the motion of the port there [m or rad, and per s].
     speed_deviation : float
         The standard deviation of the speed.
     holding_force : (F,) array or float
@@ -171,21 +191,22 @@ def law_course(
     row = law.parameter_row
     course = np.zeros(len(position))
     memory = np.zeros(FIRST_ELEMENT + max(1, len(row) - PARAMETERS))
-    kind = type(law)
+    law_class = type(law)
     _compiled_fill_course()(
-        LAWS.index(kind),
-        kind.depends_on_speed,
+        LAWS.index(law_class),
+        law_class.depends_on_speed,
         row,
         np.ascontiguousarray(position),
         np.ascontiguousarray(speed),
         memory,
         course,
     )
-    if kind.depends_on_speed and speed_deviation > 0.0:
+    if law_class.depends_on_speed and speed_deviation > 0.0:
         slow_speed = max(WIDER * speed_deviation, SLOW * float(np.sqrt(np.mean(speed**2))))
-        moves = erf(np.abs(speed) / (np.sqrt(2.0) * slow_speed))
-        held = np.clip(holding_force, -np.abs(course), np.abs(course))
-        course = moves * course + (1.0 - moves) * held
+        # probability that a normal error of deviation `slow_speed` is smaller than the speed
+        probability_of_motion = erf(np.abs(speed) / (np.sqrt(2.0) * slow_speed))
+        force_at_rest = np.clip(holding_force, -np.abs(course), np.abs(course))
+        course = probability_of_motion * course + (1.0 - probability_of_motion) * force_at_rest
     return course * law.acts_at(time)
 
 
@@ -193,7 +214,7 @@ def law_course(
 
 
 class ColumnBuilder:
-    """Computes what effects do along the motion of a view: its columns.
+    """Computes the columns of effects along the motion of a view: their change of each trial.
 
     Parameters
     ----------
@@ -223,7 +244,7 @@ class ColumnBuilder:
     def along(
         self, view: View, motions: Sequence[TrialMotion], known: EffectColumn | None = None
     ) -> View:
-        """Return a view along motions, with the model's own laws.
+        """Return a view whose laws and parameters act along motions, with the model's own laws.
 
         Parameters
         ----------
@@ -232,12 +253,12 @@ class ColumnBuilder:
         motions : sequence of TrialMotion
             The motion of each trial.
         known : EffectColumn, optional
-            What acts besides, without an unknown.
+            The part of the hypothesis that has no unknown.
         """
-        own = None
+        own_column = None
         if len(self.own_laws):
-            own = self.of_patch(view, motions, self.own_laws)
-        return replace(view, motions=motions, own=own, known=known)
+            own_column = self.of_patch(view, motions, self.own_laws)
+        return replace(view, motions=motions, own=own_column, known=known)
 
     def of(
         self,
@@ -246,7 +267,24 @@ class ColumnBuilder:
         candidate: Candidate,
         values: FloatArray,
     ) -> EffectColumn | None:
-        """Return the column of a candidate at scaled parameters (E,); None if it cannot act."""
+        """Return the column of a candidate along motions.
+
+        Parameters
+        ----------
+        view : View
+            The trials.
+        motions : sequence of TrialMotion
+            The motion of each trial.
+        candidate : Candidate
+            The effects.
+        values : (E,) array
+            The scaled parameters of the effects.
+
+        Returns
+        -------
+        EffectColumn or None
+            The sum of the changes by all effects; None if an effect cannot act with these values.
+        """
         columns = []
         for term, term_values in candidate.split(values):
             try:
@@ -266,16 +304,34 @@ class ColumnBuilder:
         patch: ModelPatch,
         acts_on: frozenset[TrialKind] = frozenset(TrialKind),
     ) -> EffectColumn | None:
-        """Return the column of a patch that acts in some kinds of trials; None if it cannot act."""
-        parts = []
+        """Return the column of a patch along motions.
+
+        Parameters
+        ----------
+        view : View
+            The trials.
+        motions : sequence of TrialMotion
+            The motion of each trial.
+        patch : ModelPatch
+            The change of the model.
+        acts_on : frozenset of TrialKind
+            The kinds of trials that it changes.
+
+        Returns
+        -------
+        EffectColumn or None
+            The change of each trial; None if the patch is invalid or gives numbers that are not
+            finite.
+        """
+        changes = []
         try:
             for trial, motion, number in zip(view.trials, motions, self.numbers, strict=True):
-                in_trial = patch.in_trial(trial.name)
-                parts.append(self.part(trial, motion, number, in_trial, acts_on))
+                patch_in_trial = patch.in_trial(trial.name)
+                changes.append(self.part(trial, motion, number, patch_in_trial, acts_on))
         except (DiscrepancyError, InvalidPatchError):
             return None
-        is_finite = all(np.all(np.isfinite(part.readings)) for part in parts)
-        return parts if is_finite else None
+        is_finite = all(np.all(np.isfinite(change.readings)) for change in changes)
+        return changes if is_finite else None
 
     def part(
         self,
@@ -285,7 +341,7 @@ class ColumnBuilder:
         patch: ModelPatch,
         acts_on: frozenset[TrialKind],
     ) -> TrialColumn:
-        """Return what a patch does in a trial along a motion.
+        """Return the change of one trial by a patch, along a motion.
 
         Parameters
         ----------
@@ -298,11 +354,13 @@ class ColumnBuilder:
         patch : ModelPatch
             The patch.
         acts_on : frozenset of TrialKind
-            The kinds of trials that it changes.
+            The kinds of trials that the patch changes.
         """
         kind = self.problem.trials[number].trial.kind
         if kind not in acts_on or not len(patch):
             return TrialColumn(np.zeros_like(trial.residual))
+        # laws act along the motion; changes of the structure and of the clock are simulated; other
+        # errors of sensors act on the explained motion
         laws = patch.of(PortForce)
         if len(laws):
             return self._of_laws(trial, motion, laws)
@@ -313,8 +371,18 @@ class ColumnBuilder:
         return TrialColumn(self._of_sensors(trial, motion, number, sensors))
 
     def _of_laws(self, trial: SeenTrial, motion: TrialMotion, laws: ModelPatch) -> TrialColumn:
-        """Return what laws at ports do in a trial along a motion."""
-        added = np.zeros_like(motion.added)
+        """Return the change of a trial by laws at ports, along a motion.
+
+        Parameters
+        ----------
+        trial : SeenTrial
+            The trial.
+        motion : TrialMotion
+            The motion of its ports.
+        laws : ModelPatch
+            The laws.
+        """
+        added_by_all = np.zeros_like(motion.added)
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
         for law in self.problem.model.at_ports(laws):
@@ -322,7 +390,7 @@ class ColumnBuilder:
                 continue
             port = trial.system.ports.index(law.port)
             _, speed_deviation = motion.deviations.get(port, (0.0, 0.0))
-            course = law_course(
+            force = law_course(
                 law,
                 trial.fine_time,
                 motion.positions[:, port],
@@ -330,16 +398,30 @@ class ColumnBuilder:
                 speed_deviation,
                 motion.forces.get(port, 0.0),
             )
-            state = trial.pushed(port, course)
-            added += state
-            readings += trial.readings(state, {port: course})
-            forces[port] = forces.get(port, 0.0) + course
-        return TrialColumn(readings, added, forces)
+            added_by_law = trial.pushed(port, force)
+            added_by_all += added_by_law
+            readings += trial.readings(added_by_law, {port: force})
+            forces[port] = forces.get(port, 0.0) + force
+        return TrialColumn(readings, added_by_all, forces)
 
     def _of_changed_response(self, trial: SeenTrial, number: int, patch: ModelPatch) -> FloatArray:
-        """Return what a patch changes in the model's own response (N, C), over the noise."""
+        """Return the change (N, C) of the readings by a patch in a simulation, over the noise.
+
+        It is the model's response with the patch minus that without it; the estimated motion is not
+        used.
+
+        Parameters
+        ----------
+        trial : SeenTrial
+            The trial.
+        number : int
+            Its index in the problem.
+        patch : ModelPatch
+            The patch.
+        """
         shared = self.point.shared
         local = self.point.local[number]
+        # both responses are without the gains of the channels
         patched, _ = self.problem.response(number, shared, local, patch)
         response, _ = self.problem.response(number, shared, local, ModelPatch())
         gains = 1.0 + self.problem.shared.gains(shared, self.problem.trials[number].trial.channels)
@@ -348,35 +430,49 @@ class ColumnBuilder:
     def _of_sensors(
         self, trial: SeenTrial, motion: TrialMotion, number: int, sensors: ModelPatch
     ) -> FloatArray:
-        """Return what errors of sensors change in the readings (N, C), over the noise.
+        """Return the change (N, C) of the readings by errors of sensors, divided by the noise.
 
-        They act on what is explained: the model's own response and what laws add to it. A missing
-        force without a law is left out, since its part of any size would show any gain.
+        The sensors see the explained motion only: the response of the model and what laws add to
+        it. A missing force without a law is left out. As it may have any size, it would fit any
+        gain.
+
+        Parameters
+        ----------
+        trial : SeenTrial
+            The trial.
+        motion : TrialMotion
+            Its motion.
+        number : int
+            Its index in the problem.
+        sensors : ModelPatch
+            The errors of sensors.
         """
         problem = self.problem
         data = problem.trials[number]
         shared = self.point.shared
         local = self.point.local[number]
-        # what the sensors see, and its rates
+        # the true values at the sensors, and their rates
         response, rates = problem.response(number, shared, local, ModelPatch())
         gains = 1.0 + problem.shared.gains(shared, data.trial.channels)
-        by_laws = trial.readings(motion.explained, motion.laws) * trial.deviation / gains
-        seen = response + by_laws
-        seen_rates = None
+        # `readings` are divided by the noise and contain the gains: undo both
+        change_by_laws = trial.readings(motion.explained, motion.laws) * trial.deviation / gains
+        true_values = response + change_by_laws
+        true_rates = None
         if rates is not None:
             state_rates = motion.explained @ trial.system.generator.T
             for port, force in motion.laws.items():
                 state_rates = state_rates - np.outer(force, trial.system.actions[port])
             rates_by_laws = (state_rates @ trial.system.outputs.T)[:: trial.parts] / gains
-            seen_rates = rates + rates_by_laws
-        # what they show of it
+            true_rates = rates + rates_by_laws
+        # the readings of the sensors with their errors
         conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(shared), local)
         observed = observe_response(
-            problem.campaign, data.trial, sensors, conditions, Response(seen, seen_rates)
+            problem.campaign, data.trial, sensors, conditions, Response(true_values, true_rates)
         )
-        change = observed.values - seen
+        change = observed.values - true_values
+        # an error of the clock shifts the readings in time
         clock_rate, clock_zero = clock_of(sensors)
-        if seen_rates is not None:
+        if true_rates is not None:
             clock_error = clock_rate * (trial.time - trial.time[0]) + clock_zero
-            change += seen_rates * clock_error[:, None]
+            change += true_rates * clock_error[:, None]
         return trial.over_noise(change * gains)

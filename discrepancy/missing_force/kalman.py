@@ -1,12 +1,14 @@
-"""The Kalman filter of a record, forwards, and its counterpart backwards: what both tell together.
+"""The Kalman filter of a record, forwards and backwards, and how both are joined.
 
-What is known before a moment and what the readings after it say (Fraser and Potter 1969, IEEE
-Transactions on Automatic Control 14, 387-390) give the evidence of all readings and the state at
-that moment. Readings come one at a time, so nothing is inverted forwards; covariance and
-information are updated in Joseph form. Where they have become steady they are kept.
+The forward filter says what is known of the state before a moment, the backward one what the
+readings after it say (Fraser and Potter 1969, IEEE Transactions on Automatic Control 14, 387-390).
+Together they give the evidence of all readings, and the state at that moment. Readings are taken in
+one at a time, so that the forward filter inverts no matrix. Covariance and information are updated
+in Joseph form; once they have converged they are kept.
 
-Shapes: n states, c channels, N samples, W columns that are filtered alike, S different steps, B
-places.
+Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
+derivatives by unknowns), S different steps, B places (samples whose state is asked for). Readings
+are divided by the deviation of the white part of their noise, which therefore has variance one.
 """
 
 from collections.abc import Sequence
@@ -22,20 +24,31 @@ from .backward import backward
 from .covariances import is_steady
 
 SMALL_PART, ORDERS = 0.25, 12
-"""Norm of what is summed as a series, and its orders: 1e-16 is left out."""
+"""Norm of the rate matrix times the time up to which its exponential is summed as a series, and the
+number of terms: the remainder is 1e-16."""
 LEAST_SIZE = 0.5
-"""Variance of a reading, over its noise, below which rounding has taken what a force too large left
-of it."""
+"""Variance of an innovation over that of the noise below which a far too large force has lost it to
+rounding. Exactly it is at least one."""
 
 
 @compiled
 def discretised(
     generator: FloatArray, intensity: FloatArray, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transitions and noises (J, n, n) of steps of given lengths (J,) [s].
+    """Return transitions and process noises (J, n, n) of steps of given lengths.
 
-    Series for a small part of a step, which is then doubled: what decays within a step would grow
-    beyond all numbers in an exponential of both signs.
+    The series is summed for a small part of a step, which is then doubled. The usual exponential of
+    a block matrix (Van Loan) contains exp(-A t) too, which overflows if a state decays within a
+    step.
+
+    Parameters
+    ----------
+    generator : (n, n) array
+        The rate matrix A [1/s].
+    intensity : (n, n) array
+        The spectral density of the white noise that drives the state.
+    lengths : (J,) array
+        The lengths of the steps [s].
     """
     n = len(generator)
     norm = np.max(np.sum(np.abs(generator), axis=1)) if n else 0.0
@@ -43,19 +56,21 @@ def discretised(
     noises = np.empty((len(lengths), n, n))
     for k in range(len(lengths)):
         doublings = 0
-        part = lengths[k]
-        while norm * part > SMALL_PART:
+        part_length = lengths[k]
+        while norm * part_length > SMALL_PART:
             doublings += 1
-            part = 0.5 * part
+            part_length = 0.5 * part_length
         # Taylor series of both for the part
         transition = np.eye(n)
         transition_term = np.eye(n)
-        noise = intensity * part
-        noise_term = intensity * part
+        noise = intensity * part_length
+        noise_term = intensity * part_length
         for order in range(1, ORDERS):
-            transition_term = (generator @ transition_term) * (part / order)
+            transition_term = (generator @ transition_term) * (part_length / order)
             transition = transition + transition_term
-            noise_term = (generator @ noise_term + noise_term @ generator.T) * (part / (order + 1))
+            noise_term = (generator @ noise_term + noise_term @ generator.T) * (
+                part_length / (order + 1)
+            )
             noise = noise + noise_term
         # two parts in a row make one of twice the length
         for _ in range(doublings):
@@ -68,53 +83,54 @@ def discretised(
 
 @callable_when_compiled
 def update_covariance(covariance: FloatArray, row: FloatArray, gain: FloatArray) -> float:
-    """Return the variance of a reading.
+    """Take a reading into a covariance (n, n) in place, and return the variance of its innovation.
 
-    Take it into a covariance (n, n), and fill its gain (n,).
+    The gain (n,) of the reading is filled; `row` (n,) is the reading for a unit of each state.
     """
-    along = covariance @ row
-    variance = row @ along + 1.0
-    gain[:] = along / variance
-    # Joseph form, from both sides in turn: what the first leaves by rounding the second takes
+    covariance_row = covariance @ row
+    variance = row @ covariance_row + 1.0
+    gain[:] = covariance_row / variance
+    # Joseph form (I - g h^T) C (I - g h^T)^T + g g^T, one factor after the other: a rounding error
+    # of the first one is reduced by the second
     for i in range(len(row)):
         for j in range(len(row)):
-            covariance[i, j] -= gain[i] * along[j]
-    along = covariance @ row
+            covariance[i, j] -= gain[i] * covariance_row[j]
+    covariance_row = covariance @ row
     for i in range(len(row)):
         for j in range(len(row)):
-            covariance[i, j] += (gain[i] - along[i]) * gain[j]
+            covariance[i, j] += (gain[i] - covariance_row[i]) * gain[j]
     return float(variance)
 
 
 @callable_when_compiled
 def predict_mean(transition: FloatArray, mean: FloatArray, predicted: FloatArray) -> None:
-    """Fill the mean (n, W) after a step; transitions are mostly zeros."""
+    """Fill the means (n, W) after a step. Zeros of the transition, which has many, are skipped."""
     predicted[:] = 0.0
     for i in range(len(transition)):
         for j in range(len(transition)):
-            factor = transition[i, j]
-            if factor != 0.0:
+            coefficient = transition[i, j]
+            if coefficient != 0.0:
                 for w in range(mean.shape[1]):
-                    predicted[i, w] += factor * mean[j, w]
+                    predicted[i, w] += coefficient * mean[j, w]
 
 
 @callable_when_compiled
 def subtract_prediction(row: FloatArray, mean: FloatArray, innovation: FloatArray) -> None:
-    """Take the prediction of a reading from its columns (W,), which leaves their innovation."""
+    """Subtract the prediction of a reading from its columns (W,), which become innovations."""
     for j in range(len(row)):
-        factor = row[j]
-        if factor != 0.0:
+        coefficient = row[j]
+        if coefficient != 0.0:
             for w in range(len(innovation)):
-                innovation[w] -= factor * mean[j, w]
+                innovation[w] -= coefficient * mean[j, w]
 
 
 @callable_when_compiled
 def update_mean(gain: FloatArray, innovation: FloatArray, mean: FloatArray) -> None:
-    """Take the innovation (W,) of a reading into a mean (n, W)."""
+    """Correct the means (n, W) by the innovations (W,) of a reading."""
     for j in range(len(gain)):
-        factor = gain[j]
+        coefficient = gain[j]
         for w in range(len(innovation)):
-            mean[j, w] += factor * innovation[w]
+            mean[j, w] += coefficient * innovation[w]
 
 
 @compiled
@@ -130,64 +146,72 @@ def forward(
     mean: FloatArray,
     places: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return the state given the readings of samples `first` to `places` (B,), without the last.
+    """Return the filtered state before some samples, from the readings since sample `first`.
+
+    Each such sample is a place: the readings of the sample before it are the last ones taken in.
 
     Parameters
     ----------
     transitions, noises : (S, n, n) ndarray
-        Transitions of the different steps, and the covariances of the noise that they add.
+        The transitions of the different steps, and the covariances of their process noise.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
     rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
-        What the readings show of the state, over their noise; which readings count; what is
-        filtered.
+        The readings for a unit of each state; whether each reading counts; the columns.
     first : int
-        The first sample that is read.
+        The first sample whose readings are taken in.
     covariance, mean : (n, n), (n, W) ndarray
-        State after the sample before it; at the first of the record, there.
+        The state after the sample before `first`; for the first sample of a record, the state at
+        that sample before its readings.
     places : (B,) ndarray
-        Samples before which the state is asked for, in order.
+        The samples before which the state is asked for, ascending.
 
-    Returns ------- covariances, means, white, halves : (B, n, n), (B, n, W), (places[-1] - first,
-    c, W), (B,) ndarray
-        State after the last sample read, columns as independent numbers of variance one, half the
-        logarithm of the readings' variances; infinite where one has been lost to rounding.
+    Returns
+    -------
+    covariances, means : (B, n, n), (B, n, W) ndarray
+        The state after the last sample before each place.
+    white : (places[-1] - first, c, W) ndarray
+        The innovations of the columns, divided by their standard deviations.
+    halves : (B,) ndarray
+        Half the sum of the logarithms of the variances of the innovations; infinite if a variance
+        has been lost to rounding.
     gains, variances : (B, c, n), (B, c) ndarray
-        Of the readings of that sample.
+        The gains and the variances of the innovations of that last sample.
     """
-    n, width = mean.shape
-    channels = len(rows)
-    count = len(places)
-    covariances = np.zeros((count, n, n))
-    means = np.zeros((count, n, width))
-    white = np.zeros((places[-1] - first, channels, width))
-    halves = np.full(count, np.inf)
-    all_gains = np.zeros((count, channels, n))
-    all_variances = np.ones((count, channels))
+    n, column_count = mean.shape
+    channel_count = len(rows)
+    place_count = len(places)
+    covariances = np.zeros((place_count, n, n))
+    means = np.zeros((place_count, n, column_count))
+    white = np.zeros((places[-1] - first, channel_count, column_count))
+    halves = np.full(place_count, np.inf)
+    all_gains = np.zeros((place_count, channel_count, n))
+    all_variances = np.ones((place_count, channel_count))
 
     covariance = covariance.copy()
     mean = mean.copy()
-    predicted = np.zeros((n, width))
-    gains = np.zeros((channels, n))
-    variances = np.ones(channels)
-    half = 0.0
+    predicted = np.zeros((n, column_count))
+    gains = np.zeros((channel_count, n))
+    variances = np.ones(channel_count)
+    half_log_determinant = 0.0
     place = 0
     steady = False
     for k in range(first, places[-1] + 1):
-        # hand out the state where it is asked for
-        while place < count and places[place] == k:
+        # store the state before a place
+        while place < place_count and places[place] == k:
             covariances[place] = covariance
             means[place] = mean
-            halves[place] = half
+            halves[place] = half_log_determinant
             all_gains[place] = gains
             all_variances[place] = variances
             place += 1
-        if place == count:
+        if place == place_count:
             break
+        # a steady covariance stays so while the step and the used readings are the same
         same_step = k > first + 1 and step_of_sample[k] == step_of_sample[k - 1]
-        is_like_last = same_step and bool(np.all(used[k] == used[k - 1]))
-        steady = steady and is_like_last
-        last_covariance = covariance
+        is_like_previous = same_step and bool(np.all(used[k] == used[k - 1]))
+        steady = steady and is_like_previous
+        previous_covariance = covariance
         # predict
         if k > 0:
             transition = transitions[step_of_sample[k]]
@@ -197,11 +221,12 @@ def forward(
                 covariance = transition @ covariance @ transition.T + noises[step_of_sample[k]]
                 covariance = 0.5 * (covariance + covariance.T)
         # take in the readings one at a time
-        for c in range(channels):
+        for c in range(channel_count):
             if not used[k, c]:
                 continue
             if not steady:
                 variances[c] = update_covariance(covariance, rows[c], gains[c])
+                # this place and later ones keep their infinite half log determinant
                 if not variances[c] > LEAST_SIZE:
                     return covariances, means, white, halves, all_gains, all_variances
             innovation = white[k - first, c]
@@ -209,8 +234,8 @@ def forward(
             subtract_prediction(rows[c], mean, innovation)
             update_mean(gains[c], innovation, mean)
             innovation /= np.sqrt(variances[c])
-            half += 0.5 * np.log(variances[c])
-        steady = steady or (is_like_last and is_steady(covariance, last_covariance))
+            half_log_determinant += 0.5 * np.log(variances[c])
+        steady = steady or (is_like_previous and is_steady(covariance, previous_covariance))
     return covariances, means, white, halves, all_gains, all_variances
 
 
@@ -224,49 +249,58 @@ def driven(
     start: FloatArray,
     pushes: FloatArray,
 ) -> FloatArray:
-    """Return the state (F, n) at the fine stamps under pushes (F, d), straight between them.
+    """Return the state (F, n) at the fine stamps under inputs that are linear between these.
 
     Parameters
     ----------
     parts : int
-        Fine steps between two samples.
+        The number of fine steps between two samples.
     transitions : (J, n, n) ndarray
-        Transitions of the different fine steps.
+        The transitions of the fine steps of different lengths.
     push_at_begin, push_at_end : (J, n, d) ndarray
-        The change of the state by a unit push at the begin and the end of a fine step.
+        The change of the state over a fine step for a unit of an input at its start, or at its end.
     step_of_sample : (N,) ndarray
-        The step that leads to each sample.
+        The index of the length of the interval that ends at each sample.
     start : (n,) ndarray
-        State at the first stamp.
+        The state at the first fine stamp.
     pushes : (F, d) ndarray
-        Pushes at the fine stamps.
+        The d inputs at the fine stamps.
     """
-    n, push_count = push_at_begin.shape[1], pushes.shape[1]
+    n, input_count = push_at_begin.shape[1], pushes.shape[1]
     states = np.zeros((len(pushes), n))
     states[0] = start
     for k in range(len(pushes) - 1):
         step = step_of_sample[k // parts + 1]
         for i in range(n):
-            total = 0.0
+            next_state = 0.0
             for j in range(n):
-                total += transitions[step, i, j] * states[k, j]
-            for d in range(push_count):
-                total += (
+                next_state += transitions[step, i, j] * states[k, j]
+            for d in range(input_count):
+                next_state += (
                     push_at_begin[step, i, d] * pushes[k, d]
                     + push_at_end[step, i, d] * pushes[k + 1, d]
                 )
-            states[k + 1, i] = total
+            states[k + 1, i] = next_state
     return states
 
 
 FilterState = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""Covariance or information (.., n, n), means or what lies along it (.., n, W), products of columns
-(.., W, W), and half a logarithm (..)."""
+"""State of a filter with its sums: covariance or information matrix (.., n, n), means or
+information vectors (.., n, W), products of whitened columns (.., W, W), and half a log determinant
+(..)."""
 
 
 @dataclass(frozen=True, eq=False)
 class FilterSteps:
-    """A record as `forward` takes it, but for which of its steps leads to each sample."""
+    """The arrays of a record that `forward` and `backward` take, without the step of each sample.
+
+    Attributes
+    ----------
+    moves, noises : (S, n, n) ndarray
+        The transitions of the different steps, and the covariances of their process noise.
+    rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+        The readings for a unit of each state; whether each reading counts; the columns.
+    """
 
     moves: FloatArray
     noises: FloatArray
@@ -276,19 +310,36 @@ class FilterSteps:
 
     @cached_property
     def noise_roots(self) -> FloatArray:
-        """Roots of the noises."""
+        """The roots (S, n, n) of the process noises: root @ root.T is the covariance."""
         return _roots(self.noises)
 
     def begin(self, covariance: FloatArray) -> FilterState:
-        """Return the state at the first sample, of a covariance."""
-        n, width = self.rows.shape[1], self.columns.shape[2]
-        return covariance, np.zeros((n, width)), np.zeros((width, width)), np.zeros(())
+        """Return the state of the filter before the first sample, with a covariance (n, n)."""
+        n, column_count = self.rows.shape[1], self.columns.shape[2]
+        return (
+            covariance,
+            np.zeros((n, column_count)),
+            np.zeros((column_count, column_count)),
+            np.zeros(()),
+        )
 
     def before(
         self, step_of_sample: IntArray, first: int, state: Sequence[FloatArray], places: IntArray
     ) -> FilterState:
-        """Return the states before the steps to some samples, filtered from a first one on."""
-        covariance, mean, known_products, known_halves = state
+        """Return the states of the filter before the steps into some samples.
+
+        Parameters
+        ----------
+        step_of_sample : (N,) array
+            The step that leads to each sample.
+        first : int
+            The first sample whose readings are taken in.
+        state : sequence of array
+            The state of the filter before that sample, as `FilterState`.
+        places : (B,) array
+            The samples before which the state is asked for, ascending.
+        """
+        covariance, mean, products_before, halves_before = state
         covariances, means, white, halves, *_ = forward(
             self.moves,
             self.noises,
@@ -301,42 +352,74 @@ class FilterSteps:
             mean,
             places,
         )
-        # products of the whitened columns up to each place
-        by_place = np.split(
+        # sums of the products of whitened columns, from the first sample up to each place
+        white_by_place = np.split(
             white.reshape(-1, white.shape[-1]), len(self.rows) * (places[:-1] - first)
         )
-        products = np.cumsum([columns.T @ columns for columns in by_place], axis=0)
-        return covariances, means, products + known_products, halves + known_halves
+        products = np.cumsum(
+            [white_columns.T @ white_columns for white_columns in white_by_place], axis=0
+        )
+        return covariances, means, products + products_before, halves + halves_before
 
     def after(self, step_of_sample: IntArray, places: IntArray) -> FilterState:
-        """Return what the readings from some samples on tell of the states there."""
+        """Return the information on the state at some samples, from these and later readings.
+
+        Parameters
+        ----------
+        step_of_sample : (N,) array
+            The step that leads to each sample.
+        places : (B,) array
+            The samples, ascending.
+        """
         return backward(
             self.moves, self.noise_roots, step_of_sample, self.rows, self.used, self.columns, places
         )
 
 
 def _roots(covariances: FloatArray) -> FloatArray:
-    """Return roots (..., n, n) of covariances."""
-    values, vectors = np.linalg.eigh(covariances)
-    return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :])
+    """Return roots (..., n, n) of covariances: root @ root.T is the covariance."""
+    eigenvalues, eigenvectors = np.linalg.eigh(covariances)
+    return np.ascontiguousarray(eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))[..., None, :])
 
 
 def joined(
     before: Sequence[FloatArray], after: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return products (..., W, W) and half log determinants (...) of records from both parts.
+    """Return the products and half log determinants of whole records from those of two parts.
 
-    The state between both parts is integrated out: Gaussian before, with the information of what
-    came after.
+    The state z at the joint is integrated out. It is Gaussian given the readings before; those
+    after have the log density of `backward`.
+
+    Parameters
+    ----------
+    before : sequence of array
+        Covariance, means, products and half log determinants of the readings before.
+    after : sequence of array
+        Information matrix, information vectors, products and half log determinants of the readings
+        after.
+
+    Returns
+    -------
+    products : (..., W, W) array
+        The inner products of the whitened columns of the whole record.
+    half_log_determinants : (...) array
+        Half the log determinant of the covariance of all its readings [nat].
     """
-    covariance, mean, products, half = before
+    covariance, mean, products, earlier_half = before
     J, h, later_products, later_half = after
+    # with covariance R R^T and residual information h - J m of the mean m, completing the square
+    # in z leaves (h - J m)^T R (I + R^T J R)^-1 R^T (h - J m), and half log det (I + R^T J R)
     root = _roots(covariance)
-    inner = np.linalg.cholesky(np.eye(covariance.shape[-1]) + root.mT @ J @ root)
-    explained = np.asarray(np.linalg.solve(inner, root.mT @ (h - J @ mean)))
-    cross = mean.mT @ h
-    whole = (
-        products + later_products - cross - cross.mT + mean.mT @ J @ mean - explained.mT @ explained
+    inner_root = np.linalg.cholesky(np.eye(covariance.shape[-1]) + root.mT @ J @ root)
+    explained = np.asarray(np.linalg.solve(inner_root, root.mT @ (h - J @ mean)))
+    mean_by_h = mean.mT @ h
+    all_products = (
+        products
+        + later_products
+        - mean_by_h
+        - mean_by_h.mT
+        + mean.mT @ J @ mean
+        - explained.mT @ explained
     )
-    half_log_determinant = np.log(np.diagonal(inner, axis1=-2, axis2=-1)).sum(-1)
-    return whole, half + later_half + half_log_determinant
+    half_log_determinant = np.log(np.diagonal(inner_root, axis1=-2, axis2=-1)).sum(-1)
+    return all_products, earlier_half + later_half + half_log_determinant

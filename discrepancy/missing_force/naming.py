@@ -1,9 +1,10 @@
-"""The search for what the missing force is: effects beside what remains of it, by their evidence.
+"""The search for the effects that explain a missing force, compared by their evidence.
 
-A hypothesis is a set of effects with missing forces at ports beside it. Its effects act along the
-motion that was, so that they and their derivatives by their parameters are columns of a linear
-model. A step of all parameters gives a new motion, and that new columns: an iterated smoother,
-whose fixed point is the most probable value, with Laplace's evidence.
+A hypothesis is a set of effects, together with a remaining missing force at ports. Its effects act
+along the estimated motion, so that the effects and their derivatives by their parameters are
+columns of a linear model. A step of all parameters gives a new motion, and the new motion new
+columns. This is an iterated smoother; its fixed point is the most probable value, and its evidence
+is Laplace's approximation.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -30,44 +31,46 @@ from .process_search import MOST_STEPS
 from .view import EffectColumn, TrialMotion, View, combined
 
 WIDE = 3.0
-"""Prior deviation of the magnitude of an effect: so many times what would explain all of the
-gap."""
+"""Prior standard deviation of the factor on an effect, relative to the factor that would explain
+all of the gap."""
 SIZES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
-"""Sizes of the missing forces beside which effects are screened, over the most probable ones
-without effect."""
+"""Sizes of the missing forces with which effects are screened, over the most probable ones without
+effects."""
 TIMES = (0.5, 1.5)
-"""Correlation times of these forces, over the same."""
+"""Correlation times of these forces, over the most probable ones without effects."""
 LARGEST_RATIO = 1e100
-"""Ratio of an effect to a gap of zero."""
+"""Ratio of an effect to the gap that stands for infinity, if the gap is zero."""
 WIDTHS = (10, 4, 4)
-"""Effects that are followed after the screen: alone, beside one other, beside two."""
+"""Number of effects that are followed after the screening: as single effects, as second ones and as
+third ones."""
 TIED = 1.0
-"""Evidence by which values of an effect may be below the best ones to be followed, too [nat]."""
+"""Difference of log evidence to the best values of an effect, up to which other values of it are
+followed too [nat]."""
 BEAM = 3
-"""Sets to which one more effect is added."""
+"""Number of most probable sets to which one more effect is added."""
 ROUNDS = 8
 """Largest number of steps of the parameters of an effect."""
 LONGEST_STEP = 1.5
-"""Longest step of these parameters."""
+"""Longest step of a parameter, in prior standard deviations."""
 SETTLED = 0.05
-"""Step after which no other follows."""
+"""Step of a parameter below which the iteration ends, in prior standard deviations."""
 LEAST_PART = 0.2
-"""Least part of a step that is taken where steps turn back."""
+"""Least part of a step that is taken if successive steps have opposite directions."""
 SLOPE = 0.05
-"""Standard normal step of the derivatives of an effect."""
+"""Half the difference of a standard normal parameter in derivatives of an effect."""
 
 
 class ScreenedEffect(NamedTuple):
-    """An effect that may stand beside a hypothesis.
+    """An effect that may be added to a hypothesis, with the result of its screening.
 
     Attributes
     ----------
     log_evidence : float
-        The largest evidence that it may have [nat].
+        The largest log evidence of the screening, at the best of the tried values [nat].
     term : EffectTerm
         The effect at its place.
     starts : list of (E,) array
-        The scaled parameters from which it is followed.
+        The scaled parameters from which the effect is followed.
     """
 
     log_evidence: float
@@ -76,14 +79,14 @@ class ScreenedEffect(NamedTuple):
 
 
 class _WeighedColumn(NamedTuple):
-    """The evidence of a column [nat], and the factor on it that is most probable."""
+    """The log evidence of a column [nat], and its most probable factor."""
 
     log_evidence: float
     factor: float
 
 
 class ForceSearch(MissingForces):
-    """The search for effects that explain the missing forces of a problem."""
+    """The search for the effects that explain the missing forces of a problem."""
 
     # ---------------------------------------------------------------- what the force is
 
@@ -94,26 +97,26 @@ class ForceSearch(MissingForces):
     ) -> list[ForceHypothesis]:
         """Return hypotheses on the missing force, the most probable first, by a beam search.
 
-        Each effect is tried alone, with its own shape and with a free one; then the best of these
-        with one more effect, while that makes a more probable set.
+        Each effect is tried alone, with its own shape and with a free one. The best sets are then
+        extended by one more effect, as long as that gives a more probable set.
 
         Parameters
         ----------
         effects : sequence of Effect
             The effects.
         on_progress : callable
-            Takes a line that says what is compared, and how much is still to come.
+            The function that takes a line on what is compared, and how much remains.
         """
         count = len(effects)
         hypotheses: dict[CandidateKey, ForceHypothesis] = {(): self.whole}
         beam = [self.whole]
         for width in WIDTHS:
             best = self._ranked(hypotheses, count)[0]
-            longer: dict[CandidateKey, ForceHypothesis] = {}
+            extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
             for base in beam:
-                self._follow_beside(base, effects, width, longer, on_progress)
-            hypotheses |= longer
-            ranked = self._ranked(longer, count)
+                self._follow_beside(base, effects, width, extended_hypotheses, on_progress)
+            hypotheses |= extended_hypotheses
+            ranked = self._ranked(extended_hypotheses, count)
             if not ranked or self.score(ranked[0], count) <= self.score(best, count):
                 break
             beam = ranked[:BEAM]
@@ -127,65 +130,74 @@ class ForceSearch(MissingForces):
         longer: dict[CandidateKey, ForceHypothesis],
         on_progress: Callable[[str], None],
     ) -> None:
-        """Follow the most promising effects beside a base, and add them to the longer hypotheses.
+        """Follow the most promising effects in addition to a base, and store them in `longer`.
 
         Parameters
         ----------
         base : ForceHypothesis
-            The hypothesis that an effect is added to.
+            The hypothesis to which an effect is added.
         effects : sequence of Effect
             The effects.
         width : int
             The number of effects that are followed.
         longer : dict of CandidateKey to ForceHypothesis
-            The hypotheses with one more effect, which is extended.
+            The hypotheses with one more effect, to which results are added.
         on_progress : callable
-            Takes a line that says what is compared.
+            The function that takes a line on what is compared.
         """
-        beside = f" beside {base.candidate.description}" if base.candidate.terms else ""
-        on_progress(f"comparing all effects{beside} with the missing force")
+        base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
+        on_progress(f"comparing all effects{base_in_words} with the missing force")
         promising = self.screened(base, effects)[:width]
         for number, screened_effect in enumerate(promising):
             candidate = base.candidate.with_term(screened_effect.term)
             if candidate.key in longer:
                 continue
-            remaining = len(promising) - number - 1
+            remaining_count = len(promising) - number - 1
             description = candidate.description
-            on_progress(f"following {description} along the missing force, {remaining} more")
-            followed = []
+            on_progress(f"following {description} along the missing force, {remaining_count} more")
+            followed_hypotheses = []
             for start in screened_effect.starts:
                 effect = np.concatenate((base.effect, start))
                 hypothesis = self.followed(base, candidate, effect)
                 if hypothesis is not None:
-                    followed.append(hypothesis)
-            if followed:
-                best = max(followed, key=lambda hypothesis: hypothesis.log_evidence)
+                    followed_hypotheses.append(hypothesis)
+            if followed_hypotheses:
+                best = max(followed_hypotheses, key=lambda hypothesis: hypothesis.log_evidence)
                 longer[candidate.key] = best
 
     def score(self, hypothesis: ForceHypothesis, count: int) -> float:
-        """Return ln (evidence times prior) of a hypothesis among `count` effects [nat]."""
+        """Return the log of evidence times prior of a hypothesis [nat].
+
+        Parameters
+        ----------
+        hypothesis : ForceHypothesis
+            The hypothesis.
+        count : int
+            The number of effects that are compared.
+        """
         prior = log_prior(hypothesis.candidate, count, self.problem.setting)
         return hypothesis.log_evidence + prior
 
     def _ranked(
         self, hypotheses: Mapping[CandidateKey, ForceHypothesis], count: int
     ) -> list[ForceHypothesis]:
-        """Return hypotheses among `count` effects, the most probable first."""
+        """Return hypotheses, the most probable first; `count` effects are compared."""
         return sorted(hypotheses.values(), key=lambda hypothesis: -self.score(hypothesis, count))
 
     # ---------------------------------------------------------------- screen of one more effect
 
     def screened(self, base: ForceHypothesis, effects: Iterable[Effect]) -> list[ScreenedEffect]:
-        """Return effects that may stand beside a hypothesis, the most promising first.
+        """Return the effects that may be added to a hypothesis, the most promising first.
 
-        Each effect is tried at each of its places, and followed from all values that do as well
-        within `TIED`: in proportion to its size a dead zone does the same whatever its stiffness,
-        and ends elsewhere from each.
+        Each effect is tried at each of its places, with several values of its parameters. It is
+        followed from all values whose evidence is within `TIED` of the best. For example, dead
+        zones of different stiffness act alike if only their amplitude is fitted, but lead to
+        different ends.
 
         Parameters
         ----------
         base : ForceHypothesis
-            The hypothesis that an effect is added to.
+            The hypothesis to which an effect is added.
         effects : iterable of Effect
             The effects.
         """
@@ -196,7 +208,7 @@ class ForceSearch(MissingForces):
             for values in trial_values(term):
                 candidate = Candidate((term,))
                 column = self.columns.of(base.view, base.motions, candidate, values)
-                if column is not None and any(np.any(part.readings) for part in column):
+                if column is not None and any(np.any(change.readings) for change in column):
                     terms.append(term)
                     values_of_columns.append(values)
                     columns.append(column)
@@ -208,15 +220,25 @@ class ForceSearch(MissingForces):
             starts_of_terms.setdefault(term, []).append((log_evidence, start))
         screened_effects = []
         for term, starts in starts_of_terms.items():
-            best = max(log_evidence for log_evidence, _ in starts)
-            tied = [start for log_evidence, start in starts if log_evidence > best - TIED]
-            screened_effects.append(ScreenedEffect(best, term, tied))
+            best_log_evidence = max(log_evidence for log_evidence, _ in starts)
+            nearly_best_starts = [
+                start for log_evidence, start in starts if log_evidence > best_log_evidence - TIED
+            ]
+            screened_effects.append(ScreenedEffect(best_log_evidence, term, nearly_best_starts))
         return sorted(screened_effects, key=lambda effect: -effect.log_evidence)
 
     def _terms_beside(
         self, base: ForceHypothesis, effects: Iterable[Effect]
     ) -> Iterator[EffectTerm]:
-        """Yield effects at places where a hypothesis does not have them, also with a free shape."""
+        """Yield the effects at places where a hypothesis lacks them, also with a free shape.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis.
+        effects : iterable of Effect
+            The effects.
+        """
         in_base = {(term.effect.identifier, term.place) for term in base.candidate.terms}
         for effect in effects:
             for place in effect.places(self.problem.setting):
@@ -232,25 +254,28 @@ class ForceSearch(MissingForces):
         columns: Sequence[EffectColumn],
         terms: Sequence[EffectTerm],
     ) -> dict[int, _WeighedColumn]:
-        """Return the best evidence and factor of each column, beside several missing forces.
+        """Return the best evidence and factor of each column, added alone to a hypothesis.
+
+        The best is taken over several sizes and times of the remaining missing forces.
 
         Parameters
         ----------
         base : ForceHypothesis
-            The hypothesis that an effect is added to.
+            The hypothesis to which an effect is added.
         columns : sequence of EffectColumn
-            The columns, each of an effect at one value of its parameters.
+            The columns, each of an effect at one set of values of its parameters.
         terms : sequence of EffectTerm
             The effect of each column.
 
         Returns
         -------
         dict of int to _WeighedColumn
-            The evidence and factor by the number of the column.
+            The evidence and factor, by the index of the column. A column is left out if its factor
+            always has a sign that its effect cannot have.
         """
         if not columns:
             return {}
-        with_columns = replace(
+        view_with_columns = replace(
             base.view,
             motions=base.motions,
             effects=(*base.view.effects, *columns),
@@ -258,11 +283,14 @@ class ForceSearch(MissingForces):
         )
         known_count = len(base.view.precisions)
         best: dict[int, _WeighedColumn] = {}
-        for size, time in product(SIZES, TIMES):
-            products = with_columns.products(scaled(base.processes, size, time))
+        for size_factor, time_factor in product(SIZES, TIMES):
+            normal_equations = view_with_columns.products(
+                scaled(base.processes, size_factor, time_factor)
+            )
+            # the unknowns of the base are fitted again with each column
             for number, term in enumerate(terms):
-                chosen = [*range(known_count), known_count + number]
-                solution = products.solve(chosen, with_columns.precisions[chosen])
+                unknowns = [*range(known_count), known_count + number]
+                solution = normal_equations.solve(unknowns, view_with_columns.precisions[unknowns])
                 factor = float(solution.mean[-1])
                 is_better = number not in best or best[number].log_evidence < solution.evidence
                 has_possible_sign = factor > 0.0 or term.may_be_negative
@@ -273,22 +301,31 @@ class ForceSearch(MissingForces):
     def _prior_precisions(
         self, base: ForceHypothesis, columns: Sequence[EffectColumn]
     ) -> list[float]:
-        """Return the prior precisions of factors of columns.
+        """Return the prior precisions of the factors of columns.
 
-        The prior deviation of a factor is `WIDE` times what would explain all of the gap.
+        The prior standard deviation of a factor is `WIDE` times the factor with which the effect
+        would be as large as the gap: of forces for an effect with a force, of readings for another
+        one.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis with the gap.
+        columns : sequence of EffectColumn
+            The columns.
         """
         gap_of_readings = _rms([trial.residual for trial in base.view.trials])
         gap_of_forces = _rms([force for motion in base.motions for force in motion.forces.values()])
         precisions = []
         for column in columns:
-            forces = [force for part in column for force in part.forces.values()]
+            forces = [force for change in column for force in change.forces.values()]
             if forces:
-                size = _rms(forces)
-                gap = gap_of_forces
+                effect_rms = _rms(forces)
+                gap_rms = gap_of_forces
             else:
-                size = _rms([part.readings for part in column])
-                gap = gap_of_readings
-            precisions.append(min(size / (WIDE * gap), LARGEST_RATIO) ** 2)
+                effect_rms = _rms([change.readings for change in column])
+                gap_rms = gap_of_readings
+            precisions.append(min(effect_rms / (WIDE * gap_rms), LARGEST_RATIO) ** 2)
         return precisions
 
     # ---------------------------------------------------------------- most probable values
@@ -298,12 +335,12 @@ class ForceSearch(MissingForces):
     ) -> ForceHypothesis | None:
         """Return a hypothesis at its most probable values, by steps of an iterated smoother.
 
-        Each step takes the laws along the motion that the last one has found.
+        Each step evaluates the laws along the motion that the last one has estimated.
 
         Parameters
         ----------
         base : ForceHypothesis
-            The hypothesis whose motion and missing forces the first step takes.
+            The hypothesis with the motion and the missing forces of the first step.
         candidate : Candidate
             The effects.
         effect : (E,) array
@@ -312,46 +349,52 @@ class ForceSearch(MissingForces):
         Returns
         -------
         ForceHypothesis or None
-            None if the effects cannot act along the motion.
+            The hypothesis; None if the effects cannot act along the motion.
         """
         processes = base.processes
         motions = base.motions
         is_settled = False
         damping = 1.0
         last_step = np.zeros(len(effect))
-        best: ForceHypothesis | None = None
-        for number in range(ROUNDS):
+        best_hypothesis: ForceHypothesis | None = None
+        for step_number in range(ROUNDS):
             view = self.linear(base.view, motions, candidate, effect)
             if view is None:
                 break
-            is_last = is_settled or number == ROUNDS - 1
+            # missing forces: from the best point of a grid in the first step, unchanged in those
+            # that follow, and by Newton's method in the last one
+            is_last = is_settled or step_number == ROUNDS - 1
             hypothesis = with_most_probable_forces(
                 view,
                 self.prior_processes(processes),
                 processes,
                 candidate,
                 effect,
-                near=number > 0,
+                near=step_number > 0,
                 most_steps=MOST_STEPS if is_last else 0,
             )
             step = hypothesis.solution.mean[len(view.shared_precision) :] - effect
             hypothesis = _without_unreached_evidence(hypothesis, step)
+            # the last iteration adds the step that remains
             if is_settled:
                 return replace(hypothesis, effect=effect + step)
-            # the first motion is that of the base and follows the readings: there a hypothesis
-            # looks better than it is
-            is_better = best is None or hypothesis.log_evidence > best.log_evidence
-            if is_better or number == 1:
-                best = hypothesis
-            turns_back = step @ last_step < -0.5 * (last_step @ last_step)
-            damping = max(0.5 * damping, LEAST_PART) if turns_back else min(1.0, 1.5 * damping)
+            # the motion of the first step is that of the base, which follows the readings: its
+            # evidence is too large, so that the second step replaces it in any case
+            is_better = (
+                best_hypothesis is None or hypothesis.log_evidence > best_hypothesis.log_evidence
+            )
+            if is_better or step_number == 1:
+                best_hypothesis = hypothesis
+            # shorter steps if the direction reverses, longer ones again if not
+            reverses = step @ last_step < -0.5 * (last_step @ last_step)
+            damping = max(0.5 * damping, LEAST_PART) if reverses else min(1.0, 1.5 * damping)
             move = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
             effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
-            is_settled = number > 0 and _is_last_step(step, last_step)
+            is_settled = step_number > 0 and _is_last_step(step, last_step)
             processes = hypothesis.processes
             motions = hypothesis.motions
             last_step = step
-        return best
+        return best_hypothesis
 
     def linear(
         self,
@@ -360,7 +403,7 @@ class ForceSearch(MissingForces):
         candidate: Candidate,
         effect: FloatArray,
     ) -> View | None:
-        """Return the view of a hypothesis, linear about its values and along motions.
+        """Return the trials, linear in the effect parameters of a hypothesis along motions.
 
         Parameters
         ----------
@@ -371,12 +414,12 @@ class ForceSearch(MissingForces):
         candidate : Candidate
             The effects.
         effect : (E,) array
-            The scaled effect parameters.
+            The scaled effect parameters about which the effects are linear.
 
         Returns
         -------
         View or None
-            None if the effects cannot act along the motions.
+            The view; None if the effects cannot act along the motions.
         """
         if not candidate.terms:
             return replace(self.columns.along(view, motions, None), effects=(), precision=())
@@ -390,7 +433,8 @@ class ForceSearch(MissingForces):
             if above is None or below is None:
                 return None
             slopes.append(combined((above, below), (0.5 / SLOPE, -0.5 / SLOPE)))
-        # a column for each parameter, and one for what acts where all of them are zero
+        # a column for each parameter, and a known one: the linear effects at zero parameters, which
+        # are the effects at `effect` minus the sum of effect * slope
         at_zero = combined((at_values, *slopes), (1.0, *-effect))
         view = self.columns.along(view, motions, at_zero)
         return replace(view, effects=tuple(slopes), precision=(1.0,) * len(effect))
@@ -403,10 +447,18 @@ def _rms(series: Iterable[FloatArray]) -> float:
 
 
 def _without_unreached_evidence(hypothesis: ForceHypothesis, step: FloatArray) -> ForceHypothesis:
-    """Return a hypothesis without the evidence of values that its parameters have not reached.
+    """Return a hypothesis whose evidence is that at its own parameters, before a step.
 
-    The solution is that of the linear model after a step (E,); its evidence is not that of the
-    hypothesis where the step is long.
+    The solution of the linear model is the result of a step of the parameters, and so is its
+    evidence. Before the step the log density is lower by half the squared step over the posterior
+    covariance. Entries below `SETTLED` are taken as zero.
+
+    Parameters
+    ----------
+    hypothesis : ForceHypothesis
+        The hypothesis.
+    step : (E,) array
+        The step from its effect parameters to the solution.
     """
     unreached = np.where(np.abs(step) > SETTLED, step, 0.0)
     if not unreached.any():
@@ -417,7 +469,16 @@ def _without_unreached_evidence(hypothesis: ForceHypothesis, step: FloatArray) -
 
 
 def _is_last_step(step: FloatArray, last_step: FloatArray) -> bool:
-    """Return whether no step need follow; small steps that hardly become smaller have far to go."""
+    """Return whether the iteration may end after a step.
+
+    The limit is ten times lower for steps that hardly become smaller: slow convergence has far to
+    go.
+
+    Parameters
+    ----------
+    step, last_step : (E,) array
+        The present step of the effect parameters, and the one before.
+    """
     size = float(np.abs(step).max(initial=0.0))
     last_size = float(np.abs(last_step).max(initial=0.0))
     becomes_smaller = size < 0.5 * last_size

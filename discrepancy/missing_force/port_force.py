@@ -1,4 +1,4 @@
-"""The missing force that a verdict is about: at which port it is, how large, and what orders it."""
+"""The missing force that a verdict reports: its port, its size, and the variables that order it."""
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -19,22 +19,25 @@ from .naming import ForceSearch
 from .shares import ForceShares
 
 UNSEEN_ERRORS = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
-"""Errors by which a missing force cannot be seen; what it would show is left out then."""
+"""Errors that mean that a missing force cannot be estimated. The verdict is then given without
+it."""
 BINS = 24
-"""Largest number of bins of a variable that may order a force."""
+"""Largest number of bins of a variable in the test of whether it orders a force."""
 LEAST_IN_BIN = 4
 """Least number of samples in a bin."""
 LEAST_ORDER = 0.3
-"""Least share of the force's variance that a variable must explain to order it."""
+"""Least share of a force's variance that a variable explains if it orders the force."""
 ALIKE = 0.05
-"""Difference of such shares up to which two variables order a force alike."""
+"""Difference of these shares up to which two variables order a force equally well."""
 
 
 # ---------------------------------------------------------------- what orders a force
 
 
 def explained_variance(variable: FloatArray, force: FloatArray) -> float:
-    """Return the share of a force's variance that its mean at like values of a variable explains.
+    """Return the share of a force's variance that is explained by its mean in bins of a variable.
+
+    It is near one if the force is a function of the variable, and near zero if it is independent.
 
     Parameters
     ----------
@@ -42,12 +45,16 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
         The variable and the force at the same times.
     """
     count = len(force)
-    bins = min(BINS, count // LEAST_IN_BIN)
-    if bins < 2 or not np.ptp(variable) > 0.0:
+    bin_count = min(BINS, count // LEAST_IN_BIN)
+    if bin_count < 2 or not np.ptp(variable) > 0.0:
         return 0.0
-    order = np.argsort(variable, kind="stable")
-    sums = [float(np.sum((part - part.mean()) ** 2)) for part in np.array_split(force[order], bins)]
-    variance_within = sum(sums) / (count - bins)
+    ascending = np.argsort(variable, kind="stable")
+    squares_by_bin = [
+        float(np.sum((forces_in_bin - forces_in_bin.mean()) ** 2))
+        for forces_in_bin in np.array_split(force[ascending], bin_count)
+    ]
+    # each bin has its own mean, which takes one degree of freedom
+    variance_within = sum(squares_by_bin) / (count - bin_count)
     variance = max(float(np.var(force, ddof=1)), 1e-300)
     return max(1.0 - variance_within / variance, 0.0)
 
@@ -55,7 +62,7 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
 def ordering_variables(
     force: FloatArray, position: FloatArray, speed: FloatArray, time: FloatArray
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return which variables order a force.
+    """Return the variables that order a force: of which it is nearly a function.
 
     Parameters
     ----------
@@ -67,10 +74,11 @@ def ordering_variables(
     shares : dict of str to float
         The share of the force's variance that each variable explains.
     ordered_by : tuple of str
-        The variables that order it, as well as the best one does.
+        The variables whose share is at least `LEAST_ORDER`, and within `ALIKE` of the largest one.
     """
     scaled_position = position / max(float(np.std(position)), 1e-300)
     scaled_speed = speed / max(float(np.std(speed)), 1e-300)
+    # of a vibration; its force is compared by magnitude, since it changes its sign in a cycle
     amplitude = np.hypot(scaled_position, scaled_speed)
     shares = {
         "displacement": explained_variance(position, force),
@@ -78,19 +86,19 @@ def ordering_variables(
         "amplitude": explained_variance(amplitude, np.abs(force)),
         "time": explained_variance(time, force),
     }
-    least = max(LEAST_ORDER, max(shares.values()) - ALIKE)
-    return shares, tuple(name for name, share in shares.items() if share >= least)
+    least_share = max(LEAST_ORDER, max(shares.values()) - ALIKE)
+    return shares, tuple(name for name, share in shares.items() if share >= least_share)
 
 
 # ---------------------------------------------------------------- the missing force at a port
 
 GROUND = 3.0
-"""Evidence over no missing force at all from which on there is one [nat]."""
+"""Log evidence over no missing force from which on a force is missing [nat]."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForceCourse:
-    """The missing force in a trial, at its samples.
+    """The missing force in one trial, at its samples.
 
     Attributes
     ----------
@@ -99,11 +107,11 @@ class ForceCourse:
     time : (N,) array
         The stamps [s].
     position, speed : (N,) array
-        The motion of the port; at a port of a state the speed is the state.
+        The motion of the port [m or rad, and per s]; at a port of a state the speed is the state.
     force, deviation : (N,) array
-        The smoothed force, and its standard deviation.
+        The smoothed force, and its posterior standard deviation [N, N m or the port's flow].
     law : (N,) array or None
-        The force of the named effect along the same motion.
+        The force of the effect in the verdict along the same motion; None if it has no law here.
     """
 
     trial: str
@@ -116,13 +124,13 @@ class ForceCourse:
 
     @property
     def left(self) -> FloatArray:
-        """The missing force (N,) beside the law."""
+        """The part (N,) of the missing force that the law does not explain."""
         return self.force if self.law is None else self.force - self.law
 
 
 @dataclass(frozen=True, eq=False)
 class MissingForce:
-    """The missing force at a port.
+    """The missing force at a port, as a verdict reports it.
 
     Attributes
     ----------
@@ -131,7 +139,7 @@ class MissingForce:
     courses : sequence of ForceCourse
         The force in each fitted trial.
     law : str
-        The name of the effect at the port that is drawn through it; empty if there is none.
+        The name of the effect at the port whose force is drawn with it; empty if there is none.
     """
 
     at_port: ForceAtPort
@@ -140,24 +148,37 @@ class MissingForce:
 
 
 def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingForce | None:
-    """Return the missing force that a hypothesis is about; None where no force is missing at all.
+    """Return the missing force at one port, with the law that a hypothesis has there.
 
-    It is that at the port of its law, or else at the port with the most evidence. The law is drawn
-    through it if it acts at one port. The share that the law explains is not computed.
+    The port is that of the law of the hypothesis if it has laws at one port only, otherwise the
+    port with the most evidence. The share that the law explains is not computed here.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    hypothesis : ForceHypothesis
+        The hypothesis.
+
+    Returns
+    -------
+    MissingForce or None
+        The missing force; None if no force is missing at any port.
     """
     evidence_of_none = max(evidence_without_force(at_port) for at_port in search.at.values())
-    evidence = {}
+    evidence_by_port = {}
     for name, at_port in search.at.items():
-        evidence[name] = at_port.log_evidence - evidence_of_none
-    if max(evidence.values()) < GROUND:
+        evidence_by_port[name] = at_port.log_evidence - evidence_of_none
+    if max(evidence_by_port.values()) < GROUND:
         return None
     terms = hypothesis.candidate.terms
     law_ports = {term.place for term in terms if term.place in search.ports}
     if len(law_ports) == 1:
         (port,) = law_ports
     else:
-        port = max(evidence, key=lambda name: evidence[name])
+        port = max(evidence_by_port, key=lambda name: evidence_by_port[name])
     number = search.ports.index(port)
+    # a hypothesis without a missing force at this port: take the force at the port alone
     if number not in hypothesis.processes:
         hypothesis = search.at[port]
     law = " and ".join(
@@ -166,12 +187,22 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
     courses = _force_courses(hypothesis, number, has_law=bool(law))
     unit, *_ = search.problem.model.port_units(port)
     correlation_time = hypothesis.processes[number].time
-    force = _force_at_port(courses, port, unit, evidence, correlation_time, law)
+    force = _force_at_port(courses, port, unit, evidence_by_port, correlation_time, law)
     return MissingForce(force, courses, law)
 
 
 def _force_courses(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -> list[ForceCourse]:
-    """Return the missing force at a port, by its number, in each trial."""
+    """Return the missing force at a port in each trial.
+
+    Parameters
+    ----------
+    hypothesis : ForceHypothesis
+        The hypothesis.
+    port : int
+        The number of the port.
+    has_law : bool
+        Whether the hypothesis has a law at the port.
+    """
     courses = []
     for trial, motion in zip(hypothesis.view.trials, hypothesis.motions, strict=True):
         samples = slice(None, None, trial.parts)
@@ -200,7 +231,7 @@ def _force_at_port(
     correlation_time: float,
     law: str,
 ) -> ForceAtPort:
-    """Return what a verdict says of the missing force at a port.
+    """Return the record of the missing force at a port for the verdict.
 
     Parameters
     ----------
@@ -209,26 +240,26 @@ def _force_at_port(
     port, unit : str
         The name of the port, and the unit of its force.
     evidence : mapping of str to float
-        The evidence of a missing force over none, by port [nat].
+        The log evidence of a missing force over none, by the name of the port [nat].
     correlation_time : float
         The correlation time of the force [s].
     law : str
-        The name of the law that is drawn through it.
+        The name of the law at the port; empty if there is none.
     """
     force = np.concatenate([course.force for course in courses])
     position = np.concatenate([course.position for course in courses])
     speed = np.concatenate([course.speed for course in courses])
     time = np.concatenate([course.time for course in courses])
     shares, ordered_by = ordering_variables(force, position, speed, time)
-    # where the force is largest
+    # the trial and the sample with the largest force
     course = max(courses, key=lambda course: float(np.abs(course.force).max()))
-    k = int(np.abs(course.force).argmax())
+    sample_of_largest = int(np.abs(course.force).argmax())
     largest = ForceMoment(
         trial=course.trial,
-        time=float(course.time[k]),
-        force=float(course.force[k]),
-        displacement=float(course.position[k]),
-        speed=float(course.speed[k]),
+        time=float(course.time[sample_of_largest]),
+        force=float(course.force[sample_of_largest]),
+        displacement=float(course.position[sample_of_largest]),
+        speed=float(course.speed[sample_of_largest]),
     )
     return ForceAtPort(
         port=port,
@@ -251,7 +282,11 @@ def _rms(values: FloatArray) -> float:
 
 
 def evidence_without_force(hypothesis: ForceHypothesis) -> float:
-    """Return the log evidence of a hypothesis without any missing force [nat]."""
+    """Return the log evidence of a hypothesis if no force is missing [nat].
+
+    The sizes of its missing forces are multiplied by 1e-9, since a process of size zero is
+    singular.
+    """
     return hypothesis.view.solve(scaled(hypothesis.processes, 1e-9, 1.0)).evidence
 
 
@@ -261,7 +296,7 @@ def seen_force(
     hypotheses: Sequence[ForceHypothesis],
     fit: CandidateFit,
 ) -> MissingForce | None:
-    """Return the missing force beside the fit of a verdict, with the share that its law explains.
+    """Return the missing force for a verdict, with the share of it that its law explains.
 
     Parameters
     ----------
@@ -272,12 +307,13 @@ def seen_force(
     hypotheses : sequence of ForceHypothesis
         The hypotheses that were fitted to the missing force.
     fit : CandidateFit
-        The fit that stands for the verdict.
+        The fit of the verdict.
 
     Returns
     -------
     MissingForce or None
-        None where no force can be seen.
+        The missing force; None if no force can be estimated, or if none of the fit's effects acts
+        at a port.
     """
     terms = fit.candidate.terms
     try:
@@ -286,17 +322,23 @@ def seen_force(
         if not sees_forces(problem) or (terms and not has_law):
             return None
         search = search or ForceSearch(problem)
+        # the hypothesis with the effects of the fit, or one that is followed to them now
         hypothesis = next(
-            (known for known in hypotheses if known.candidate.key == fit.candidate.key), None
+            (
+                fitted_hypothesis
+                for fitted_hypothesis in hypotheses
+                if fitted_hypothesis.candidate.key == fit.candidate.key
+            ),
+            None,
         )
         if hypothesis is None and terms:
             hypothesis = search.followed(search.whole, fit.candidate, fit.point.effect)
-        missing = missing_force(search, search.whole if hypothesis is None else hypothesis)
+        force = missing_force(search, search.whole if hypothesis is None else hypothesis)
     except UNSEEN_ERRORS:
         return None
-    if missing is None or not missing.law or hypothesis is None:
-        return missing
-    at_port = missing.at_port
+    if force is None or not force.law or hypothesis is None:
+        return force
+    at_port = force.at_port
     laws = [(term.name_in_words, term.place) for term in terms if term.place in ports]
     if len({place for _, place in laws}) > 1:
         at_port = replace(at_port, law=" and ".join(f"{name} at {place}" for name, place in laws))
@@ -307,11 +349,11 @@ def seen_force(
             held_out = _force_left(shares.share_of(hypothesis, held_out=True))
         fitted = _force_left(shares.share_of(hypothesis, held_out=False))
         at_port = replace(at_port, fitted=fitted, held_out=held_out)
-    return replace(missing, at_port=at_port)
+    return replace(force, at_port=at_port)
 
 
 def _force_left(share: GapShare) -> ForceLeft:
-    """Return what a law leaves of the missing force, as the verdict has it."""
+    """Return the rms of the missing force without and with a law, for the verdict."""
     return ForceLeft(
         share.remaining_rms, share.total_rms, trials=share.trial_count, tested=share.tested
     )

@@ -11,47 +11,63 @@ from discrepancy.campaign.records import FloatArray
 from .filtered import Process
 
 Processes = Mapping[int, Process]
-"""Missing forces by the numbers of their ports."""
+"""Missing forces as processes, by the numbers of their ports."""
 
 SIZE_DEVIATION, TIME_DEVIATION = 3.0, 1.2
-"""Prior deviations of the logarithms of a process's size and correlation time."""
+"""Prior standard deviations of the logarithms of size and correlation time of a process."""
 PRIOR_DEVIATIONS = np.array((SIZE_DEVIATION, TIME_DEVIATION))
+"""Both of these deviations, as an array."""
 START_FACTORS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
-"""Logarithms of factors of sizes and times, at the best of which Newton's method begins: what
-remains beside a law is a part of what was missing."""
+"""Logarithms of the factors on size and time that make the grid around the given processes. Small
+sizes are in it because a law leaves only a part of the force that was missing without it."""
 FARTHEST = 5.0
-"""Prior deviations from the median within which processes are looked for."""
+"""Bound of the search, in prior standard deviations from the median."""
 DIFFERENCE = 0.02
-"""Difference of logarithms by which slopes are found."""
+"""Difference of the logarithms in numerical derivatives."""
 LONGEST_STEP, SHORTEST_STEP = 1.5, 1e-4
-"""Steps of Newton's method that are taken, as differences of logarithms."""
+"""Longest and shortest step of Newton's method that is taken, as a difference of logarithms."""
 MOST_STEPS = 20
-"""Steps of Newton's method, at most."""
+"""Largest number of steps of Newton's method."""
 
 
 def prior_log_density(median: Processes, processes: Processes) -> float:
-    """Return the logarithm of the prior density of processes [nat], up to a constant."""
-    ratios = np.log([_values_over(process, median[port]) for port, process in processes.items()])
-    return -0.5 * float(np.sum(np.square(ratios / PRIOR_DEVIATIONS)))
+    """Return the log prior density of missing forces [nat], up to a constant.
+
+    Size and time of a missing force are lognormal about their medians, and independent.
+
+    Parameters
+    ----------
+    median : mapping of int to Process
+        The prior medians, by the number of the port.
+    processes : mapping of int to Process
+        The missing forces.
+    """
+    log_ratios = np.log(
+        [_values_over(process, median[port]) for port, process in processes.items()]
+    )
+    return -0.5 * float(np.sum(np.square(log_ratios / PRIOR_DEVIATIONS)))
 
 
 def _values_over(process: Process, median: Process) -> tuple[float, float]:
-    """Return size and time of a process over those of another."""
+    """Return size and time of a process, each divided by that of the median."""
     return process.size / median.size, process.time / median.time
 
 
 @dataclass(frozen=True, eq=False)
 class ProcessSearch:
-    """The logarithms of sizes and times of P missing forces, and the evidence as their function.
+    """The search for the most probable sizes and correlation times of P missing forces.
+
+    It is Newton's method on their logarithms (P, 2), with numerical derivatives and within bounds.
 
     Attributes
     ----------
     log_evidence : callable
-        Takes processes by port; returns the logarithm of evidence times prior [nat].
+        The function that takes processes by port, and returns the log of evidence times prior
+        [nat].
     begin : mapping of int to Process
-        The processes to begin with; what is no size or time stays as it is in them.
+        The processes to begin with; only their sizes and times are changed.
     low, high : (P, 2) ndarray
-        Bounds of the logarithms.
+        The bounds of the logarithms of size and time.
     """
 
     log_evidence: Callable[[dict[int, Process]], float]
@@ -67,7 +83,20 @@ class ProcessSearch:
         begin: Processes,
         time_range: tuple[float, float],
     ) -> "ProcessSearch":
-        """Return the search within `FARTHEST` prior deviations, and times within a range [s]."""
+        """Return the search within `FARTHEST` prior deviations of the medians.
+
+        Parameters
+        ----------
+        log_evidence : callable
+            The function that takes processes by port, and returns the log of evidence times prior
+            [nat].
+        median : mapping of int to Process
+            The prior medians, by the number of the port.
+        begin : mapping of int to Process
+            The processes to begin with.
+        time_range : (float, float)
+            The shortest and the longest correlation time that the records can show [s].
+        """
         center = logarithms({port: median[port] for port in begin})
         low = center - FARTHEST * PRIOR_DEVIATIONS
         high = center + FARTHEST * PRIOR_DEVIATIONS
@@ -85,13 +114,21 @@ class ProcessSearch:
         }
 
     def value(self, logs: FloatArray) -> float:
-        """Return the logarithm of evidence times prior [nat]."""
+        """Return the log of evidence times prior [nat] at logarithms (P, 2) of sizes and times."""
         return self.log_evidence(self.processes(logs))
 
     def most_probable(
         self, *, from_grid: bool, most_steps: int
     ) -> tuple[dict[int, Process], float]:
-        """Return the most probable processes, and ln (evidence times prior) there [nat]."""
+        """Return the most probable processes, and the log of evidence times prior there [nat].
+
+        Parameters
+        ----------
+        from_grid : bool
+            Whether to begin at the best point of a grid around `begin`, not at `begin` itself.
+        most_steps : int
+            The largest number of steps of Newton's method.
+        """
         logs = np.clip(logarithms(self.begin), self.low, self.high)
         if from_grid:
             logs = self._best_of_grid(logs)
@@ -99,7 +136,7 @@ class ProcessSearch:
         return self.processes(logs), top
 
     def _best_of_grid(self, logs: FloatArray) -> FloatArray:
-        """Return the best of a grid of sizes and times, port after port."""
+        """Return the best logarithms (P, 2) of a grid, one port after the other."""
         for port in range(len(logs)):
             candidates = []
             for factors in START_FACTORS:
@@ -110,62 +147,105 @@ class ProcessSearch:
         return logs
 
     def _climbed(self, logs: FloatArray, most_steps: int) -> tuple[FloatArray, float]:
-        """Return the top that Newton's method reaches, and the value there.
+        """Return the maximum that Newton's method reaches, as logarithms (P, 2), and its value.
 
-        Where a search ends before the top a rounding decides; the top does not depend on it.
+        If the number of steps ended the search before the maximum, its result would depend on
+        rounding; the maximum itself does not.
         """
         top = self.value(logs)
-        units = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
+        offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
         curvature = np.empty((logs.size, logs.size))
-        last_move = np.inf
+        last_change = np.inf
         for _ in range(most_steps):
-            ahead = np.array([self.value(logs + unit) for unit in units])
-            back = np.array([self.value(logs - unit) for unit in units])
-            if last_move > DIFFERENCE:  # near the top the last curvature is as good
-                curvature = self._curvature(logs, top, ahead, back)
-            if not np.isfinite((*curvature.flat, *ahead, *back)).all():
+            values_above = np.array([self.value(logs + offset) for offset in offsets])
+            values_below = np.array([self.value(logs - offset) for offset in offsets])
+            # near the maximum the last curvature is accurate enough
+            if last_change > DIFFERENCE:
+                curvature = self._curvature(logs, top, values_above, values_below)
+            if not np.isfinite((*curvature.flat, *values_above, *values_below)).all():
                 break
-            step = self._newton_step(logs, 0.5 * DIFFERENCE * (ahead - back), curvature)
-            reached, value = self._uphill(logs, top, step)
-            if value < top:
+            # slope and curvature are both multiplied by DIFFERENCE ** 2, which cancels in the step
+            step = self._newton_step(
+                logs, 0.5 * DIFFERENCE * (values_above - values_below), curvature
+            )
+            next_logs, next_value = self._uphill(logs, top, step)
+            if next_value < top:
                 break
-            last_move = np.abs(reached - logs).max()
-            logs, top = reached, value
+            last_change = np.abs(next_logs - logs).max()
+            logs, top = next_logs, next_value
         return logs, top
 
     def _curvature(
         self, logs: FloatArray, top: float, ahead: FloatArray, back: FloatArray
     ) -> FloatArray:
-        """Return second differences (2 P, 2 P), given the values a unit ahead and back."""
-        units = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
+        """Return the second differences (2 P, 2 P) of the value, by all pairs of logarithms.
+
+        Parameters
+        ----------
+        logs : (P, 2) array
+            The logarithms.
+        top : float
+            The value there [nat].
+        ahead, back : (2 P,) array
+            The values with one logarithm `DIFFERENCE` larger, or smaller.
+        """
+        offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
+        # central differences on the diagonal, forward ones of both logarithms off it
         curvature = np.diag(ahead + back - 2.0 * top)
         for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-            ahead_of_both = self.value(logs + units[i] + units[k])
-            curvature[i, k] = ahead_of_both - ahead[i] - ahead[k] + top
+            value_with_both_larger = self.value(logs + offsets[i] + offsets[k])
+            curvature[i, k] = value_with_both_larger - ahead[i] - ahead[k] + top
             curvature[k, i] = curvature[i, k]
         return curvature
 
     def _newton_step(
         self, logs: FloatArray, slope: FloatArray, curvature: FloatArray
     ) -> FloatArray:
-        """Return Newton's step (P, 2) within the bounds, uphill also where values are convex."""
+        """Return a step (P, 2) of Newton's method towards the maximum, within the bounds.
+
+        Parameters
+        ----------
+        logs : (P, 2) array
+            The logarithms.
+        slope : (2 P,) array
+            The gradient of the value, multiplied by `DIFFERENCE` squared.
+        curvature : (2 P, 2 P) array
+            The second derivatives of the value, multiplied by the same.
+        """
         may_rise = np.ravel(logs < self.high)
         may_fall = np.ravel(logs > self.low)
-        free = np.flatnonzero(np.where(slope > 0.0, may_rise, may_fall))
-        values, axes = np.linalg.eigh(curvature[np.ix_(free, free)])
+        # a logarithm at its bound stays there if the value rises beyond the bound
+        free_axes = np.flatnonzero(np.where(slope > 0.0, may_rise, may_fall))
+        eigenvalues, eigenvectors = np.linalg.eigh(curvature[np.ix_(free_axes, free_axes)])
+        # magnitudes of the eigenvalues: the step leads uphill where the value is convex, too
         step = np.zeros(logs.size)
-        step[free] = axes @ (axes.T @ slope[free] / np.maximum(np.abs(values), 1e-300))
-        too_long = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
-        return np.asarray(step.reshape(logs.shape) / too_long)
+        step[free_axes] = eigenvectors @ (
+            eigenvectors.T @ slope[free_axes] / np.maximum(np.abs(eigenvalues), 1e-300)
+        )
+        shortening = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
+        return np.asarray(step.reshape(logs.shape) / shortening)
 
     def _uphill(self, logs: FloatArray, top: float, step: FloatArray) -> tuple[FloatArray, float]:
-        """Return where a step leads and the value there; it is halved until it leads uphill."""
-        reached, value = logs, -np.inf
-        while value < top and np.abs(step).max() > SHORTEST_STEP:
-            reached = np.clip(logs + step, self.low, self.high)
-            value = self.value(reached)
+        """Return logarithms (P, 2) of a larger value along a step, and the value (backtracking).
+
+        The step is halved until the value is not below the present one. If the step becomes too
+        short first, the value returned is below it.
+
+        Parameters
+        ----------
+        logs : (P, 2) array
+            The logarithms.
+        top : float
+            The value there [nat].
+        step : (P, 2) array
+            The step.
+        """
+        next_logs, next_value = logs, -np.inf
+        while next_value < top and np.abs(step).max() > SHORTEST_STEP:
+            next_logs = np.clip(logs + step, self.low, self.high)
+            next_value = self.value(next_logs)
             step = 0.5 * step
-        return reached, value
+        return next_logs, next_value
 
 
 def logarithms(processes: Processes) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The share of the missing force that a law explains, in fitted or in held-out trials."""
+"""The share of the missing force that a hypothesis explains, in fitted or in held-out trials."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -18,24 +18,25 @@ from .trial import SeenTrial
 from .view import TrialMotion, View
 
 WINDOWS = 12
-"""Largest number of blocks into which a trial is cut."""
+"""Largest number of blocks into which a trial is divided."""
 SHORTEST = 8
 """Least number of samples of a block."""
 WITHIN = 2.0
-"""Prior deviations within which parameters stay where the missing force without any effect is
-estimated."""
+"""Bound of the shared unknowns, in prior standard deviations, when the missing force is estimated
+without any effect."""
 TESTED = 0.1
-"""Share of the missing force from which on the force of a law is large enough to be tested."""
+"""Ratio of the mean square force of a law to that of the missing force from which on the trials
+test the law."""
 ROUNDS = 3
-"""Times that the motion of a held-out trial is smoothed along the law that acts along it."""
+"""Number of times that a held-out trial is smoothed again with the law along its motion."""
 
 
 PortForces = Mapping[int, FloatArray]
-"""Forces (F,) at ports of a trial, by the number of the port."""
+"""Forces (F,) at the ports of a trial, by the number of the port."""
 
 
 class _BlockSums(NamedTuple):
-    """Sums of squares over a block of a trial: without a law, beside it, and of noise alone."""
+    """Sums of squares over a block of a trial: without a law, with the law, and of noise alone."""
 
     before: float
     after: float
@@ -43,12 +44,12 @@ class _BlockSums(NamedTuple):
 
 
 class ForceShares:
-    """Shares of the missing force that hypotheses explain.
+    """The shares of the missing force that hypotheses explain.
 
     Parameters
     ----------
     search : ForceSearch
-        The search for the missing force whose hypotheses they are.
+        The search for the missing force that made the hypotheses.
     """
 
     def __init__(self, search: ForceSearch) -> None:
@@ -67,21 +68,23 @@ class ForceShares:
 
     @property
     def has_held_out(self) -> bool:
-        """Whether there are trials in motion that were held out."""
+        """Whether some of the trials in motion are held out."""
         return self._held_out is not None
 
     def share_of(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
         """Return the share of the missing force that a hypothesis explains.
 
-        It is the larger one of the share of the forces and that of what they do to predictions:
-        fast forces hardly move a free mass, and slow ones are small beside them.
+        Two shares are computed: that of the forces, and that of the changes of the readings by
+        these forces. The one with the larger lower end of its interval is returned, as each may
+        miss a part: fast forces hardly move a free mass, and slow forces are small compared with
+        fast ones.
 
         Parameters
         ----------
         hypothesis : ForceHypothesis
             The hypothesis.
         held_out : bool
-            Whether the share is of the trials held out, or of those fitted.
+            Whether the share is that of held-out trials, not of the fitted ones.
         """
         view, motions = self.motions(hypothesis, held_out=held_out)
         _, motions_without = self._motions_without_effect(held_out)
@@ -90,11 +93,12 @@ class ForceShares:
         remaining_rms = _largest_rms([motion.left for motion in motions], ports)
         total_rms = _largest_rms([motion.forces for motion in motions_without], ports)
         law_rms = _largest_rms([motion.laws for motion in motions], ports)
+        # in trials where the force of the law is small, its share says nothing about it
         tested = not law_ports or law_rms**2 > TESTED * total_rms**2
         of_forces, of_predictions = self._block_sums(hypothesis, view, motions, motions_without)
         shares = []
-        for blocks, kind in ((of_forces, OF_FORCE), (of_predictions, OF_PREDICTIONS)):
-            before, after, noise = np.array(blocks).T
+        for block_sums, kind in ((of_forces, OF_FORCE), (of_predictions, OF_PREDICTIONS)):
+            before, after, noise = np.array(block_sums).T
             share = GapShare(
                 before=before,
                 after=after,
@@ -122,9 +126,9 @@ class ForceShares:
         motions: Sequence[TrialMotion],
         motions_without: Sequence[TrialMotion],
     ) -> tuple[list[_BlockSums], list[_BlockSums]]:
-        """Return the sums of squares of forces, and of what they do to predictions, by block.
+        """Return the sums of squares of forces and of the changes of readings, by block.
 
-        Forces at different ports are weighted by how much they move the state and the readings.
+        Forces at different ports are weighted by how strongly they act on state and readings.
 
         Parameters
         ----------
@@ -133,43 +137,59 @@ class ForceShares:
         view : View
             The trials.
         motions, motions_without : sequence of TrialMotion
-            The motion of each trial beside the hypothesis, and without any effect.
+            The motion of each trial with the hypothesis, and without any effect.
+
+        Returns
+        -------
+        of_forces, of_predictions : list of _BlockSums
+            The sums of each block of all trials: of weighted forces, and of changes of readings
+            divided by their noise.
         """
         system = view.trials[0].system
         weights = {}
         for port in motions[0].left:
-            by_state = np.linalg.norm(system.actions[port])
-            by_readings = np.linalg.norm(system.through[port])
-            weights[port] = float(np.hypot(by_state, by_readings))
+            strength_on_state = np.linalg.norm(system.actions[port])
+            strength_on_readings = np.linalg.norm(system.through[port])
+            weights[port] = float(np.hypot(strength_on_state, strength_on_readings))
         of_forces = []
         of_predictions = []
         filters = view.filtered({**hypothesis.processes, **self.search.whole.processes})
-        for trial, motion, without, force_filter in zip(
+        for trial, motion, motion_without, force_filter in zip(
             view.trials, motions, motions_without, filters, strict=True
         ):
-            # the forces that noise alone would show
+            # the missing forces that are estimated from noise alone
             smoothed = force_filter.smoothed(_simulated_noise(trial))
             noise_forces = {}
             for (port, _), force in zip(force_filter.processes, smoothed.forces, strict=True):
                 noise_forces[port] = force
-            kinds: tuple[PortForces, ...] = (without.forces, motion.left, noise_forces)
+            # in the order of `_BlockSums`: without a law, with the law, and of noise alone
+            forces_of_kinds: tuple[PortForces, ...] = (
+                motion_without.forces,
+                motion.left,
+                noise_forces,
+            )
             for begin, end in _blocks(len(trial.time)):
                 samples = slice(begin * trial.parts, end * trial.parts, trial.parts)
-                force_sums = [_weighted_squares(forces, weights, samples) for forces in kinds]
+                force_sums = [
+                    _weighted_squares(forces, weights, samples) for forces in forces_of_kinds
+                ]
                 of_forces.append(_BlockSums(*force_sums))
                 prediction_sums = [
-                    float(np.sum(trial.ahead(forces, begin, end) ** 2)) for forces in kinds
+                    float(np.sum(trial.ahead(forces, begin, end) ** 2))
+                    for forces in forces_of_kinds
                 ]
                 of_predictions.append(_BlockSums(*prediction_sums))
         return of_forces, of_predictions
 
     def _motions_without_effect(self, held_out: bool) -> tuple[View, list[TrialMotion]]:
-        """Return motion and missing force without any effect.
+        """Return the view of the trials, and motion and missing force of each without any effect.
 
-        Parameters are kept within twice their priors, since they would take up a part of the force.
+        Shared unknowns are kept within `WITHIN` prior deviations, as they would otherwise explain a
+        part of the missing force.
         """
         if held_out not in self._without_effect:
             whole = self.search.whole
+            # an unknown without a prior has no bound
             bound = np.where(whole.view.shared_precision > 0.0, WITHIN, np.inf)
             mean = np.clip(whole.solution.mean, -bound, bound)
             bounded = replace(whole, solution=replace(whole.solution, mean=mean))
@@ -179,48 +199,65 @@ class ForceShares:
     def motions(
         self, hypothesis: ForceHypothesis, *, held_out: bool
     ) -> tuple[View, list[TrialMotion]]:
-        """Return motion and missing force of each trial beside a hypothesis, and their view.
+        """Return the view of the trials, and motion and remaining force of each with a hypothesis.
 
-        The force beside the hypothesis has the size that is missing without any effect, so that it
-        takes up all that it can.
+        The remaining force has the size of the force that is missing without any effect, so that it
+        can take up all that the hypothesis does not explain.
+
+        Parameters
+        ----------
+        hypothesis : ForceHypothesis
+            The hypothesis.
+        held_out : bool
+            Whether the trials are the held-out ones, not those fitted.
         """
         processes = {**hypothesis.processes, **self.search.whole.processes}
         if not held_out:
             _, _, motions = hypothesis.view.smoothed(processes, hypothesis.solution)
             return hypothesis.view, motions
         assert self._held_out is not None
-        columns, view = self._held_out
+        builder, view = self._held_out
         solution = replace(hypothesis.solution, mean=hypothesis.shared)
         _, _, motions = view.smoothed(processes, solution)
         for _ in range(ROUNDS):
-            known = None
+            effects_column = None
             if len(hypothesis.effect):
-                known = columns.of(view, motions, hypothesis.candidate, hypothesis.effect)
-            view = columns.along(view, motions, known)
+                effects_column = builder.of(view, motions, hypothesis.candidate, hypothesis.effect)
+            view = builder.along(view, motions, effects_column)
             _, _, motions = view.smoothed(processes, solution)
         return view, motions
 
 
 def _blocks(sample_count: int) -> Iterable[tuple[int, int]]:
-    """Return begin and end of each block of a trial."""
+    """Return start and end of each block of a trial, as indices of samples."""
     count = min(WINDOWS, max(1, sample_count // SHORTEST))
     edges = np.linspace(0, sample_count, count + 1).astype(int)
     return pairwise(edges.tolist())
 
 
 def _weighted_squares(forces: PortForces, weights: Mapping[int, float], samples: slice) -> float:
-    """Return the sum of squares of forces over samples, each weighted by its port."""
+    """Return the sum of squares of forces over samples, each multiplied by the weight of its port.
+
+    Parameters
+    ----------
+    forces : mapping of int to (F,) array
+        The forces at the fine stamps, by the number of the port.
+    weights : mapping of int to float
+        The weight of each port.
+    samples : slice
+        The fine stamps of the samples.
+    """
     sums = [np.sum((weights[port] * force[samples]) ** 2) for port, force in forces.items()]
     return float(sum(sums))
 
 
 def _largest_rms(forces_by_trial: Sequence[PortForces], ports: Iterable[int]) -> float:
-    """Return the largest rms of the forces at some ports, over all trials."""
-    sizes = []
+    """Return the largest rms among some ports, of the forces of all trials together."""
+    rms_of_ports = []
     for port in ports:
         forces = [trial_forces[port] for trial_forces in forces_by_trial if port in trial_forces]
-        sizes.append(_rms(np.concatenate(forces)) if forces else 0.0)
-    return max(sizes)
+        rms_of_ports.append(_rms(np.concatenate(forces)) if forces else 0.0)
+    return max(rms_of_ports)
 
 
 def _rms(values: FloatArray) -> float:
@@ -229,15 +266,20 @@ def _rms(values: FloatArray) -> float:
 
 
 def _simulated_noise(trial: SeenTrial) -> FloatArray:
-    """Return simulated noise (N, C) over its deviation, with the colour of the trial's noise."""
+    """Return simulated noise (N, C) of a trial with its correlation, divided by its deviation.
+
+    The seed is fixed, so that results can be repeated.
+    """
     generator = np.random.default_rng(SEED)
     noise = generator.standard_normal(trial.residual.shape)
     for channel, coloured_share, rate in trial.coloured:
         # an autoregression of first order at the trial's stamps
-        remaining = np.exp(-rate * np.diff(trial.time, prepend=-np.inf))
-        slow = np.zeros(len(noise))
+        decay = np.exp(-rate * np.diff(trial.time, prepend=-np.inf))
+        correlated_noise = np.zeros(len(noise))
         for k, innovation in enumerate(generator.standard_normal(len(noise))):
-            slow[k] = remaining[k] * slow[k - 1] + np.sqrt(1.0 - remaining[k] ** 2) * innovation
-        white = np.sqrt(1.0 - coloured_share) * noise[:, channel]
-        noise[:, channel] = white + np.sqrt(coloured_share) * slow
+            correlated_noise[k] = (
+                decay[k] * correlated_noise[k - 1] + np.sqrt(1.0 - decay[k] ** 2) * innovation
+            )
+        white_noise = np.sqrt(1.0 - coloured_share) * noise[:, channel]
+        noise[:, channel] = white_noise + np.sqrt(coloured_share) * correlated_noise
     return np.asarray(noise * trial.used)

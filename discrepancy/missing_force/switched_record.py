@@ -1,7 +1,9 @@
-"""A record in which a force is on or off: the evidence of every stretch in which it is.
+"""A trial in which a force is on or off: the evidence of all stretches in which it may be on.
 
-What the readings before a moment tell and what those after it do are joined, so that the evidence
-of a stretch with any begin and any end costs no pass of the filter of its own.
+A path (N,) says for each sample whether the force of events is on; a stretch is a range of samples
+in which it stays on, or off. The filter of the readings before a moment and the backward filter of
+those after it are joined, so that the evidence of a stretch with any start and any end needs no
+further pass over the record.
 """
 
 from collections.abc import Sequence
@@ -17,29 +19,29 @@ from .kalman import FilterSteps, discretised, joined
 from .view import View
 
 CHANGE_PRICE = 4.0
-"""ln odds against a change, beside the choice of its place."""
+"""Log odds against a change of a path, besides the prior of its place [nat]."""
 STARTS = 40
-"""Places between which a stretch is looked for first."""
+"""Largest number of places in a grid between which a stretch is looked for."""
 MOST_STEPS = 400_000
-"""Steps of the filter for one such look, of a long record."""
+"""Largest number of steps of the filter for one such grid; a long record has fewer places."""
 PLACES = 80
-"""Places of a change that are weighed at once."""
+"""Number of places of a change that are compared at once."""
 RANGE = 12.0
-"""Evidence below the largest [nat] at which a place is out of the question."""
+"""Log evidence below the largest [nat] from which on a place is taken as impossible."""
 
 Forces = tuple[Process, Process]
-"""The force of events, and what may be missing throughout."""
+"""The force of events, and the force that may be missing throughout."""
 
 
 class Products(NamedTuple):
-    """What a trial tells of the shared unknowns.
+    """The information of a trial on the K shared unknowns, as the products of its whitened columns.
 
     Attributes
     ----------
     products : (..., 1 + K, 1 + K) ndarray
-        Products of the whitened residual (first) and the columns of the unknowns.
+        The inner products of the whitened residual (first) and the columns of the unknowns.
     half_log_determinants : (...) ndarray
-        Half the logarithm of the determinant of the readings' covariance.
+        Half the log determinant of the covariance of the readings [nat].
     """
 
     products: FloatArray
@@ -52,18 +54,18 @@ class EventTrials:
     Parameters
     ----------
     view : View
-        Trials, unknowns, what is known to act.
+        The trials, and the columns of all unknowns and of the forces known to act.
     port : int
-        Number of the port.
+        The number of the port.
     every : int
-        The step between readings that are looked at; 1 for all.
+        The step between samples that are used; 1 uses all.
 
     Attributes
     ----------
     trials : list of SeenTrial
-        Stamps of what is looked at, and which readings count.
-    columns : list of (K, N, C) ndarray
-        Residuals and columns of all unknowns, by trial.
+        The trials with the samples that are used.
+    columns : list of (1 + K + L, N, C) ndarray
+        The residual and the columns of all unknowns, by trial.
     """
 
     def __init__(self, view: View, port: int, *, every: int = 1) -> None:
@@ -76,7 +78,7 @@ class EventTrials:
         self.columns = [rows[:, ::every] for rows in view.rows]
 
     def evidence(self, by_trial: Sequence[Products]) -> FloatArray:
-        """Return ln evidence (...) of what trials tell together."""
+        """Return the log evidence (...) of all trials [nat], given the products of each."""
         products = sum(trial.products for trial in by_trial)
         halves = sum(trial.half_log_determinants for trial in by_trial)
         products, halves = without(
@@ -86,20 +88,21 @@ class EventTrials:
 
 
 class SwitchedRecord:
-    """A trial in which the force of events is on or off.
+    """A trial in which the force of events is on or off, with its filters.
 
     Parameters
     ----------
     trials : EventTrials
         The trials in which events are looked for.
     number : int
-        Number of this one.
+        The index of this trial in them.
     forces : (Process, Process)
-        That of events, and what may be missing throughout.
+        The force of events, and the force that may be missing throughout.
     others : sequence of Products
-        The products of the other trials, which inform on the shared unknowns.
+        The products of the other trials, which also depend on the shared unknowns.
     parts : int
-        How many times smaller its steps are than those of the record.
+        The number of steps into which each interval between samples is divided, so that a change
+        can lie between samples.
     """
 
     def __init__(
@@ -121,7 +124,8 @@ class SwitchedRecord:
         used[::parts] = trial.used
         columns = np.zeros((*used.shape, len(trials.columns[number])))
         columns[::parts] = np.moveaxis(trials.columns[number] * filtered.white, 0, -1)
-        # the kind of each step is its length and one of four ways of the force
+        # a step is of one of 4 J kinds: its force is off, begins, ends or is on (see
+        # `switched_steps`), and it has one of J lengths
         self.length_of_sample = np.concatenate(
             (step_of_sample[:1], np.repeat(step_of_sample[1:], parts))
         )
@@ -132,28 +136,51 @@ class SwitchedRecord:
         self.begun = [self.steps.begin(off), self.steps.begin(on)]
 
     def step_kinds(self, on: BoolArray) -> IntArray:
-        """Return the kind of step (N,) that leads to each sample of a path."""
+        """Return the kind (N,) of the step that leads to each sample of a path (N,).
+
+        It is the index in the matrices of `switched_steps`.
+        """
         was_on = np.r_[False, on[:-1]]
         return np.asarray((2 * was_on + on) * self.length_count + self.length_of_sample)
 
     def products(self, on: BoolArray) -> Products:
-        """Return what the trial tells of the shared unknowns, of a path (N,)."""
+        """Return the information of the trial on the shared unknowns, given a path (N,)."""
         end = np.array([len(on)])
         begin = self.begun[int(on[0])]
-        *_, products, halves = self.steps.before(self.step_kinds(on), 0, begin, end)
-        return Products(*without(products[0], halves[0], self.local_precision))
+        *_, products, half_log_determinants = self.steps.before(self.step_kinds(on), 0, begin, end)
+        return Products(*without(products[0], half_log_determinants[0], self.local_precision))
 
     def evidence_by_ends(self, on: BoolArray, starts: IntArray, ends: IntArray) -> FloatArray:
-        """Return ln evidence (A, B) with the force switched from each start to each end."""
-        width = 1 + len(self.trials.view.shared_precision)
-        products = np.zeros((len(starts), len(ends), width, width))
-        halves = np.full((len(starts), len(ends)), np.inf)
+        """Return the log evidence of all trials if the force is switched in one more stretch.
+
+        Parameters
+        ----------
+        on : (N,) array of bool
+            The path: whether the force is on at each sample.
+        starts : (A,) array of int
+            The first samples of the stretches in which the path is inverted.
+        ends : (B,) array of int
+            The samples that follow the last ones of the stretches.
+
+        Returns
+        -------
+        (A, B) array
+            The log evidence of each start with each end [nat]; -inf if the end is not after the
+            start.
+        """
+        product_count = 1 + len(self.trials.view.shared_precision)
+        products = np.zeros((len(starts), len(ends), product_count, product_count))
+        # an infinite determinant is an evidence of -inf, which stays if an end is not after the
+        # start
+        half_log_determinants = np.full((len(starts), len(ends)), np.inf)
         kinds = self.step_kinds(on)
         states_at_starts = self.steps.before(kinds, 0, self.begun[int(on[0])], starts)
         after_ends = self.steps.after(kinds, ends)
         transitions, noises = self._steps_back(on, ends)
         for k, start in enumerate(starts.tolist()):
-            if start == 0:  # the record begins the other way
+            # a stretch from the first sample on: the force begins off instead of on, or on instead
+            # of off
+            if start == 0:
                 state = self.begun[int(not on[0])]
             else:
                 covariance, mean, known_products, known_half = states_at_starts
@@ -164,94 +191,156 @@ class SwitchedRecord:
             covariance, mean, *sums = self.steps.before(
                 self.step_kinds(switched), start, state, ends[is_later]
             )
-            # the step at the end of the stretch, behind which the path is as it was
+            # the step into the sample `end`, from which on the path is not inverted any more
             transition = transitions[is_later]
             covariance = transition @ covariance @ transition.mT + noises[is_later]
-            arrived = (covariance, transition @ mean, *sums)
-            whole = joined(arrived, [item[is_later] for item in after_ends])
-            products[k, is_later], halves[k, is_later] = without(*whole, self.local_precision)
-        return self.trials.evidence([Products(products, halves), *self.others])
+            state_at_ends = (covariance, transition @ mean, *sums)
+            products_of_trial = joined(state_at_ends, [array[is_later] for array in after_ends])
+            products[k, is_later], half_log_determinants[k, is_later] = without(
+                *products_of_trial, self.local_precision
+            )
+        return self.trials.evidence([Products(products, half_log_determinants), *self.others])
 
     def _steps_back(self, on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (B, n, n) of the steps at which a stretch ends.
+        """Return transitions and noises (B, n, n) of the steps by which inverted stretches end.
 
-        None at the last.
+        Parameters
+        ----------
+        on : (N,) array of bool
+            The path before a stretch is inverted.
+        ends : (B,) array of int
+            The samples that follow the last ones of the stretches. No step follows the end of the
+            record: its transition is the identity, without noise.
         """
+        # the kind of step as in `step_kinds`: the path is inverted before the end, not at it
         is_last = ends == len(on)
-        sample = np.where(is_last, 0, ends)
-        was_switched_on = ~on[ends - 1]
-        kind = (2 * was_switched_on + on[sample]) * self.length_count + self.length_of_sample[
-            sample
-        ]
-        nothing_moves = np.eye(len(self.steps.rows[0]))
-        transitions = np.where(is_last[:, None, None], nothing_moves, self.steps.moves[kind])
+        end_sample = np.where(is_last, 0, ends)
+        was_on = ~on[ends - 1]
+        kind = (2 * was_on + on[end_sample]) * self.length_count + self.length_of_sample[end_sample]
+        identity = np.eye(len(self.steps.rows[0]))
+        transitions = np.where(is_last[:, None, None], identity, self.steps.moves[kind])
         noises = np.where(is_last[:, None, None], 0.0, self.steps.noises[kind])
         return transitions, noises
 
     def with_best_stretch_switched(self, on: BoolArray) -> BoolArray | None:
-        """Return a path with the stretch turned on or off that gains most; None where none pays."""
-        count = len(on)
-        size = min(max(MOST_STEPS // count, 12), STARTS, count)
-        grid = np.unique(np.r_[np.linspace(0, count, size + 1).round(), changes(on)]).astype(
-            np.int64
-        )
-        # an end where the path changes already takes that change away; ends of the record are free
-        prices = change_price(count) * np.where(np.isin(grid, changes(on)), -1.0, 1.0)
+        """Return the path with that one stretch inverted which makes it most probable.
+
+        Inverting turns the force on where it was off, and off where it was on. The begin and the
+        end of the stretch are taken from a grid over the record.
+
+        Parameters
+        ----------
+        on : (N,) array of bool
+            The path: whether the force is on at each sample.
+
+        Returns
+        -------
+        (N,) array of bool or None
+            The new path; None if no stretch raises the evidence by more than its changes cost.
+        """
+        sample_count = len(on)
+        # each start needs one pass of the filter, of up to `sample_count` steps
+        interval_count = min(max(MOST_STEPS // sample_count, 12), STARTS, sample_count)
+        edges = np.unique(
+            np.r_[np.linspace(0, sample_count, interval_count + 1).round(), changes(on)]
+        ).astype(np.int64)
+        # The price of a path counts its changes. A stretch that begins or ends at an existing
+        # change removes it (-1); elsewhere it adds one (+1); at the ends of the record there is no
+        # change.
+        prices = change_price(sample_count) * np.where(np.isin(edges, changes(on)), -1.0, 1.0)
         prices[[0, -1]] = 0.0
-        gains = (
-            self.evidence_by_ends(on, grid[:-1], grid[1:]) - prices[:-1, None] - prices[None, 1:]
+        # score [k, m]: the stretch from edge k to edge m + 1; -inf if it is empty
+        scores = (
+            self.evidence_by_ends(on, edges[:-1], edges[1:]) - prices[:-1, None] - prices[None, 1:]
         )
-        start, end = np.unravel_index(np.argmax(gains), gains.shape)
-        if gains[start, end] <= self.trials.evidence([self.products(on), *self.others]):
+        first_edge, last_interval = np.unravel_index(np.argmax(scores), scores.shape)
+        if scores[first_edge, last_interval] <= self.trials.evidence(
+            [self.products(on), *self.others]
+        ):
             return None
         switched = on.copy()
-        switched[grid[start] : grid[end + 1]] ^= True
+        switched[edges[first_edge] : edges[last_interval + 1]] ^= True
         return switched
 
     def with_changes_placed(self, on: BoolArray) -> BoolArray:
-        """Return a path with its changes where they are most probable beside each other."""
+        """Return a path (N,) whose changes are moved to their most probable places.
+
+        They are moved one after the other. This is repeated, three times at most, since the best
+        place of one change depends on the others.
+        """
         for _ in range(3):
             previous = on.copy()
             for number, old in enumerate(changes(on)):
                 places, log_evidence = self.evidence_by_place(on, number)
                 new = places[np.argmax(log_evidence)]
                 on = on.copy()
+                # between old and new place: an earlier change extends the state after it, a later
+                # one extends the state before it
                 on[min(old, new) : max(old, new)] = on[old] if new < old else on[old - 1]
             if np.array_equal(on, previous):
                 break
         return on
 
     def evidence_by_place(self, on: BoolArray, number: int) -> tuple[IntArray, FloatArray]:
-        """Return places of a change, densest where it is probable, and ln evidence of each."""
-        before, change, after = np.r_[0, changes(on), len(on)][number : number + 3]
-        # from the change before on the path is as behind the change, which is put off to each place
-        at_once = on.copy()
-        at_once[before:after] = on[change]
+        """Return places of a change of a path, and the log evidence of each.
+
+        Places are refined from a coarse grid to all samples around the most probable ones.
+
+        Parameters
+        ----------
+        on : (N,) array of bool
+            The path: whether the force is on at each sample.
+        number : int
+            The index of the change among the changes of the path.
+
+        Returns
+        -------
+        places : (B,) array of int
+            Samples at which the change may lie, ascending.
+        log_evidence : (B,) array
+            The log evidence of all trials with the change there [nat].
+        """
+        previous_change, change, next_change = np.r_[0, changes(on), len(on)][number : number + 3]
+        # the path whose change is as early as the previous one; inverting it from there to a place
+        # delays the change to that place
+        earliest_path = on.copy()
+        earliest_path[previous_change:next_change] = on[change]
         places = np.zeros(0, dtype=np.int64)
         log_evidence = np.zeros(0)
-        first, last = before + 1, after - 1
+        first_place, last_place = previous_change + 1, next_change - 1
         while True:
-            grid = np.linspace(first, last, PLACES).round().astype(np.int64)
-            new = np.setdiff1d(grid, places)
-            if not len(new):
+            candidate_places = np.linspace(first_place, last_place, PLACES).round().astype(np.int64)
+            new_places = np.setdiff1d(candidate_places, places)
+            if not len(new_places):
                 return places, log_evidence
-            of_new = self.evidence_by_ends(at_once, np.array([before]), new)[0]
-            places = np.r_[places, new]
-            log_evidence = np.r_[log_evidence, of_new]
+            evidence_of_new = self.evidence_by_ends(
+                earliest_path, np.array([previous_change]), new_places
+            )[0]
+            places = np.r_[places, new_places]
+            log_evidence = np.r_[log_evidence, evidence_of_new]
             order = np.argsort(places)
             places, log_evidence = places[order], log_evidence[order]
             probable = np.flatnonzero(log_evidence >= log_evidence.max() - RANGE)
-            first = places[max(probable[0] - 1, 0)]
-            last = places[min(probable[-1] + 1, len(places) - 1)]
+            first_place = places[max(probable[0] - 1, 0)]
+            last_place = places[min(probable[-1] + 1, len(places) - 1)]
 
 
 def switched_steps(
     system: ForceStateSpace, event: int, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transitions and noises (4 J, n, n) of steps in which a force is switched.
+    """Return transitions and noises (4 J, n, n) of steps in which the force of events is switched.
 
-    First all lengths with the force off, then beginning at the end of the step, then ending there,
-    then on.
+    The first J have the force off; in the next J it begins at the end of the step; in the next J it
+    acts during the step and ends there; in the last J it is on.
+
+    Parameters
+    ----------
+    system : ForceStateSpace
+        The state space with the force on.
+    event : int
+        The index of the force of events in the state.
+    lengths : (J,) array
+        The lengths of the steps [s].
     """
     on_transition, on_noise = discretised(system.generator, system.intensity, lengths)
     off_transition, off_noise = discretised(
@@ -259,7 +348,8 @@ def switched_steps(
     )
     transitions = np.stack((off_transition, off_transition, on_transition, on_transition))
     noises = np.stack((off_noise, off_noise, on_noise, on_noise))
-    # behind all steps but those with the force on throughout it is another force than before
+    # After all steps but the last kind, the force does not continue the one before: it is zero, or
+    # (second kind) begins with its stationary variance of one.
     transitions[:3, :, event] = 0.0
     noises[:3, :, event] = 0.0
     noises[:3, :, :, event] = 0.0
@@ -269,8 +359,17 @@ def switched_steps(
 
 
 def begin_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray, FloatArray]:
-    """Return the start covariances (n, n) of the state with the event's force off, and on."""
+    """Return the covariances (n, n) of the state at the first sample with the force off, and on.
+
+    Parameters
+    ----------
+    system : ForceStateSpace
+        The state space with the force on.
+    event : int
+        The index of the force of events in the state.
+    """
     on = system.start_covariance
+    # a settled trial begins at rest under the force; without it that deflection is absent
     off = on.copy()
     off[:event, :event] -= np.outer(on[:event, event], on[:event, event])
     return without_state(off, event), on
@@ -285,18 +384,18 @@ def without_state(matrix: FloatArray, index: int) -> FloatArray:
 
 
 def changes(on: BoolArray) -> IntArray:
-    """Return the samples from which on a force acts that did not, or does not any more."""
+    """Return the samples at which a path (N,) changes: the first ones with the new value."""
     return np.flatnonzero(np.diff(on)) + 1
 
 
 def change_price(count: int) -> float:
-    """Return what a change costs in a record of `count` samples [nat].
+    """Return the price of a change in a record of `count` samples [nat].
 
-    Its place, and that it is there.
+    It is minus the log prior of a change: of its place among the samples, and that there is one.
     """
     return float(np.log(count)) + CHANGE_PRICE
 
 
 def price_of_changes(paths: Sequence[BoolArray]) -> float:
-    """Return what all changes of paths cost [nat]."""
+    """Return the price of all changes of paths [nat]."""
     return sum(len(changes(on)) * change_price(len(on)) for on in paths)

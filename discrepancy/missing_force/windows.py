@@ -1,8 +1,9 @@
-"""When there is a gap in the records: events of the missing force, or of what readings show.
+"""The windows in time in which there is a gap between the records and the model.
 
-Where a model says how its ports move, an event is a force at the port with the most evidence, or an
-error of one channel where that has more, beside all unknowns of the records. Elsewhere it acts on
-the pattern over the channels in which the residuals of a fit are largest.
+They are found as events: of the missing force at the port with the most evidence or, if that is
+more probable, of an error of one channel, with all unknowns of the records integrated out. If the
+model does not describe how its ports move, events are looked for in the residuals of a fit:
+in the course of their strongest pattern over the channels (the first singular vector).
 """
 
 from collections.abc import Sequence
@@ -29,32 +30,34 @@ from .trial import SeenTrial
 from .view import View
 
 IN_TIME = frozenset(TrialKind) - {TrialKind.STATIC}
-"""Kinds of trials that have a course in time."""
+"""Kinds of trials whose readings are a course in time."""
 SHOWS = 0.2
-"""Share of the largest channel's size from which on a channel shows a gap."""
+"""Share of the largest channel's rms from which on a channel is listed as showing the gap."""
 READING_SIZES = (3.0, 30.0, 300.0)
-"""Deviations of an error of a reading, over its noise, that are compared with the missing force."""
+"""Standard deviations of an error of a channel, over that of its noise, that are compared with the
+missing force."""
 READING_TIMES = (0.02, 0.3)
-"""Correlation times of such an error, over the length of the record."""
+"""Correlation times of such an error, over the duration of the longest record."""
 
 
 def gap_windows(
     problem: Problem, fit: CandidateFit, residuals: ResidualSet, *, seed: int = 0
 ) -> tuple[GapWindow, ...]:
-    """Return when the model as it is has a gap, in held-out records too.
+    """Return the windows in which the unchanged model has a gap, in held-out records too.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model.
     fit : CandidateFit
-        The fit of the verdict. Where its law at a port, acting throughout, has more evidence than
+        The fit of the verdict. If its law at a port, acting throughout, has more evidence than
         events, there are no windows.
     residuals : ResidualSet
-        The residuals of the model as it is. They alone are examined where forces cannot be seen,
-        and for a model with laws of its own, which are exact only where they are simulated.
+        The residuals of the unchanged model. They alone are examined if missing forces cannot be
+        estimated, or if the model has laws of its own, which are exact only in a simulation.
     seed : int
-        The seed of the draw that restores what the fit has absorbed.
+        The seed of the random draw in `ResidualSet.white`, which restores the part of the noise
+        that the fit has absorbed.
     """
     dynamic_trials = tuple(fitted.trial for fitted in residuals.trials if fitted.trial.is_dynamic)
     _, own_laws = problem.model.apart()
@@ -69,27 +72,49 @@ def gap_windows(
 
 
 def _force_windows(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
-    """Return when a force is missing at the port, or at the channel, with the most evidence."""
+    """Return the windows in which a force is missing at the port with the most evidence.
+
+    If an error of a channel is more probable, they are the windows of that error.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model, with the dynamic trials.
+    fit : CandidateFit
+        The fit of the verdict.
+    """
     search = ForceSearch(problem)
     port = max(search.at, key=lambda name: search.at[name].log_evidence)
     evidence_of_law = _evidence_of_law(search, port, fit)
     channels = [data.trial.channels for data in problem.trials]
-    number, hypothesis = _most_probable_place(
+    port_number, hypothesis = _most_probable_place(
         search.ports.index(port), search.rough(port), channels
     )
     if hypothesis.log_evidence < evidence_without_force(hypothesis) + GROUND:
         return ()
-    process = hypothesis.processes[number]
-    best = events(hypothesis.view, number, process, evidence_of_law)
-    shown = []
+    process = hypothesis.processes[port_number]
+    best_events = events(hypothesis.view, port_number, process, evidence_of_law)
+    readings_by_force = []
     for trial, motion in zip(hypothesis.view.trials, hypothesis.motions, strict=True):
-        force = motion.forces[number]
-        shown.append(trial.readings(trial.pushed(number, force), {number: force}))
-    return _windows_of_events(best, channels, shown, with_effect=False)
+        force = motion.forces[port_number]
+        readings_by_force.append(
+            trial.readings(trial.pushed(port_number, force), {port_number: force})
+        )
+    return _windows_of_events(best_events, channels, readings_by_force, with_effect=False)
 
 
 def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float:
-    """Return the evidence of the laws of a fit at a port [nat]; -inf if it has none there."""
+    """Return the log evidence of the laws of a fit at a port [nat]; -inf if it has none there.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    port : str
+        The name of the port.
+    fit : CandidateFit
+        The fit.
+    """
     laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
     if not laws:
         return -np.inf
@@ -105,38 +130,44 @@ def residual_windows(
     with_effect: bool = False,
     kinds: frozenset[TrialKind] = IN_TIME,
 ) -> tuple[GapWindow, ...]:
-    """Return when the residuals of a hypothesis are more than noise.
+    """Return the windows in which the residuals of a fit are more than noise.
 
-    A flight whose turns came without times has no windows.
+    A flight whose turns have no times has no windows.
 
     Parameters
     ----------
     residuals : ResidualSet
         The residuals.
     seed : int
-        The seed of the draw that restores what the fit has absorbed.
+        The seed of the random draw in `ResidualSet.white`, which restores the part of the noise
+        that the fit has absorbed.
     with_effect : bool
-        Whether the hypothesis is the best one, not the model as it is.
+        Whether the residuals are those of the best hypothesis, not of the unchanged model.
     kinds : frozenset of TrialKind
         The kinds of trials that are examined.
     """
     windows: tuple[GapWindow, ...] = ()
     white = residuals.white(np.random.default_rng((seed, 1)))
-    for fitted, series in zip(residuals.trials, white, strict=True):
+    for fitted, white_residuals in zip(residuals.trials, white, strict=True):
         trial = fitted.trial
-        has_course = fitted.used.any() and np.ptp(trial.time) > 0.0
-        if trial.kind not in kinds or not has_course:
+        extends_in_time = fitted.used.any() and np.ptp(trial.time) > 0.0
+        if trial.kind not in kinds or not extends_in_time:
             continue
-        hypothesis, pattern = pattern_of_residuals(trial.name, trial.time, series, fitted.used)
+        hypothesis, pattern = pattern_of_residuals(
+            trial.name, trial.time, white_residuals, fitted.used
+        )
         if hypothesis.log_evidence < evidence_without_force(hypothesis) + GROUND:
             continue
         process = hypothesis.processes[0]
         try:
-            best = events(hypothesis.view, 0, process)
-        except np.linalg.LinAlgError:  # residuals of millions of noises are there throughout
-            best = throughout(hypothesis.view, 0, process)
-        shown = hypothesis.motions[0].forces[0][:, None] * pattern
-        windows += _windows_of_events(best, [trial.channels], [shown], with_effect=with_effect)
+            best_events = events(hypothesis.view, 0, process)
+        # with residuals of millions of noise deviations matrices become singular: a gap throughout
+        except np.linalg.LinAlgError:
+            best_events = throughout(hypothesis.view, 0, process)
+        residuals_by_pattern = hypothesis.motions[0].forces[0][:, None] * pattern
+        windows += _windows_of_events(
+            best_events, [trial.channels], [residuals_by_pattern], with_effect=with_effect
+        )
     return windows
 
 
@@ -145,34 +176,34 @@ def sized_windows(
 ) -> tuple[GapWindow, ...]:
     """Return windows with the sizes and channels that the residuals show in them.
 
-    A window in which no reading counts is left out: nothing shows a gap there.
+    A window without a reading that counts is left out, as nothing shows a gap in it.
 
     Parameters
     ----------
     windows : sequence of GapWindow
-        The windows of the model as it is, and of what the hypothesis of the verdict leaves.
+        The windows of the unchanged model, and those of the hypothesis of the verdict.
     before, after : ResidualSet
-        The residuals without and with the hypothesis. Both are divided by the noise of the first,
-        so that a size with the effect can be compared with one without it.
+        The residuals without and with the hypothesis. Both are divided by the noise of `before`, so
+        that sizes with and without the hypothesis can be compared.
     """
     noise = {fitted.trial.name: fitted.noise_deviation for fitted in before.trials}
-    sized = []
+    windows_with_sizes = []
     for window in windows:
         residuals = after if window.with_effect else before
         (fitted,) = (fitted for fitted in residuals.trials if fitted.trial.name == window.trial)
         inside = _used_in_window(window, fitted)
         if not inside.any():
             continue
-        sizes = _rms_inside(inside, fitted, noise[window.trial])
-        largest = float(sizes.max())
-        shows = (sizes > 0.0) & (sizes >= SHOWS * largest)
-        channels = _selected(fitted.trial.channels, shows)
-        sized.append(replace(window, size=largest, channels=channels))
-    return tuple(sized)
+        rms_of_channels = _rms_inside(inside, fitted, noise[window.trial])
+        largest = float(rms_of_channels.max())
+        is_shown = (rms_of_channels > 0.0) & (rms_of_channels >= SHOWS * largest)
+        channels = _selected(fitted.trial.channels, is_shown)
+        windows_with_sizes.append(replace(window, size=largest, channels=channels))
+    return tuple(windows_with_sizes)
 
 
 def _used_in_window(window: GapWindow, fitted: FittedTrial) -> BoolArray:
-    """Return which readings (N, C) of a trial count and lie within a window."""
+    """Return which readings (N, C) of a trial count and lie in a window."""
     begin = window.first if window.begin is None else window.begin.value
     end = window.last if window.end is None else window.end.value
     time = fitted.trial.time
@@ -180,13 +211,23 @@ def _used_in_window(window: GapWindow, fitted: FittedTrial) -> BoolArray:
 
 
 def _rms_inside(inside: BoolArray, fitted: FittedTrial, noise: FloatArray) -> FloatArray:
-    """Return the rms residual (C,) of each channel over its noise (C,), of some readings (N, C)."""
+    """Return the rms residual (C,) of each channel divided by its noise, over selected readings.
+
+    Parameters
+    ----------
+    inside : (N, C) array of bool
+        The selected readings.
+    fitted : FittedTrial
+        The residuals of the trial.
+    noise : (C,) array
+        The standard deviation of the noise of each channel [unit of the channel].
+    """
     squares = np.where(inside, (fitted.residual / noise) ** 2, 0.0).sum(axis=0)
     return np.asarray(np.sqrt(squares / np.maximum(inside.sum(axis=0), 1)))
 
 
 def _selected(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...]:
-    """Return the channels that are selected by a mask (C,)."""
+    """Return the channels whose entry in a mask (C,) is true."""
     pairs = zip(channels, is_selected, strict=True)
     return tuple(channel for channel, selected in pairs if selected)
 
@@ -197,7 +238,7 @@ def _selected(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...
 def _most_probable_place(
     port: int, at_port: ForceHypothesis, channels: Sequence[tuple[str, ...]]
 ) -> tuple[int, ForceHypothesis]:
-    """Return the missing force at a port, or the error of a channel if that is more probable.
+    """Return the missing force at a port, or an error of a channel if that is more probable.
 
     Parameters
     ----------
@@ -213,33 +254,48 @@ def _most_probable_place(
     port : int
         The number of the port; 0 for a channel, which is the only port of its view.
     hypothesis : ForceHypothesis
-        The more probable hypothesis.
+        The more probable of both.
     """
     view = at_port.view
     trials = view.trials
-    length = max(float(np.ptp(trial.time)) for trial in trials)
+    longest_duration = max(float(np.ptp(trial.time)) for trial in trials)
     best_port = port
-    best = at_port
+    best_hypothesis = at_port
     for channel in dict.fromkeys(chain(*channels)):
         motions = [replace(motion, forces={}, left={}) for motion in view.motions]
-        on_reading = [
+        trials_with_error = [
             _with_reading_as_port(trial, names, channel)
             for trial, names in zip(trials, channels, strict=True)
         ]
-        channel_view = replace(view, trials=on_reading, motions=motions)
-        options = []
+        channel_view = replace(view, trials=trials_with_error, motions=motions)
+        processes_to_try = []
         for size, relative_time in product(READING_SIZES, READING_TIMES):
-            options.append({0: Process(size, relative_time * length, rough=True)})
-        evidences = [channel_view.solve(processes).evidence for processes in options]
-        number = max(range(len(options)), key=lambda k: evidences[k])
-        if evidences[number] > best.log_evidence:
+            processes_to_try.append(
+                {0: Process(size, relative_time * longest_duration, rough=True)}
+            )
+        evidences = [channel_view.solve(processes).evidence for processes in processes_to_try]
+        best_option = max(range(len(processes_to_try)), key=lambda k: evidences[k])
+        if evidences[best_option] > best_hypothesis.log_evidence:
             best_port = 0
-            best = with_most_probable_forces(channel_view, options[number], options[number])
-    return best_port, best
+            best_hypothesis = with_most_probable_forces(
+                channel_view, processes_to_try[best_option], processes_to_try[best_option]
+            )
+    return best_port, best_hypothesis
 
 
 def _with_reading_as_port(trial: SeenTrial, channels: Sequence[str], channel: str) -> SeenTrial:
-    """Return a trial whose only port is a reading; the unit of its force is the noise deviation."""
+    """Return a trial whose only port is a channel: a force there is an error of its readings.
+
+    Parameters
+    ----------
+    trial : SeenTrial
+        The trial.
+    channels : sequence of str
+        The channels of the trial.
+    channel : str
+        The channel with the error. A force of 1 changes its reading by one noise deviation.
+    """
+    # readings are C s - e f (see `PortedSystem`): the minus sign makes a positive force raise them
     through = -trial.deviation[None] * (np.array(channels) == channel)
     no_motion = np.zeros((len(trial.positions), 1))
     no_action = np.zeros((1, len(trial.system.generator)))
@@ -257,7 +313,7 @@ def _with_reading_as_port(trial: SeenTrial, channels: Sequence[str], channel: st
 def pattern_of_residuals(
     name: str, time: FloatArray, series: FloatArray, used: BoolArray
 ) -> tuple[ForceHypothesis, FloatArray]:
-    """Return residuals as a record of one reading: their largest pattern over the channels.
+    """Return the strongest pattern of residuals over channels, and its course as a force.
 
     Parameters
     ----------
@@ -266,21 +322,22 @@ def pattern_of_residuals(
     time : (N,) array
         The stamps [s].
     series : (N, C) array
-        The residuals, over their noise and white if they are noise.
+        The residuals, divided by their noise; white noise of variance one if there is no gap.
     used : (N, C) array of bool
         Whether a residual counts.
 
     Returns
     -------
     hypothesis : ForceHypothesis
-        The pattern over time, as a missing force at the reading.
+        The course of the pattern, as a missing force at the one channel of a record.
     pattern : (C,) array
-        The pattern over the channels.
+        The pattern over the channels, of norm one.
     """
     series = np.where(used, series, 0.0)
     _, _, patterns = np.linalg.svd(series, full_matrices=False)
     pattern = patterns[:1]
-    # the largest pattern of noise alone is larger than the noise
+    # the largest singular value of noise alone is about sqrt(N) + sqrt(C - 1): over sqrt(N) it is
+    # the standard deviation of the strongest pattern
     deviation = 1.0 + np.sqrt((series.shape[1] - 1) / len(time))
     no_state = np.zeros((1, 0))
     system = PortedSystem(
@@ -327,7 +384,7 @@ def _windows_of_events(
     *,
     with_effect: bool,
 ) -> tuple[GapWindow, ...]:
-    """Return the windows of events, with the channels that show them and their size there.
+    """Return the windows of events, with the channels that show them and their size in these.
 
     Parameters
     ----------
@@ -336,9 +393,9 @@ def _windows_of_events(
     channels : sequence of tuple of str
         The channels of each trial.
     shown : sequence of (N, C) array
-        What the readings of each trial show of the force, over their noise.
+        The part of the readings of each trial that the force makes, divided by the noise.
     with_effect : bool
-        Whether the gap is that of the best hypothesis, not of the model as it is.
+        Whether the gap is that of the best hypothesis, not of the unchanged model.
     """
     windows = []
     for number, (trial, path) in enumerate(zip(best.search.trials, best.paths, strict=True)):
@@ -350,20 +407,23 @@ def _windows_of_events(
         moments: list[Moment | None] = []
         if len(switches):
             moments = [Moment(*map(float, moment)) for moment in best.moments(number)]
-        edges = [0, *switches.tolist(), len(is_on)]
+        stretch_edges = [0, *switches.tolist(), len(is_on)]
+        # None: the stretch begins with the record, or ends with it
         bounds = [None, *moments, None]
-        for k in np.flatnonzero(is_on[edges[:-1]]).tolist():
-            stretch = slice(edges[k], edges[k + 1])
-            sizes = np.sqrt(np.mean(shown[number][stretch] ** 2, axis=0))
+        for k in np.flatnonzero(is_on[stretch_edges[:-1]]).tolist():
+            samples_of_stretch = slice(stretch_edges[k], stretch_edges[k + 1])
+            rms_of_channels = np.sqrt(np.mean(shown[number][samples_of_stretch] ** 2, axis=0))
             windows.append(
                 GapWindow(
                     trial=trial.name,
-                    channels=_selected(channels[number], sizes > SHOWS * sizes.max()),
+                    channels=_selected(
+                        channels[number], rms_of_channels > SHOWS * rms_of_channels.max()
+                    ),
                     begin=bounds[k],
                     end=bounds[k + 1],
                     first=float(trial.time[0]),
                     last=float(trial.time[-1]),
-                    size=float(sizes.max()),
+                    size=float(rms_of_channels.max()),
                     with_effect=with_effect,
                 )
             )
