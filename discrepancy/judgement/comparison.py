@@ -323,22 +323,32 @@ class Comparison(ABC, Generic[H]):
         return self.has_held_out and not self._survives_held_out(hypothesis, 0.0)
 
     def competitors(self, best: H) -> list[H]:
-        """Return other names that neither evidence nor trials separate from the best one."""
+        """Return the hypotheses that could be named instead of the best one.
+
+        The data do not separate them from it: their score is within `SEARCH.force_rival` of that of
+        the best one, and their share of the gap is not smaller beyond chance.
+
+        Parameters
+        ----------
+        best : H
+            The hypothesis that would be named.
+        """
         best_share = self.decisive_share(best)
-        least_score = self.score(best) - SEARCH.force_rival
-        others: dict[EffectsAtPlaces, H] = {}
+        least_competing_score = self.score(best) - SEARCH.force_rival
+        by_effects: dict[EffectsAtPlaces, H] = {}
         for hypothesis in self.contenders:
             candidate = hypothesis.candidate
             is_same_family = families_at_places(hypothesis) == families_at_places(best)
             is_longer = len(candidate.terms) > len(best.candidate.terms)
+            # the same law with a free shape is no other cause, and more effects are no simpler one
             if (candidate.is_family and is_same_family) or is_longer:
                 continue
-            if self.score(hypothesis) <= least_score:
+            if self.score(hypothesis) <= least_competing_score:
                 continue
             if not best_share.is_larger_than(self.decisive_share(hypothesis)):
-                others.setdefault(effects_at_places(hypothesis), hypothesis)
-        others.pop(effects_at_places(best), None)
-        return list(others.values())
+                by_effects.setdefault(effects_at_places(hypothesis), hypothesis)
+        by_effects.pop(effects_at_places(best), None)
+        return list(by_effects.values())
 
 
 def _is_small(share: GapShare, least_low_end: float) -> bool:
