@@ -52,7 +52,7 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     Parameters
     ----------
     residuals : ResidualSet
-        One or more trials beside their predictions.
+        One or more trials with their predictions.
     seed : int
         The seed of the random numbers that are added to residuals of a fit to make them white, see
         `ResidualSet.white`.
@@ -270,7 +270,7 @@ def check_held_out(after: ResidualSet) -> Gate:
     Parameters
     ----------
     after : ResidualSet
-        All trials beside their predictions by the hypothesis.
+        All trials with their predictions by the hypothesis.
 
     Returns
     -------
@@ -303,7 +303,7 @@ def _held_out_gate(passed: bool | None, excess: float, reason: str) -> Gate:
 
 
 def chi_square_text(trial_scores: Scores) -> str:
-    """Return χ² per sample in words, beside what a right model would have."""
+    """Return χ² per sample in words, with the value that is expected of a right model."""
     expected = f"{trial_scores.chi_square_expected:.3g} ± {trial_scores.chi_square_deviation:.2g}"
     return (
         f"{trial_scores.chi_square_per_sample:.3g}, where {expected} is expected of a right model"

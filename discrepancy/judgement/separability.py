@@ -162,7 +162,7 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
     return replace(start, local=tuple(local_unknowns))
 
 
-# ---------------------------------------------------------------- what can be seen and told apart
+# ---------------------------------------------------------------- detection and separation
 
 
 def separability(

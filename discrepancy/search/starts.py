@@ -237,7 +237,7 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
         levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
         for values in product(levels, repeat=parameter_count):
             start = start_beside(base, term, np.array(values))
-            with suppress(DiscrepancyError):  # more than the structure can carry
+            with suppress(DiscrepancyError):  # the effect is larger than the model allows
                 value = objective(problem, start.candidate, start.point)
                 valued_starts.append((value, start))
     valued_starts.sort(key=lambda valued_start: valued_start[0])

@@ -139,11 +139,11 @@ def _channel_process(
     )
     # the process without the noise: white noise adds to the variance of the residuals, but not to
     # their correlation, so the correlation of the process is larger by the ratio of the variances
-    variance_beside_noise = mean_square / noise_level - 1.0
-    if process.is_recorded_colour or variance_beside_noise <= 0.0:
+    process_variance = mean_square / noise_level - 1.0
+    if process.is_recorded_colour or process_variance <= 0.0:
         return process
-    process_over_residuals = (1.0 + variance_beside_noise) / variance_beside_noise
-    process.amplitude = np.sqrt(variance_beside_noise)
+    process_over_residuals = (1.0 + process_variance) / process_variance
+    process.amplitude = np.sqrt(process_variance)
     process.correlation_time = interval * noise_tests.times_fewer(
         autocorrelation, white_variance, process_over_residuals
     )
