@@ -1,8 +1,8 @@
-"""Fits of trials whose initial state is unknown, begun from the first readings.
+"""Fits of trials with an unknown initial state, which begin with a fit to the first readings.
 
-Started from rest, the motion of a long record is far from the readings: its phase slips, and a
-descent ends in a wrong optimum. Over a few readings a motion is nearly linear in its initial state.
-So the initial state is fitted to the first readings, then to twice as many, and so on to the whole
+The phase of a predicted motion drifts away from that of a long record, so that a fit that begins at
+rest ends in a wrong optimum. But the first few readings are nearly linear in the initial state. So
+the initial state is fitted to the first readings, then to twice as many, and so on up to the whole
 record.
 """
 
@@ -17,18 +17,18 @@ from discrepancy.fits.problem import Problem
 FIRST_SAMPLES = 8
 """Number of readings to which an initial state is fitted first."""
 STEPS = 12
-"""Largest number of steps of a fit to the first part of a record."""
+"""Largest number of steps of each fit to a part of a record."""
 MISFIT = 1.5
-"""χ² per sample from which on a fit is repeated from new initial states."""
+"""χ² per sample above which a fit is repeated with initial states from the first readings."""
 
 
 def refit_from_first_readings(
     problem: Problem, fit: CandidateFit, *, iterations: int = 60, local_only: bool = False
 ) -> CandidateFit:
-    """Return a fit that begins at the initial states of the first readings, if it is better.
+    """Return a fit again from initial states that are fitted to the first readings.
 
-    The given fit is returned where it explains the readings, where no trial has an unknown initial
-    state, and where the new fit is no better.
+    The given fit is returned if it explains the readings already, if no trial has an unknown
+    initial state, or if the new fit is not better.
 
     Parameters
     ----------
@@ -39,7 +39,8 @@ def refit_from_first_readings(
     iterations : int
         The largest number of steps.
     local_only : bool
-        Whether only the unknowns of the trials are fitted, and all others stay.
+        Whether only the trials' own unknowns are fitted, while shared unknowns and effects are
+        fixed.
     """
     is_fitted = fit.chi_square < MISFIT * float(problem.counts.sum())
     if is_fitted or not has_unknown_initial_state(problem):
@@ -58,7 +59,7 @@ def refit_from_first_readings(
 
 
 def has_unknown_initial_state(problem: Problem) -> bool:
-    """Return whether a trial in motion begins in a state with unknown entries."""
+    """Return whether the initial state of at least one trial in motion has unknown entries."""
     for data in problem.trials:
         rows, _ = data.unknowns.initial_shape
         if data.trial.is_dynamic and rows > 0:
@@ -67,22 +68,25 @@ def has_unknown_initial_state(problem: Problem) -> bool:
 
 
 def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Point:
-    """Return a point with the unknowns of the trials as fitted to their first readings.
+    """Return a point whose local unknowns are fitted to the first readings of the trials.
 
-    They are fitted with the model as it is and kept in `Problem.beginnings` by the name of the
-    trial, since the initial state of a trial is the same under all hypotheses.
+    They are fitted once, with the model without effect, and kept in `Problem.beginnings` by the
+    name of the trial, since the initial state of a trial is nearly the same under all hypotheses.
     """
     beginnings = problem.beginnings
     if any(data.trial.name not in beginnings for data in problem.trials):
         without_effect = replace(point, effect=np.zeros(0))
-        fitted = _fit_to_growing_records(problem, without_effect)
-        for data, unknowns in zip(problem.trials, fitted.local, strict=True):
+        fitted_point = _fit_to_growing_records(problem, without_effect)
+        for data, unknowns in zip(problem.trials, fitted_point.local, strict=True):
             beginnings[data.trial.name] = unknowns
     return replace(point, local=tuple(beginnings[data.trial.name] for data in problem.trials))
 
 
 def _fit_to_growing_records(problem: Problem, point: Point) -> Point:
-    """Return the point with the trials' unknowns fitted to growing parts of the records."""
+    """Return the point with the local unknowns fitted to first readings, twice as many each time.
+
+    The shared unknowns are fixed. If a fit fails, the point of the last one is returned.
+    """
     longest = max(len(data.trial.time) for data in problem.trials)
     samples = FIRST_SAMPLES
     while samples < 2 * longest:

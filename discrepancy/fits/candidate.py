@@ -1,4 +1,8 @@
-"""Hypotheses of the search: sets of effects, and the values that fits give to them."""
+"""Hypotheses of the search: sets of effects, the unknowns of their fits, and states of a fit.
+
+A *candidate* is a hypothesis about what the model lacks: a set of effects of the catalogue, each at
+a place of the structure or in a channel.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -19,8 +23,8 @@ CandidateKey = tuple[tuple[str, str], ...]
 class EffectTerm:
     """One effect of a candidate, at one of its places.
 
-    All values of its parameters are standard normal variables: the prior maps them to physical
-    values.
+    Its parameters are fitted as scaled variables, which are standard normal under the prior. The
+    prior maps them to physical values.
 
     Attributes
     ----------
@@ -29,8 +33,8 @@ class EffectTerm:
     place : str
         The place, one of `effect.places(setting)`.
     free_shape : bool
-        Whether the shape parameters are fitted (the family of the effect), or stay at their
-        canonical values (the effect itself).
+        Whether the shape parameters of the law are fitted; if not, they have their canonical
+        values. Effects that differ only by their shape are a family.
     """
 
     effect: Effect
@@ -39,7 +43,7 @@ class EffectTerm:
 
     @property
     def label(self) -> str:
-        """The identifier of the effect, with a mark where its shape is free."""
+        """The identifier of the effect, with the suffix `FREE_SHAPE` if its shape is free."""
         if self.free_shape:
             return self.effect.identifier + FREE_SHAPE
         return self.effect.identifier
@@ -68,11 +72,11 @@ class EffectTerm:
         return {parameter.name: parameter.prior.value(float(u)) for parameter, u in pairs}
 
     def patch(self, setting: Setting, normal: Sequence[float] | FloatArray) -> ModelPatch:
-        """Return the patch of the model at standard normal variables (one for each parameter)."""
+        """Return the change of the model by the effect, given its scaled parameters (E,)."""
         return self.effect.patch(setting, self.values(normal), self.place)
 
     def start(self) -> FloatArray:
-        """Return the standard normal variables of the prior medians and the canonical shapes."""
+        """Return the scaled parameters (E,): medians of the prior, and canonical shapes."""
         variables = []
         for parameter in self.parameters:
             if isinstance(parameter, ShapeParameter):
@@ -84,32 +88,32 @@ class EffectTerm:
     def rescaled(
         self, normal: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
     ) -> FloatArray:
-        """Return the standard normal variables at which the magnitudes are multiplied by a factor.
+        """Return the scaled parameters (E,) after all magnitudes are multiplied by a factor.
 
         Parameters
         ----------
         normal : (E,) array
-            The standard normal variables of the term's parameters.
+            The scaled parameters of the term.
         factor : float
             The factor on the physical value of each magnitude.
         lowest, highest : float
-            The limits of the returned variables of magnitudes.
+            The limits of the returned scaled magnitudes.
         """
         rescaled = normal.copy()
         for number, parameter in enumerate(self.parameters):
             if not parameter.magnitude:
                 continue
             prior = parameter.prior
-            value = factor * prior.value(float(normal[number]))
+            physical_value = factor * prior.value(float(normal[number]))
             if prior.shape == "log_normal":  # a log-normal magnitude cannot change its sign
-                value = max(value, prior.value(lowest))
-            rescaled[number] = np.clip(prior.normal(value), lowest, highest)
+                physical_value = max(physical_value, prior.value(lowest))
+            rescaled[number] = np.clip(prior.normal(physical_value), lowest, highest)
         return rescaled
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A hypothesis: a set of effects that act together. The empty set is the model as it is.
+    """A hypothesis: a set of effects that act together. The empty set is the unchanged model.
 
     Attributes
     ----------
@@ -126,7 +130,7 @@ class Candidate:
 
     @property
     def key(self) -> CandidateKey:
-        """The sorted pairs (label, place), which no other candidate has."""
+        """The sorted pairs (label, place) of the effects, which identify the candidate."""
         return tuple(sorted((term.label, term.place) for term in self.terms))
 
     @property
@@ -160,17 +164,24 @@ class Candidate:
         return effects[parameter].acts_on
 
     def split(self, normal: FloatArray) -> list[tuple[EffectTerm, FloatArray]]:
-        """Return each term with its share of the standard normal variables (E,)."""
+        """Return each term with its own part of the scaled effect parameters (E,)."""
         if not self.terms:
             return []
         ends = np.cumsum([len(term.parameters) for term in self.terms])
         return list(zip(self.terms, np.split(normal, ends[:-1]), strict=True))
 
     def stepped(self, normal: FloatArray, step: FloatArray) -> FloatArray:
-        """Return the standard normal variables (E,) after a step (E,).
+        """Return the scaled effect parameters (E,) after a step of a fit.
 
-        A magnitude steps along the tangent of its physical value, in which the prediction is nearly
-        linear; every other parameter steps in its standard normal variable.
+        A magnitude makes its step in the physical value, linearised at the present value, because
+        the prediction is nearly linear in it. Other parameters step in their scaled variable.
+
+        Parameters
+        ----------
+        normal : (E,) array
+            The scaled effect parameters.
+        step : (E,) array
+            The step of these variables.
         """
         variables = []
         moves = zip(self.parameters, normal.tolist(), step.tolist(), strict=True)
@@ -197,17 +208,17 @@ class Candidate:
         return Candidate((*self.terms, term))
 
     def subset(self, numbers: Iterable[int], normal: FloatArray) -> tuple["Candidate", FloatArray]:
-        """Return the candidate of some of the terms, and its standard normal variables.
+        """Return the candidate of some of the terms, and its scaled parameters.
 
         Parameters
         ----------
         numbers : iterable of int
             The indices of the terms to keep, at least one.
         normal : (E,) array
-            The standard normal variables of all terms.
+            The scaled parameters of all terms.
         """
-        parts = self.split(normal)
-        terms, values = zip(*(parts[number] for number in numbers), strict=True)
+        terms_with_values = self.split(normal)
+        terms, values = zip(*(terms_with_values[number] for number in numbers), strict=True)
         return Candidate(terms), np.concatenate(values)
 
 
@@ -301,25 +312,26 @@ def with_step(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> F
 
 @dataclass(frozen=True, eq=False)
 class ResidualProcess:
-    """A random process for each channel that describes what a fit leaves beside white noise.
+    """The random process in the residuals of each channel besides white noise.
 
-    No model of a real structure leaves white noise. Hypotheses are then compared under a noise that
-    is as wide as the residuals of the best of them (Kennedy and O'Hagan 2001).
+    The residuals of a model of a real structure are never white noise alone. Hypotheses are then
+    compared under a noise that is as large as the residuals of the best of them (Kennedy and
+    O'Hagan 2001, J. R. Stat. Soc. B 63, 425-464).
 
     Attributes
     ----------
     amplitude : (channels,) array
-        The standard deviation beside the noise, relative to that of the noise; 0 where the
-        residuals are noise alone.
+        The standard deviation of the process over that of the noise; 0 if the residuals are noise
+        alone.
     noise_factor : (channels,) array
-        The factor on the recorded noise deviation that makes dependent samples count as so many
-        independent ones; 1 where the residuals are white noise.
+        The factor on the recorded noise deviation with which correlated samples, taken as
+        independent, have the right weight; 1 if the residuals are white noise.
     correlation_time : (channels,) array
-        The time over which the process forgets [s].
+        The correlation time of the process [s].
     frequency : (channels,) array
-        The frequency at which it swings [Hz]; 0 if it does not swing.
+        The frequency of the process [Hz]; 0 if it does not oscillate.
     is_recorded_colour : (channels,) array of bool
-        Whether the residuals have the colour that the noise record of the channel itself has.
+        Whether the residuals have the same correlation in time as the channel's noise record.
     """
 
     amplitude: FloatArray
@@ -335,5 +347,5 @@ class ResidualProcess:
 
     @property
     def is_all_recorded_colour(self) -> bool:
-        """Whether all that the fit leaves is noise of the colour that its records have."""
+        """Whether the residuals of all channels are noise, white or correlated as in its record."""
         return bool(np.all(self.is_recorded_colour | (self.noise_factor == 1.0)))

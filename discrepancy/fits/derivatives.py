@@ -1,4 +1,8 @@
-"""Derivatives of a trial with respect to its nuisances, and of its prediction to all unknowns."""
+"""Derivatives of the response and the prediction of a trial with respect to unknowns of a fit.
+
+The nuisances are the calibrated parameters and the trial's own unknowns. The *response* is what the
+model gives; the *prediction* of the readings is the response with gains and zeros of channels.
+"""
 
 from collections.abc import Callable
 from functools import partial
@@ -26,6 +30,8 @@ def nuisance_derivatives(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives of a trial's response with respect to its nuisances.
 
+    They are one-sided difference quotients.
+
     Parameters
     ----------
     data : TrialData
@@ -35,13 +41,14 @@ def nuisance_derivatives(
     shared, local : (Q,), (L,) array
         The scaled shared unknowns, and those of the trial.
     respond : callable
-        Returns response (N, C) and its time derivative (or None) at shared and local unknowns.
+        Returns the response (N, C) at shared and local unknowns, and its time derivative (N, C), or
+        None if the model does not give it.
 
     Returns
     -------
-    parameters : (P, N, C) array
+    by_parameters : (P, N, C) array
         The derivatives with respect to the calibrated parameters.
-    local : (I, N, C) array
+    by_local : (I, N, C) array
         The derivatives with respect to the unknowns of the trial except its zeros.
     """
     unknowns = data.unknowns
@@ -53,28 +60,29 @@ def nuisance_derivatives(
         stepped, _ = respond(shared_values, local_values)
         return (stepped - response) / step
 
-    # calibrated parameters: inwards from the upper end of a range
+    # calibrated parameters: a step from the upper end of the range goes downwards
     _, high = shared_unknowns.ends
     is_at_end = shared + SHARED_STEP > high
     steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: shared_unknowns.count]
-    parameters = [
+    by_parameters = [
         slope(with_step(shared, k, step), local, step) for k, step in enumerate(steps.tolist())
     ]
     # initial state and constants of inputs
     zeros_end, _, inputs_end, time_zero_end = unknowns.ends
-    columns = [slope(shared, with_step(local, k)) for k in range(zeros_end, inputs_end)]
+    by_local = [slope(shared, with_step(local, k)) for k in range(zeros_end, inputs_end)]
     if unknowns.has_time_zero:
         if rates is None:
-            columns.append(slope(shared, with_step(local, inputs_end)))
+            by_local.append(slope(shared, with_step(local, inputs_end)))
         else:
-            columns.append(rates * unknowns.scale[inputs_end])
+            # a shift of time zero by scale u changes the response by its rate times scale u
+            by_local.append(rates * unknowns.scale[inputs_end])
     # health
     if len(unknowns.health_rows):
-        columns.extend(
+        by_local.extend(
             _health_derivatives(data, local, time_zero_end, response.shape, partial(slope, shared))
         )
     shape = (-1, *response.shape)
-    return np.array(parameters).reshape(shape), np.array(columns).reshape(shape)
+    return np.array(by_parameters).reshape(shape), np.array(by_local).reshape(shape)
 
 
 def _health_derivatives(
@@ -86,8 +94,9 @@ def _health_derivatives(
 ) -> FloatArray:
     """Return the derivatives (H, N, C) of a response with respect to the uncertain health entries.
 
-    The health of a static trial has a row for each reading, and a row changes its own reading only.
-    So all entries of a region are stepped at once, and each takes its own row of the difference.
+    Health is the stiffness loss of each region of the structure. In a static trial it has one row
+    for each reading, and a row changes only that reading. So all rows of a region are stepped at
+    once, and the derivative by each row is that row of the difference.
 
     Parameters
     ----------
@@ -96,29 +105,31 @@ def _health_derivatives(
     local : (L,) array
         The scaled unknowns of the trial.
     first : int
-        The index of the first health entry among them.
+        The index of the first health entry among these unknowns.
     shape : tuple of int
         The shape (N, C) of the response.
     slope : callable
-        Returns the difference quotient (N, C) to other unknowns of the trial (L,), for a positive
-        step.
+        Returns the change of the response (N, C) at other unknowns of the trial (L,), divided by
+        the positive step `PARAMETER_STEP`.
     """
     unknowns = data.unknowns
     derivatives = np.zeros((len(unknowns.health_rows), *shape))
     for region in range(data.trial.health.shape[1]):
-        entries = np.flatnonzero(unknowns.health_columns == region)
-        if not len(entries):
+        region_entries = np.flatnonzero(unknowns.health_columns == region)
+        if not len(region_entries):
             continue
         stepped = local.copy()
-        # away from the limits of the stiffness loss
-        sign = np.where(stepped[first + entries] > 0.0, -1.0, 1.0)
-        stepped[first + entries] += sign * PARAMETER_STEP
-        change = slope(stepped)
+        # step towards zero, away from the limits of the stiffness loss
+        sign = np.where(stepped[first + region_entries] > 0.0, -1.0, 1.0)
+        stepped[first + region_entries] += sign * PARAMETER_STEP
+        difference_quotient = slope(stepped)
         if data.trial.is_dynamic:
-            derivatives[entries] = sign[:, np.newaxis, np.newaxis] * change
+            derivatives[region_entries] = sign[:, np.newaxis, np.newaxis] * difference_quotient
         else:
-            rows = unknowns.health_rows[entries]
-            derivatives[entries, rows] = sign[:, np.newaxis] * change[rows]
+            reading_rows = unknowns.health_rows[region_entries]
+            derivatives[region_entries, reading_rows] = (
+                sign[:, np.newaxis] * difference_quotient[reading_rows]
+            )
     return derivatives
 
 
@@ -129,9 +140,10 @@ def prediction_derivatives(
     derivatives: TrialDerivatives,
     candidate: Candidate,
 ) -> tuple[FloatArray, IntArray]:
-    """Return the derivatives of a trial's prediction.
+    """Return the derivatives of a trial's predicted readings with respect to all unknowns.
 
-    Those of the response, with gains and zeros.
+    The derivatives of the response are multiplied by the gains, and those with respect to gains and
+    zeros of channels are added.
 
     Parameters
     ----------
@@ -148,10 +160,10 @@ def prediction_derivatives(
 
     Returns
     -------
-    columns : (L + K, N, C) array
+    by_unknowns : (L + K, N, C) array
         The derivatives with respect to the L unknowns of the trial, and to the K shared
         unknowns and effect parameters that act on it [unit of the channel].
-    index : (K,) array of int
+    shared_indices : (K,) array of int
         The indices of these K, among the Q shared unknowns and the effect parameters after
         them.
     """
@@ -178,7 +190,7 @@ def prediction_derivatives(
     effect_numbers = np.array(
         [k for k in range(candidate.size) if kind in candidate.acts_on_with(k)], dtype=int
     )
-    columns = np.concatenate(
+    by_unknowns = np.concatenate(
         (
             by_zeros,
             derivatives.local * gains,
@@ -187,11 +199,11 @@ def prediction_derivatives(
             derivatives.effect[effect_numbers] * gains,
         )
     )
-    index = np.concatenate(
+    shared_indices = np.concatenate(
         (
             np.arange(shared_unknowns.count),
             shared_unknowns.count + gain_numbers,
             shared_unknowns.size + effect_numbers,
         )
     )
-    return columns, index
+    return by_unknowns, shared_indices

@@ -1,6 +1,7 @@
-"""Tests that a name must pass.
+"""Statistical tests that a fit must pass before its effects are named by a verdict.
 
-The fit against the noise records, and its shape against a free one.
+The residuals are compared with the noise records, and the law of an effect with the same law of
+free shape. A *name* is an effect of the catalogue that the verdict says is missing in the model.
 """
 
 from collections.abc import Sequence
@@ -17,9 +18,10 @@ from .fitting import CandidateFit
 from .problem import Problem
 
 ABSOLUTE_LEVEL = 1e-3
-"""Level of the test of absolute fit: a true name fails it this often."""
+"""Level of the test of absolute fit: the probability that a true hypothesis fails it."""
 SHAPE_GAIN = 2.0
-"""Log evidence that a free shape may gain before the name gives way to its family [nat]."""
+"""Gain of log evidence by a free shape above which a verdict names the family of the effect, and
+not the effect [nat]."""
 
 
 class NamedTest(NamedTuple):
@@ -35,8 +37,8 @@ class NamedTest(NamedTuple):
 def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     """Test whether the residuals of a fit are white noise of the recorded level.
 
-    The tests are those of `absolute_fit_tests`. The least of their p-values is compared with
-    `ABSOLUTE_LEVEL` over their number (Holm 1979, Scand. J. Statist. 6, 65-70).
+    The tests are those of `absolute_fit_tests`. The least of their p-values, multiplied by the
+    number of tests, is compared with `ABSOLUTE_LEVEL` (Holm 1979, Scand. J. Statist. 6, 65-70).
 
     Parameters
     ----------
@@ -48,8 +50,8 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     Returns
     -------
     Gate
-        The outcome. `passed` is None where no channel has a noise record and more readings than
-        unknowns; whiteness is tested all the same and can fail.
+        The outcome. If no variance could be compared with a noise record, `passed` is None, or
+        False if one of the other tests (priors, whiteness) fails.
     """
     tests = absolute_fit_tests(problem, fit)
     has_variance_test = any(test.name.startswith("variance") for test in tests)
@@ -73,34 +75,49 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
 
 
 def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
-    """Return the tests of absolute fit: variances, priors and whiteness.
+    """Return the p-values of all tests of absolute fit: variances, priors and whiteness.
 
-    The variance of each channel is compared with its noise record by an F test, and all channels
-    together by one test.
+    The residual variance of each channel is compared with its noise record by an F test, and that
+    of all channels together by one more test.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    fit : CandidateFit
+        The fit to test.
     """
-    # dependent samples of the recorded colour count as fewer independent ones
+    # correlated residuals count as fewer independent ones: all degrees of freedom are divided
     samples_per_independent = _recorded_colour_factor(problem, fit) ** 2
-    freedom = (problem.counts - fit.spent) / samples_per_independent
-    noise_freedom = problem.freedom / samples_per_independent
-    is_testable = (problem.freedom > 0.0) & (freedom >= 1.0)
-    channels = np.flatnonzero(is_testable)
+    residual_freedom = (problem.counts - fit.spent) / samples_per_independent
+    record_freedom = problem.freedom / samples_per_independent
+    is_testable = (problem.freedom > 0.0) & (residual_freedom >= 1.0)
+    testable_channels = np.flatnonzero(is_testable)
     tests = []
-    for number in channels:
-        mean_square = fit.sums[number] / freedom[number] / samples_per_independent[number]
-        p_value = noise_tests.variance_p_value(mean_square, freedom[number], noise_freedom[number])
-        tests.append(NamedTest(f"variance of {problem.channel_names[number]}", p_value))
-    if len(channels) > 1:
+    for channel in testable_channels:
+        # sum of squares over counts - spent: the second divisor undoes that of residual_freedom
+        mean_square = (
+            fit.sums[channel] / residual_freedom[channel] / samples_per_independent[channel]
+        )
+        p_value = noise_tests.variance_p_value(
+            mean_square, residual_freedom[channel], record_freedom[channel]
+        )
+        tests.append(NamedTest(f"variance of {problem.channel_names[channel]}", p_value))
+    if len(testable_channels) > 1:
         p_value = noise_tests.pooled_variance_p_value(
-            np.array([test.p_value for test in tests]), freedom[channels], noise_freedom[channels]
+            np.array([test.p_value for test in tests]),
+            residual_freedom[testable_channels],
+            record_freedom[testable_channels],
         )
         tests.append(NamedTest("variance of all channels", p_value))
     return [*tests, *prior_tests(problem, fit), *whiteness_tests(problem, fit)]
 
 
 def _recorded_colour_factor(problem: Problem, fit: CandidateFit) -> FloatArray:
-    """Return the noise factor of each channel whose residuals have the recorded colour, else 1.
+    """Return the noise factor of each channel, (channels,).
 
-    See `ResidualProcess.noise_factor`.
+    It is `ResidualProcess.noise_factor` if the residuals are correlated in time as the noise record
+    of the channel is, and 1 otherwise. Its square is the number of samples per independent sample.
     """
     process = fit.residual_process
     if process is None:
@@ -109,22 +126,26 @@ def _recorded_colour_factor(problem: Problem, fit: CandidateFit) -> FloatArray:
 
 
 def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
-    """Return the tests that the unknowns of a fit stayed within their priors.
+    """Return χ² tests of whether the unknowns of a fit are consistent with their priors.
 
-    A wrong model can fit by leaving the calibrated values, and a law by turning into another one: a
-    joint that slips at zero force is a soft joint. The magnitude of an effect is not tested, as it
-    may have any value. The tests are conservative: estimates scatter less than the prior.
+    A wrong model can fit the readings by moving calibrated values far from their priors, and a law
+    by extreme parameters that make it another law: a joint that slips at zero force is a soft
+    joint. The magnitude of an effect is not tested, as it may have any value. The tests are
+    conservative, since estimates scatter less than the prior.
     """
+    # scaled unknowns are standard normal under their prior: their sum of squares is χ²
     shared = problem.shared
-    parameters = fit.point.shared[: shared.count]
+    parameter_deviations = fit.point.shared[: shared.count]
     has_proper_prior = shared.precision[shared.count :] > 0.0
-    gains = fit.point.shared[shared.count :][has_proper_prior]
+    gain_deviations = fit.point.shared[shared.count :][has_proper_prior]
     tests = []
-    if parameters.size:
-        p_value = float(chi2.sf(parameters @ parameters, parameters.size))
+    if parameter_deviations.size:
+        p_value = float(
+            chi2.sf(parameter_deviations @ parameter_deviations, parameter_deviations.size)
+        )
         tests.append(NamedTest("calibrated parameters beside their priors", p_value))
-    if gains.size:
-        p_value = float(chi2.sf(gains @ gains, gains.size))
+    if gain_deviations.size:
+        p_value = float(chi2.sf(gain_deviations @ gain_deviations, gain_deviations.size))
         tests.append(NamedTest("gains beside their priors", p_value))
     for term, values in fit.candidate.split(fit.effect):
         for parameter, u in zip(term.effect.parameters, values.tolist(), strict=False):
@@ -137,9 +158,10 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
 
 
 def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
-    """Return the Ljung-Box test of each channel, over all its records in motion.
+    """Return the Ljung-Box test of each channel, over its records in all trials in motion.
 
-    Channels whose noise record is not white itself are left out, as in locating.
+    A channel is left out if its noise record is not white, or if its residuals have the correlation
+    of that record.
     """
     tests = []
     is_white_noise = _recorded_colour_factor(problem, fit) == 1.0
@@ -164,10 +186,10 @@ class ResidualRecord(NamedTuple):
     values : (N,) array
         The standardised residuals.
     is_used : (N,) array of bool
-        Whether a sample counts.
+        Whether a sample is compared with the model.
     steps : (N - 1,) or (1,) array
-        The steps in time between the samples [s]; only their median where the noise is white, as
-        they do not matter then.
+        The time steps between the samples [s]; only their median, (1,), if the noise is white after
+        standardising, as the single steps do not matter then.
     """
 
     values: FloatArray
@@ -176,7 +198,9 @@ class ResidualRecord(NamedTuple):
 
 
 def residual_records(problem: Problem, fit: CandidateFit, channel: int) -> list[ResidualRecord]:
-    """Return the residuals of a channel in each trial in motion that is long enough for tests.
+    """Return the standardised residuals of one channel, one record for each trial in motion.
+
+    Trials with fewer samples than `noise_tests.SHORTEST_SERIES` are left out.
 
     Parameters
     ----------
@@ -217,14 +241,14 @@ def whiteness_p_value(records: Sequence[ResidualRecord]) -> float:
 
 
 def check_shape(named_fit: CandidateFit, family_fit: CandidateFit | None) -> Gate:
-    """Test whether an effect with a free shape explains more than the effect itself.
+    """Test whether a fit with a free shape parameter explains more than the fit without one.
 
     Parameters
     ----------
     named_fit : CandidateFit
         The fit with the canonical shape.
     family_fit : CandidateFit or None
-        The fit with the free shape; None where the effect has no shape parameters.
+        The fit with the free shape; None if the effect has no shape parameters.
     """
     if family_fit is None:
         reason = "The effect has no shape that could be free."
@@ -239,17 +263,17 @@ def check_shape(named_fit: CandidateFit, family_fit: CandidateFit | None) -> Gat
 
 
 def time_step_error(problem: Problem, fit: CandidateFit) -> float:
-    """Return the error that the time steps cause in a fit, relative to the noise.
+    """Return the error of the time integration in a fit, relative to the noise deviation.
 
-    It is the largest rms change of a channel in a trial when the steps are halved, over the noise
-    deviation of the channel.
+    The time steps are halved, and the rms change of each channel in each trial in motion is divided
+    by the noise deviation of the channel. The largest of these ratios is returned.
     """
     largest = 0.0
     for number, data in enumerate(problem.trials):
         if not data.trial.is_dynamic:
             continue
-        finer = problem.response_with(number, fit.point, fit.candidate, finer=2)
-        change = (finer - fit.responses[number]) / data.deviation
-        rms = np.sqrt((change**2).mean(axis=0))
+        finer_response = problem.response_with(number, fit.point, fit.candidate, finer=2)
+        standardised_change = (finer_response - fit.responses[number]) / data.deviation
+        rms = np.sqrt((standardised_change**2).mean(axis=0))
         largest = max(largest, float(rms.max()))
     return largest

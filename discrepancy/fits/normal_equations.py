@@ -1,4 +1,7 @@
-"""Normal equations of a fit: derivatives and residuals of all trials, over their noise."""
+"""Normal equations of a fit, from the derivatives and residuals of all trials over their noise.
+
+Their matrix is the Gauss-Newton approximation of the Hessian of the negative log posterior.
+"""
 
 from dataclasses import dataclass
 
@@ -14,11 +17,12 @@ from discrepancy.fits.candidate import (
 from discrepancy.fits.problem import Problem
 
 LEAST_PRECISION = 1e-12
-"""Precision of an unknown about which neither its prior nor the readings say anything."""
+"""Precision added for every unknown, so that one without a prior and without influence on the
+readings does not make the matrix singular."""
 
 
 def check_finite(values: FloatArray) -> FloatArray:
-    """Return the values as they are, if all of them are finite.
+    """Return the values unchanged after checking that all of them are finite.
 
     Raises
     ------
@@ -51,7 +55,15 @@ def cholesky_factor(matrix: FloatArray) -> FloatArray:
 
 
 def solve_factored(factor: FloatArray, right: FloatArray) -> FloatArray:
-    """Return (U^T U)^-1 b, given the factor U (n, n) and right-hand sides b (n, ...)."""
+    """Return the solution x (n, ...) of U^T U x = b.
+
+    Parameters
+    ----------
+    factor : (n, n) array
+        The upper Cholesky factor U, as `cholesky_factor` returns it.
+    right : (n, ...) array
+        The right-hand sides b.
+    """
     return np.asarray(cho_solve((factor, False), right, check_finite=False))
 
 
@@ -60,21 +72,23 @@ def solve_factored(factor: FloatArray, right: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class TrialRows:
-    """The derivatives and residuals of one trial, over the deviation of the noise.
+    """The derivatives and residuals of one trial, in units of the noise deviation.
+
+    The N C readings are those of N samples in C channels, sample by sample.
 
     Attributes
     ----------
     rows : (L + K, N C) array
-        The derivatives of the readings with respect to the L unknowns of the trial, then to the K
-        shared unknowns and effect parameters that act on it.
+        The derivatives of the readings: one row for each of the L unknowns of the trial, then one
+        for each of the K shared unknowns and effect parameters that act on it.
     index : (K,) array of int
         The indices of these K among all shared unknowns and effect parameters.
     root : (C,) array
-        The square root of the relative noise precision of each channel.
+        The recorded noise deviation of each channel over the estimated one.
     residual : (N C,) array
-        The residuals.
+        The readings minus their prediction.
     value : (L,) array
-        The values of the unknowns of the trial.
+        The scaled values of the unknowns of the trial.
     prior : (L,) array
         The prior precisions of the unknowns of the trial.
     """
@@ -87,22 +101,29 @@ class TrialRows:
     prior: FloatArray
 
     def eliminate_local(self) -> tuple[FloatArray, FloatArray]:
-        """Return what eliminates the unknowns of the trial from its normal equations.
+        """Return the matrices by which the trial's own unknowns are eliminated.
 
-        With A the block of the trial's unknowns and B that between them and the shared ones, it is
-        the Cholesky factor (L, L) of A, and A^-1 B (L, K): by how much the trial's unknowns fall
-        as the shared ones rise.
+        Let A be the block of the normal equations of the trial's own unknowns, and B the block
+        between them and the shared unknowns. The own unknowns that minimise the objective change
+        by -A^-1 B per unit of the shared unknowns.
+
+        Returns
+        -------
+        factor : (L, L) array
+            The upper Cholesky factor of A.
+        local_per_shared : (L, K) array
+            A^-1 B.
         """
-        local_rows, shared_rows = np.split(self.rows, [len(self.prior)])
-        block = local_rows @ local_rows.T + np.diag(self.prior + LEAST_PRECISION)
-        factor = cholesky_factor(block)
-        return factor, solve_factored(factor, local_rows @ shared_rows.T)
+        local_jacobian, shared_jacobian = np.split(self.rows, [len(self.prior)])
+        local_block = local_jacobian @ local_jacobian.T + np.diag(self.prior + LEAST_PRECISION)
+        factor = cholesky_factor(local_block)
+        return factor, solve_factored(factor, local_jacobian @ shared_jacobian.T)
 
 
 def trial_rows(
     problem: Problem, number: int, state: FitState, candidate: Candidate, precision: FloatArray
 ) -> TrialRows:
-    """Return the derivatives and residuals of a trial at a state, over the deviation of the noise.
+    """Return the derivatives and residuals of a trial in units of the noise deviation.
 
     Parameters
     ----------
@@ -115,19 +136,21 @@ def trial_rows(
     candidate : Candidate
         The effects whose parameters are unknowns.
     precision : (channels,) array
-        The noise precision of each channel, relative to the recorded one.
+        The estimated noise precision (inverse variance) of each channel over the recorded one.
     """
     data = problem.trials[number]
-    columns, index = problem.prediction_derivatives(
+    by_unknowns, shared_indices = problem.prediction_derivatives(
         number, state.point, state.linearisations[number], candidate
     )
-    root = np.sqrt(precision[data.groups])
-    residual = (state.residuals[number] * root).ravel()
-    rows = (data.standardised(columns) * root).reshape(len(columns), residual.size)
+    precision_root = np.sqrt(precision[data.groups])
+    residual = (state.residuals[number] * precision_root).ravel()
+    jacobian = (data.standardised(by_unknowns) * precision_root).reshape(
+        len(by_unknowns), residual.size
+    )
     return TrialRows(
-        rows=rows,
-        index=index,
-        root=root,
+        rows=jacobian,
+        index=shared_indices,
+        root=precision_root,
         residual=residual,
         value=state.point.local[number],
         prior=data.unknowns.precision,
@@ -136,19 +159,19 @@ def trial_rows(
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """The normal equations of a fit.
+    """The normal equations of a fit: matrix @ step = gradient.
 
-    Their unknowns are the shared ones, the effect parameters, and those of each trial, in this
+    The n unknowns are the shared ones, the effect parameters, and those of each trial, in this
     order.
 
     Attributes
     ----------
     trials : list of (TrialRows, (M,) array of int)
-        The derivatives of each trial, and the indices of their rows among all unknowns.
+        The derivatives of each trial, and the indices of their M rows among the n unknowns.
     matrix : (n, n) array
-        The approximate Hessian of the negative log posterior.
+        The Gauss-Newton approximation of the Hessian of the negative log posterior.
     gradient : (n,) array
-        The negative gradient of the negative log posterior: downhill.
+        The negative gradient of the negative log posterior, which points downhill.
     """
 
     trials: list[tuple[TrialRows, IntArray]]
@@ -174,30 +197,32 @@ def normal_equations(
     candidate : Candidate
         The effects whose parameters are unknowns.
     precision : (channels,) array
-        The noise precision of each channel, relative to the recorded one.
+        The estimated noise precision (inverse variance) of each channel over the recorded one.
     effect_precision : (E,) array, optional
         The prior precisions of the effect parameters; 1 if left out.
     """
     numbers = range(len(problem.trials))
-    trials = [trial_rows(problem, number, state, candidate, precision) for number in numbers]
-    # prior
+    trial_equations = [
+        trial_rows(problem, number, state, candidate, precision) for number in numbers
+    ]
+    # prior: each scaled unknown u adds precision u^2 / 2 to the objective
     if effect_precision is None:
         effect_precision = np.ones(candidate.size)
-    local_priors = [rows.prior for rows in trials]
-    prior = np.concatenate((problem.shared.precision, effect_precision, *local_priors))
+    local_priors = [trial.prior for trial in trial_equations]
+    prior_precision = np.concatenate((problem.shared.precision, effect_precision, *local_priors))
     effect = state.point.effect[: candidate.size]
-    local_values = [rows.value for rows in trials]
+    local_values = [trial.value for trial in trial_equations]
     values = np.concatenate((state.point.shared, effect, *local_values))
-    matrix = np.diag(prior + LEAST_PRECISION)
-    gradient = -prior * values
-    # readings
+    matrix = np.diag(prior_precision + LEAST_PRECISION)
+    gradient = -prior_precision * values
+    # readings: J J^T and J r of each trial, with its derivatives J (M, N C) and residuals r
     first_local = problem.shared.size + candidate.size
-    indexed_trials = []
-    for rows in trials:
-        local_index = first_local + np.arange(len(rows.prior))
-        index = np.concatenate((local_index, rows.index))
-        first_local += len(rows.prior)
-        matrix[np.ix_(index, index)] += rows.rows @ rows.rows.T
-        gradient[index] += rows.rows @ rows.residual
-        indexed_trials.append((rows, index))
-    return NormalEquations(indexed_trials, matrix, gradient)
+    trials_with_indices = []
+    for trial in trial_equations:
+        local_indices = first_local + np.arange(len(trial.prior))
+        unknown_indices = np.concatenate((local_indices, trial.index))
+        first_local += len(trial.prior)
+        matrix[np.ix_(unknown_indices, unknown_indices)] += trial.rows @ trial.rows.T
+        gradient[unknown_indices] += trial.rows @ trial.residual
+        trials_with_indices.append((trial, unknown_indices))
+    return NormalEquations(trials_with_indices, matrix, gradient)

@@ -1,6 +1,6 @@
-"""Residuals of a fit with their expected variance, for locating, proof and report.
+"""Residuals of a fit with their expected variance, and posterior draws of its effects.
 
-Posterior draws.
+The residuals are used to locate a discrepancy, to prove an effect, and in the report.
 """
 
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from discrepancy.search_settings import SEARCH
 def residual_set(
     problem: Problem, fitted: CandidateFit, *, sensitivities: bool = True
 ) -> ResidualSet:
-    """Return the fitted and the held-out trials of a campaign beside their predictions.
+    """Return the residuals of all trials of a campaign, fitted and held out, with their variance.
 
     Parameters
     ----------
@@ -42,13 +42,15 @@ def residual_set(
     fitted : CandidateFit
         The fit with its covariance.
     sensitivities : bool
-        Whether the exact covariance of the residuals is computed (P columns for each sample), or
-        only its diagonal.
+        Whether the factor of the exact covariance of the residuals is computed (P columns for each
+        sample), or only its diagonal, the leverage.
 
-    Notes ----- Where the fit has a residual process, the leverage is that of the trials' own
-    unknowns. What is shared takes a few samples of all trials, and its uncertainty is that of the
-    residual process, which a χ² against the noise shall show. The noise of channels without a
-    record is estimated from the residuals of the fitted trials.
+    Notes
+    -----
+    If the fit has a residual process, only the trials' own unknowns enter the leverage. The shared
+    unknowns then absorb few samples, and their uncertainty is already described by the residual
+    process, which a χ² against the noise is meant to show. The noise of a channel without a record
+    is estimated from the residuals of the fitted trials.
     """
     precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(fitted.sums))
     predictions = _Predictions(problem, fitted, fitted, precision)
@@ -62,9 +64,11 @@ def residual_set(
 
 
 def held_out_fit(problem: Problem, fitted: CandidateFit) -> tuple[Problem, CandidateFit]:
-    """Return the problem of the held-out trials, and a fit of their own unknowns.
+    """Return the problem of the held-out trials, and the fit of their own unknowns.
 
-    Shared unknowns and effects stay as they were fitted, so the held-out trials test them.
+    A trial's own unknowns are, for example, zeros of channels and the initial state. The shared
+    unknowns and the effects keep the values fitted to the other trials, so that the held-out trials
+    test them.
     """
     candidate = fitted.candidate
     held_out = problem.with_trials(problem.campaign.held_out)
@@ -75,6 +79,7 @@ def held_out_fit(problem: Problem, fitted: CandidateFit) -> tuple[Problem, Candi
         start = with_initial_states_of_first_readings(held_out, start)
     local_fit = fit(held_out, candidate, start, local_only=True)
     local_fit = refit_from_first_readings(held_out, local_fit, local_only=True)
+    # a poor fit may be at a wrong optimum: try again from another release amplitude
     if local_fit.chi_square > SEARCH.far * float(held_out.counts.sum()):
         start = _with_best_release_amplitudes(held_out, candidate, start)
         second_fit = fit(held_out, candidate, start, local_only=True)
@@ -89,10 +94,10 @@ in prior deviations, of a free initial state in tenths of the nominal one."""
 
 
 def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start: Point) -> Point:
-    """Return the start with the release amplitude of each trial at which its objective is least.
+    """Return the start with the release amplitude of each trial that gives the least objective.
 
-    Where friction ends a motion, each number of half swings has an optimum of its own, and a
-    descent finds only the nearest.
+    If friction ends a motion, there is one optimum for each number of half swings, and a descent
+    finds only the nearest. So a grid of amplitudes, `RELEASE_STEPS`, is tried.
     """
     best_local = list(start.local)
     for number, data in enumerate(held_out.trials):
@@ -121,16 +126,17 @@ def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start
 
 
 class _Projection(NamedTuple):
-    """What the uncertainty of the unknowns does to the prediction of a trial, over its noise.
+    """Factors of the covariance of a trial's prediction, in units of its noise deviation.
+
+    The covariance is `by_local.T @ by_local + by_shared @ by_shared.T`.
 
     Attributes
     ----------
     by_local : (L, N C) array
-        The changes by the trial's own unknowns, in coordinates in which they are independent with
-        variance 1, given the shared unknowns.
+        The factor by the trial's own unknowns, given the shared unknowns.
     by_shared : (N C, Q + E) array
-        The changes by the shared unknowns and effects, in such coordinates too, with the trial's
-        own unknowns following them.
+        The factor by the shared unknowns and effect parameters, with the trial's own unknowns
+        refitted as these change.
     """
 
     by_local: FloatArray
@@ -146,16 +152,17 @@ class _Projection(NamedTuple):
 
 
 class _Predictions:
-    """Trials beside their predictions, with the variance that their residuals should have.
+    """Predictions of trials by a fit, with the variance that their residuals should have.
 
     Parameters
     ----------
     problem : Problem
         The trials and the model.
     fitted : CandidateFit
-        The fit of the fitted trials, whose covariance is that of the shared unknowns.
+        The fit to the fitted trials; its covariance is that of the shared unknowns.
     local_fit : CandidateFit
-        The fit of the trials' own unknowns: the same, or that of held-out trials.
+        The fit that gives the trials' own unknowns: `fitted` itself for the fitted trials, or the
+        fit of held-out trials.
     precision : (channels,) array
         The noise precision of each channel in the fitted trials, relative to the recorded one.
     """
@@ -176,7 +183,13 @@ class _Predictions:
         self.is_held_out = local_fit is not fitted
 
     def trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
-        """Return the trials beside their predictions."""
+        """Return each trial with its prediction, residuals and their expected variance.
+
+        Parameters
+        ----------
+        sensitivities : bool
+            Whether the factor of the exact covariance of the residuals is computed too.
+        """
         fitted_trials = []
         shared_count = len(self.root)
         local_counts = [data.unknowns.size for data in self.problem.trials]
@@ -200,31 +213,44 @@ class _Predictions:
         return fitted_trials
 
     def _projection(self, rows: TrialRows, local_count: int) -> _Projection:
-        """Return what the uncertainty of the unknowns does to the prediction of a trial."""
+        """Return the factors of the covariance of a trial's prediction.
+
+        Parameters
+        ----------
+        rows : TrialRows
+            The derivatives of the trial, by its own L unknowns first.
+        local_count : int
+            The number L of the trial's own unknowns.
+        """
         local_rows, shared_rows = np.split(rows.rows, [local_count])
         factor, local_per_shared = rows.eliminate_local()
+        # A = U^T U is the precision of the local unknowns: J_l^T A^-1 J_l = (U^-T J_l)^T (U^-T J_l)
         by_local = solve_triangular(factor, local_rows, trans="T")
         # Schur complement: local unknowns follow the shared ones, J_s - J_l A^-1 B
-        following = (shared_rows - local_per_shared.T @ local_rows).T
-        return _Projection(by_local, following @ self.root[rows.index])
+        total_derivatives = (shared_rows - local_per_shared.T @ local_rows).T
+        return _Projection(by_local, total_derivatives @ self.root[rows.index])
 
     def _variances(
         self, number: int, data: TrialData, projection: _Projection
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the leverage of the readings, and the variance of their prediction (both (N, C)).
+        """Return the leverage of the readings and the variance of a new reading, both (N, C).
 
-        Both are relative to the noise variance; see `FittedTrial`.
+        Both are relative to the noise variance; `FittedTrial` defines the leverage.
         """
         shape = self.local_fit.residuals[number].shape
         process = self.fitted.residual_process
-        counted = float(process is None)  # 0: the residual process stands for shared unknowns
-        local = projection.local_variance()
-        shared = projection.shared_variance()
+        shared_weight = float(process is None)  # 0: the residual process stands for shared unknowns
+        local_variance = projection.local_variance()
+        shared_variance = projection.shared_variance()
         if self.is_held_out:
-            leverage = np.maximum(counted * shared - local, -1.0 + 1e-9)
-            variance = 1.0 + np.maximum(shared - local, -1.0 + 1e-9).reshape(shape)
+            # own unknowns were fitted to the trial and reduce its residuals; the uncertainty of
+            # shared unknowns, which were not, adds to them
+            leverage = np.maximum(shared_weight * shared_variance - local_variance, -1.0 + 1e-9)
+            variance = 1.0 + np.maximum(shared_variance - local_variance, -1.0 + 1e-9).reshape(
+                shape
+            )
         else:
-            leverage = np.minimum(local + counted * shared, 1.0)
+            leverage = np.minimum(local_variance + shared_weight * shared_variance, 1.0)
             variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
         if process is not None and data.trial.is_dynamic:
             # without a noise record the process is part of the noise already
@@ -235,7 +261,19 @@ class _Predictions:
     def _fitted_trial(
         self, number: int, data: TrialData, projection: _Projection, sensitivity: FloatArray | None
     ) -> FittedTrial:
-        """Return a trial beside its prediction."""
+        """Return a trial with its prediction, its residuals and their expected variance.
+
+        Parameters
+        ----------
+        number : int
+            The index of the trial.
+        data : TrialData
+            The trial.
+        projection : _Projection
+            The factors of the covariance of its prediction.
+        sensitivity : (N, C, P) array or None
+            The factor of the exact covariance of its residuals, if that is asked for.
+        """
         point = self.local_fit.point
         response = self.local_fit.responses[number]
         prediction = self.problem.prediction(number, point, response)
@@ -246,11 +284,12 @@ class _Predictions:
         if data.trial.is_dynamic:
             rates = np.gradient(prediction, data.trial.time, axis=0)
         return FittedTrial(
-            # the whitening filter leaves out more samples after a gap
+            # as many samples after a gap as the whitening filter is long are not used either
             trial=replace(data.trial, used=data.weight > 0.0),
             prediction=prediction,
             residual=residual * data.deviation,
             noise_deviation=noise_deviation,
+            # the variance is relative to that of the noise; the bound keeps the deviation positive
             predictive_deviation=noise_deviation * np.sqrt(np.maximum(variance, 1e-9)),
             leverage=leverage,
             rates=rates,
@@ -274,7 +313,7 @@ KEPT_DRAWS = 1000
 
 
 def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
-    """Return a fit with posterior draws of its effects, if their posterior is not nearly Gaussian.
+    """Return a fit with posterior draws of its effects if their posterior is not nearly Gaussian.
 
     Parameters
     ----------
@@ -286,13 +325,14 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     Returns
     -------
     CandidateFit
-        The same fit if the misfit rises enough at the ends of the Gaussian intervals along all
-        principal directions; else with `draws`. The same fit gives the same draws.
+        The given fit if -ln posterior rises by more than `LEAST_RISE` at both ends of the Gaussian
+        90 % interval along every principal axis of the covariance; otherwise the fit with `draws`.
+        The same fit always gives the same draws.
     """
     if not fit.candidate.size:
         return fit
     screen = Screen(problem, fit, record_noise=False)
-    centre = fit.point.effect
+    fitted_effect = fit.point.effect
 
     def energy(effect: FloatArray) -> float:
         """Return -ln posterior of effect parameters (E,) relative to the fit [nat]."""
@@ -300,19 +340,19 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
             return np.inf
         try:
             rise = screen.misfit_rise(effect)
-        except DiscrepancyError:  # more than the structure can carry
+        except DiscrepancyError:  # the effect is larger than the model allows
             return np.inf
-        return rise + 0.5 * float(effect @ effect - centre @ centre)
+        return rise + 0.5 * float(effect @ effect - fitted_effect @ fitted_effect)
 
     variances, directions = np.linalg.eigh(fit.effect_covariance)
     axes = directions * np.sqrt(np.maximum(variances, 0.0))
-    rises = []
+    energy_rises = []
     for axis in axes.T:
-        rises.append(energy(centre - NINETY * axis))
-        rises.append(energy(centre + NINETY * axis))
-    if min(rises) > LEAST_RISE:
+        energy_rises.append(energy(fitted_effect - NINETY * axis))
+        energy_rises.append(energy(fitted_effect + NINETY * axis))
+    if min(energy_rises) > LEAST_RISE:
         return fit
-    return replace(fit, draws=importance_draws(energy, centre, axes))
+    return replace(fit, draws=importance_draws(energy, fitted_effect, axes))
 
 
 def importance_draws(
@@ -320,11 +360,11 @@ def importance_draws(
 ) -> FloatArray:
     """Return equally weighted draws of a density by adaptive multiple importance sampling.
 
-    The points of each round are drawn of a Cauchy density, whose tails reach far beyond the
-    density, with the moments that all earlier points give. Each point is weighted by the proposals
-    of all rounds together (Cornuet, Marin, Mira and Robert 2012, Scand. J. Statist. 39, 798-812).
-    Along a ridge that is bent and a hundred times longer than wide, the draws cover a part of it
-    only.
+    In each round points are drawn from a Cauchy density, whose heavy tails cover those of the
+    target. Its location and scale are the weighted mean and covariance of all earlier points. Each
+    point is weighted by the mixture of the proposals of all rounds (Cornuet, Marin, Mira and Robert
+    2012, Scand. J. Statist. 39, 798-812). If the density is a bent ridge that is a hundred times
+    longer than wide, the draws cover only a part of it.
 
     Parameters
     ----------
@@ -333,7 +373,8 @@ def importance_draws(
     centre : (E,) array
         The location of the first proposal.
     axes : (E, E) array
-        The columns along which the first proposal extends, each as long as its standard deviation.
+        The principal axes of the first proposal as columns, each as long as the standard deviation
+        along it.
 
     Returns
     -------
@@ -356,10 +397,10 @@ def importance_draws(
         energies = np.append(energies, [energy(point) for point in new_points])
         # weight all points by the mixture of all proposals
         log_mixture = logsumexp([proposal.logpdf(points) for proposal in proposals], axis=0)
-        weight = softmax(-energies - log_mixture)
+        weights = softmax(-energies - log_mixture)
         # adapt the next proposal
-        mean = weight @ points
-        covariance = np.atleast_2d(np.cov(points.T, aweights=weight))
+        mean = weights @ points
+        covariance = np.atleast_2d(np.cov(points.T, aweights=weights))
     # stratified resampling
     quantiles = stratified(generator, KEPT_DRAWS)
-    return np.asarray(points[np.searchsorted(np.cumsum(weight)[:-1], quantiles)])
+    return np.asarray(points[np.searchsorted(np.cumsum(weights)[:-1], quantiles)])

@@ -4,7 +4,10 @@ A residual is (measured - (1 + gain) model - zero) / s0, whitened in time where 
 coloured. The variance of each channel's noise is marginalised under the inverse gamma distribution
 that its record leaves: -ln L = sum over channels of (n0 + n) / 2 ln(1 + RSS / n0) + constant, with
 n0 the degrees of freedom of the noise record, n the number of samples, and RSS the sum of squared
-residuals in units of s0^2.
+residuals in units of s0^2. Here s0 is the recorded standard deviation of the noise.
+
+The *response* is what the model gives for the channels; the *prediction* of the readings is the
+response with the gains and zeros of the channels.
 """
 
 from collections.abc import Sequence
@@ -43,7 +46,8 @@ QUIETEST = 1e-12
 def channel_misfits(freedom: FloatArray, counts: FloatArray, sums: FloatArray) -> FloatArray:
     """Return the misfit of each channel: -ln L with the noise variance marginalised [nat].
 
-    It is up to a constant. Where nothing is recorded of the noise, its scale has a flat prior.
+    It is up to a constant. Without a noise record, the logarithm of the noise deviation has a flat
+    prior.
 
     Parameters
     ----------
@@ -86,10 +90,10 @@ class Problem:
     refinement : int
         The factor by which time steps are smaller than the model's own.
     refusals : dict of str to str
-        Why an effect could not be fitted, by its identifier.
+        The reason why an effect could not be fitted, by its identifier.
     beginnings : dict of str to (L,) array
-        The unknowns of trials as fitted to their first readings, by the name of the trial, where
-        they were looked for.
+        The scaled unknowns of a trial as fitted to its first readings, by the name of the trial;
+        filled by `beginnings.with_initial_states_of_first_readings`.
 
     Raises
     ------
@@ -116,7 +120,8 @@ class Problem:
         self.refusals: dict[str, str] = {}
         self.beginnings: dict[str, FloatArray] = {}
         self._prepare_trials(campaign.fitted)
-        # a response needs a layout, and the layout first estimates of unknown gains
+        # first estimates of unknown gains need a response, and a response needs the layout of the
+        # unknowns: so the layout is made twice, the first time without these estimates
         self.shared = global_unknowns(campaign, model, campaign.fitted, {})
         self.shared = global_unknowns(campaign, model, campaign.fitted, self._data_over_model())
 
@@ -138,16 +143,17 @@ class Problem:
     def record_refusal(self, candidate: Candidate, cause: DiscrepancyError) -> None:
         """Record why a single effect could not be evaluated or fitted.
 
-        Of a set of effects nothing is recorded, as any of them may be the cause.
+        Nothing is recorded for a set of several effects, as any of them may be the cause.
         """
         if len(candidate.terms) == 1:
             self.refusals[candidate.terms[0].effect.identifier] = str(cause)
 
     def _data_over_model(self) -> dict[str, float]:
-        """Return the ratio of readings to model for each channel of unknown scale.
+        """Return the ratio of readings to model response for each channel of unknown gain.
 
-        It is negative where the channel moves against the model. The first trial in which the
-        channel moves decides.
+        It is the ratio of their largest amplitudes in the first trial in which the channel moves in
+        the model. It is negative if readings and response have opposite signs, except after a
+        release.
         """
         ratios: dict[str, float] = {}
         point = self.start(Candidate())
@@ -158,17 +164,22 @@ class Problem:
                 if not has_unknown_scale or name in ratios:
                     continue
                 readings = data.trial.values[:, column]
-                measured = readings - np.median(readings)
+                deviation_from_median = readings - np.median(readings)
                 local = point.local[number]
+                # a free initial state is zero at its prior mean, where nothing would move
                 if release is not None and not release.at_rest:
                     first_amplitude = data.unknowns.zeros
                     local[first_amplitude] = 1.0 / data.unknowns.scale[first_amplitude]
                 response, _ = self.response(number, point.shared, local, ModelPatch())
-                size = float(np.abs(response[:, column]).max())
-                if size > 0.0:
-                    has_same_sign = release is not None or measured @ response[:, column] > 0.0
+                response_amplitude = float(np.abs(response[:, column]).max())
+                if response_amplitude > 0.0:
+                    has_same_sign = (
+                        release is not None or deviation_from_median @ response[:, column] > 0.0
+                    )
                     sign = 1.0 if has_same_sign else -1.0
-                    ratios[name] = float(np.abs(measured).max()) / size * sign
+                    ratios[name] = (
+                        float(np.abs(deviation_from_median).max()) / response_amplitude * sign
+                    )
         return ratios
 
     # -------------------------------------------------------------------------- values
@@ -182,7 +193,9 @@ class Problem:
         )
 
     def patch_in(self, number: int, candidate: Candidate, effect: FloatArray) -> ModelPatch:
-        """Return the patch of a candidate in a trial: empty where it does not act on such trials.
+        """Return the change of the model by the effects of a candidate in a trial.
+
+        It is empty if the effects do not act on trials of this kind.
 
         Parameters
         ----------
@@ -202,7 +215,7 @@ class Problem:
     ) -> tuple[FloatArray, FloatArray | None]:
         """Return the response of a patched model in a trial, without gains and zeros.
 
-        Responses are kept in memory.
+        The last `KEPT_RESPONSES` responses are kept in memory.
 
         Parameters
         ----------
@@ -213,16 +226,16 @@ class Problem:
         local : (L,) array
             The scaled unknowns of the trial.
         patch : ModelPatch
-            The effects.
+            The change of the model by effects.
         finer : int
-            The factor by which time steps are smaller than those of the problem.
+            The factor by which the time steps of the problem are divided.
 
         Returns
         -------
         response : (N, C) array
             The response at the times of the readings [unit of the channel].
         rates : (N, C) array or None
-            Its time derivative, where the model gives it.
+            Its time derivative; None if the model does not give it.
         """
         data = self.trials[number]
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
@@ -276,24 +289,27 @@ class Problem:
         candidate : Candidate
             The effects that act.
         known : TrialDerivatives, optional
-            Derivatives with respect to shared unknowns and those of the trial that are near enough.
+            Derivatives with respect to nuisances at a nearby point, which are not computed again.
         effect_steps : (E,) array, optional
-            The posterior deviations of the effect parameters. Differences over one of them, at most
-            a hundredth of the prior's, average over the kinks of friction and hysteresis and do not
-            reach beyond where the parameters may lie.
+            The posterior standard deviations of the effect parameters, used as steps of their
+            finite differences, at least `LEAST_STEP` and at most `PARAMETER_STEP`. Such a step
+            averages over the kinks of friction and hysteresis, and stays where the parameters may
+            lie.
 
-        Notes ----- Differences by effects are two-sided. What remains of such a derivative once the
-        nuisances are fitted is small: a ten-thousandth where the effect moves frequencies. The
-        curvature in a one-sided difference is larger than that, and would count as information.
+        Notes
+        -----
+        Differences by effect parameters are two-sided. The part of such a derivative that nuisances
+        cannot compensate is small: a ten-thousandth if the effect moves frequencies. The error of a
+        one-sided difference by curvature is larger, and would count as information.
         """
         kind = self.trials[number].trial.kind
         response = self.response_with(number, point, candidate)
         if known is None:
-            parameters, by_local = self._nuisance_derivatives(number, point, candidate)
+            by_parameters, by_local = self._nuisance_derivatives(number, point, candidate)
         else:
-            parameters = known.parameters
+            by_parameters = known.parameters
             by_local = known.local
-        effect = np.zeros((candidate.size, *response.shape))
+        by_effect = np.zeros((candidate.size, *response.shape))
         steps = np.full(candidate.size, PARAMETER_STEP)
         if effect_steps is not None:
             steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
@@ -304,13 +320,13 @@ class Problem:
             point_below = replace(point, effect=with_step(point.effect, k, -step))
             above = self.response_with(number, point_above, candidate)
             below = self.response_with(number, point_below, candidate)
-            effect[k] = (above - below) / (2.0 * step)
-        return TrialDerivatives(response, parameters, by_local, effect)
+            by_effect[k] = (above - below) / (2.0 * step)
+        return TrialDerivatives(response, by_parameters, by_local, by_effect)
 
     def _nuisance_derivatives(
         self, number: int, point: Point, candidate: Candidate
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the `nuisance_derivatives` of a trial beside the effects of a candidate."""
+        """Return the `nuisance_derivatives` of a trial while the effects of a candidate act."""
         patch = self.patch_in(number, candidate, point.effect)
 
         def respond(shared: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray | None]:
@@ -349,19 +365,33 @@ class Problem:
         return float(misfits[self.counts > 0].sum())
 
     def precisions(self, sums: FloatArray) -> FloatArray:
-        """Return the expected noise precision (channels,) over 1 / s0^2, given sums of squares."""
+        """Return the expected noise precision of each channel over the recorded 1 / s0^2.
+
+        It is (n0 + n) / (n0 + RSS), the mean of its gamma posterior (see the module docstring), and
+        1 if the noise is known or the channel has no samples.
+
+        Parameters
+        ----------
+        sums : (channels,) array
+            The sum of squared standardised residuals RSS of each channel.
+        """
         n0, n = self.freedom, self.counts
         with np.errstate(divide="ignore", invalid="ignore"):
-            squares = np.where(n0 > 0.0, sums, np.maximum(sums, QUIETEST * n))
-            precisions = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + squares))
+            bounded_sums = np.where(n0 > 0.0, sums, np.maximum(sums, QUIETEST * n))
+            precisions = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + bounded_sums))
         return np.where(n > 0, precisions, 1.0)
 
     # -------------------------------------------------------------------------- other problems
 
     def with_trials(self, trials: Sequence[Trial], model: Model | None = None) -> "Problem":
-        """Return the problem of other trials, and of another model if one is given.
+        """Return a problem with other trials, the same noise and the same shared unknowns.
 
-        Noise and shared unknowns stay the same.
+        Parameters
+        ----------
+        trials : sequence of Trial
+            The trials that are compared with the model.
+        model : Model, optional
+            Another model; that of this problem if left out.
         """
         other = copy(self)
         if model is not None:
@@ -370,7 +400,13 @@ class Problem:
         return other
 
     def first_samples(self, count: int) -> "Problem":
-        """Return the problem in which only the first samples of the trials in motion count."""
+        """Return the problem in which only the first samples of each trial in motion are compared.
+
+        Parameters
+        ----------
+        count : int
+            The number of samples.
+        """
         shorter = copy(self)
         shorter_trials = []
         for data in self.trials:
@@ -383,9 +419,9 @@ class Problem:
         return shorter
 
     def widened(self, factors: FloatArray) -> "Problem":
-        """Return the problem under a wider noise whose deviation is known.
+        """Return the problem under a noise with a larger standard deviation, taken as known.
 
-        The noise is wider in trials in motion, and at rest too where no noise is recorded.
+        The factors apply in trials in motion, and at rest only to channels without a noise record.
 
         Parameters
         ----------

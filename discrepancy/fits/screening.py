@@ -1,14 +1,16 @@
-"""Screening: how much an effect could explain, before any fit, to first order in the nuisances.
+"""Screening: estimate how much an effect could reduce the misfit, before it is fitted.
 
-Let d be the standardised change that an effect makes to the prediction at the fitted nuisances, J
-the derivatives of the prediction by the nuisances, r the residuals, g the gradient and H the
-Hessian of the fit. The misfit after the nuisances have adapted is
+The nuisances are all unknowns of a fit that are not of interest here: calibrated parameters, gains,
+zeros and initial states. Let d be the standardised change that an effect makes to the prediction at
+the fitted nuisances, J the derivatives of the prediction by the nuisances (one row for each), r the
+residuals, g the negative gradient and H the Hessian of the fit's objective. To first order in the
+nuisances, the misfit after they are refitted is
 
     F(d) = F(0) - b(d) + G(d, d) / 2,
     G(c, d) = c.d - (J c)' H^-1 (J d),   b(d) = r.d - g' H^-1 (J d).
 
-Changes of several effects add, so pairs and scales of effects cost inner products only. G is also
-the measure that separates two effects before data are looked at.
+Changes by several effects add, so pairs and scales of effects cost only inner products. G also
+measures how well two effects can be told apart, before any data are known.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,7 +35,7 @@ from .problem import Problem
 
 @dataclass(frozen=True)
 class ScreenedChange:
-    """The change of the prediction by an effect at given values, without what nuisances can do.
+    """The change of the prediction by an effect, minus what refitted nuisances can compensate.
 
     Attributes
     ----------
@@ -42,8 +44,8 @@ class ScreenedChange:
     start : (E,) array
         The scaled parameters of the effect.
     vector : (D,) array
-        The change and its projections on the nuisances, such that G(c, d) = (sign c).d with
-        `Screen.sign`.
+        The change d of all readings, then its projections H^(-1/2) J d on the nuisances, such that
+        G(c, d) = sum(sign * c.vector * d.vector) with `Screen.sign`.
     overlap : float
         b(d): the overlap of the change with the residuals [nat].
     squared_size : float
@@ -58,14 +60,14 @@ class ScreenedChange:
 
     @property
     def scale(self) -> float:
-        """The factor on the change at which it explains most."""
+        """The factor on the change that reduces the misfit most: b(d) / G(d, d)."""
         return self.overlap / self.squared_size if self.squared_size > 0.0 else 0.0
 
     @property
     def gain(self) -> float:
-        """The decrease of the misfit at the best scale [nat].
+        """The decrease of the misfit at the best scale: b(d)^2 / (2 G(d, d)) [nat].
 
-        0 where that has a sign the effect cannot have.
+        It is 0 if the best scale is negative and the effect cannot be.
         """
         if self.overlap > 0.0 or self.term.may_be_negative:
             return 0.5 * self.overlap * self.scale
@@ -73,25 +75,27 @@ class ScreenedChange:
 
     @property
     def best(self) -> FloatArray:
-        """The scaled parameters (E,) with the magnitude at the best scale: the start of a fit."""
+        """The scaled parameters (E,) with the magnitude at the best scale, to begin a fit with."""
         lowest = -0.7 * LARGEST_EFFECT
         return self.term.rescaled(self.start, self.scale, lowest, SEARCH.largest_start)
 
 
 class Screen:
-    """A fit as a screen for further effects: changes of its prediction and their inner products.
+    """Estimates of how much further effects would improve a fit, without fitting them.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model.
     fit : CandidateFit
-        The fit at which nuisances are eliminated; its own effects stay as they are.
+        The fit whose nuisances are eliminated; its own effects keep their values, unless
+        `effect_precision` is given.
     record_noise : bool
-        Whether residuals are weighted by the noise records, or by what the fit left.
+        Whether residuals are weighted by the recorded noise, where there is a record, or by the
+        noise level that the residuals of the fit give.
     effect_precision : (E,) array, optional
-        The prior precisions of the fit's own effect parameters; if given, these adapt to a change
-        as the nuisances do.
+        The prior precisions of the fit's own effect parameters; if given, these parameters are
+        eliminated together with the nuisances.
     """
 
     def __init__(
@@ -112,6 +116,7 @@ class Screen:
         self._trials = equations.trials
         self._nuisance_count = len(equations.gradient)
         factor = cholesky_factor(equations.matrix)
+        # U^-T with H = U^T U: then (J c)^T H^-1 (J d) is the inner product of U^-T J c and U^-T J d
         self._inverse_factor = solve_triangular(
             factor, np.eye(self._nuisance_count), trans="T", check_finite=False
         )
@@ -119,47 +124,70 @@ class Screen:
 
     @property
     def sign(self) -> FloatArray:
-        """The signs (D,) of the inner product.
+        """The signs (D,) of the inner product G of two vectors.
 
-        1 for changes, -1 for their projections on nuisances.
+        They are 1 for the changes of readings and -1 for the projections on the nuisances, since G
+        is the inner product of the changes minus that of the projections.
         """
-        samples = sum(residual.size for residual in self.fit.residuals)
-        return np.repeat((1.0, -1.0), (samples, self._nuisance_count))
+        reading_count = sum(residual.size for residual in self.fit.residuals)
+        return np.repeat((1.0, -1.0), (reading_count, self._nuisance_count))
 
     # ---------------------------------------------------------------- changes of the prediction
 
     def change(self, term: EffectTerm, start: FloatArray) -> ScreenedChange:
-        """Return the change by a term at scaled parameters (E,), beside the effects of the fit."""
+        """Return the change of the prediction if one more effect acts.
+
+        Parameters
+        ----------
+        term : EffectTerm
+            The effect at its place, added to those of the fit.
+        start : (E,) array
+            The scaled parameters of the effect.
+        """
         candidate = self.fit.candidate.with_term(term)
         effect = np.concatenate((self.fit.point.effect, start))
-        vector, overlap, size = self._change_to(candidate, effect, term.effect.acts_on)
-        return ScreenedChange(term, start, vector, overlap, max(size, 0.0))
+        vector, overlap, squared_size = self._change_to(candidate, effect, term.effect.acts_on)
+        return ScreenedChange(term, start, vector, overlap, max(squared_size, 0.0))
 
     def misfit_rise(self, effect: FloatArray) -> float:
-        """Return the rise of the misfit [nat] at other effect parameters (E,) of the fit."""
+        """Return the rise of the misfit at other parameters (E,) of the fit's own effects [nat]."""
         candidate = self.fit.candidate
-        _, overlap, size = self._change_to(candidate, effect, candidate.acts_on)
-        return 0.5 * size - overlap
+        _, overlap, squared_size = self._change_to(candidate, effect, candidate.acts_on)
+        return 0.5 * squared_size - overlap
 
     @np.errstate(over="ignore", invalid="ignore")
     def _change_to(
         self, candidate: Candidate, effect: FloatArray, kinds: frozenset[TrialKind]
     ) -> tuple[FloatArray, float, float]:
-        """Return vector, overlap b and size G of the change to a candidate, in kinds of trials."""
+        """Return vector, overlap b and squared size G of the change to another candidate.
+
+        Parameters
+        ----------
+        candidate : Candidate
+            The effects after the change.
+        effect : (E,) array
+            Their scaled parameters.
+        kinds : frozenset of TrialKind
+            The kinds of trials whose prediction changes.
+        """
         problem = self.problem
         point = self.fit.point
         patch = candidate.patch(problem.setting, effect)
-        changes: dict[int, FloatArray] = {}
+        standardised_changes: dict[int, FloatArray] = {}
         for number, data in enumerate(problem.trials):
             if data.trial.kind not in kinds:
                 continue
             response, _ = problem.response(number, point.shared, point.local[number], patch)
             gains = 1.0 + problem.shared.gains(point.shared, data.trial.channels)
-            changes[number] = data.standardised(gains * (response - self.fit.responses[number]))
-        return self.project(changes)
+            standardised_changes[number] = data.standardised(
+                gains * (response - self.fit.responses[number])
+            )
+        return self.project(standardised_changes)
 
     def project(self, changes: Mapping[int, FloatArray]) -> tuple[FloatArray, float, float]:
-        """Return vector, overlap b and size G of changes, without what nuisances can do.
+        """Return vector, overlap b and squared size G of changes of the prediction.
+
+        The part of the changes that refitted nuisances can compensate is projected out.
 
         Parameters
         ----------
@@ -169,33 +197,40 @@ class Screen:
         Returns
         -------
         vector : (D,) array
-            The changes of all trials, and their projections on the nuisances.
-        overlap, size : float
-            b(d) and G(d, d) of the module's text.
+            The changes of all trials, then their projections on the nuisances.
+        overlap, squared_size : float
+            b(d) and G(d, d) of the module docstring.
         """
-        by_nuisance = np.zeros(self._nuisance_count)  # J d
+        nuisance_overlaps = np.zeros(self._nuisance_count)  # J d
         trial_changes = []
         overlap = 0.0
-        size = 0.0
-        for number, (rows, index) in enumerate(self._trials):
-            d: FloatArray = np.zeros(rows.residual.shape)
+        squared_size = 0.0
+        for number, (trial_rows, nuisance_indices) in enumerate(self._trials):
+            d: FloatArray = np.zeros(trial_rows.residual.shape)
             if number in changes:
-                d = (changes[number] * rows.root).ravel()
-                by_nuisance[index] += rows.rows @ d
-                overlap += float(rows.residual @ d)
-                size += float(d @ d)
+                d = (changes[number] * trial_rows.root).ravel()
+                nuisance_overlaps[nuisance_indices] += trial_rows.rows @ d
+                overlap += float(trial_rows.residual @ d)
+                squared_size += float(d @ d)
             trial_changes.append(d)
-        projections = self._inverse_factor @ by_nuisance
+        projections = self._inverse_factor @ nuisance_overlaps
         overlap -= float(self._gradient @ projections)
-        size -= float(projections @ projections)
-        check_finite(np.array((overlap, size)))
-        return np.concatenate((*trial_changes, projections)), overlap, size
+        squared_size -= float(projections @ projections)
+        check_finite(np.array((overlap, squared_size)))
+        return np.concatenate((*trial_changes, projections)), overlap, squared_size
 
     def shrunk(self, change: ScreenedChange) -> tuple[ScreenedChange, float]:
-        """Return a change made so small that it is linear in its magnitude, and the factor.
+        """Return a change with so small a magnitude that it is linear in it, and the factor.
 
-        At its median, an effect that moves a frequency turns phases by many radians, which says
-        nothing of what it does at a small magnitude.
+        At the median of its prior an effect that moves a frequency may shift phases by many
+        radians. That change has another direction than the change at a small magnitude.
+
+        Returns
+        -------
+        change : ScreenedChange
+            The change at the smaller magnitude; the given one if it is small already.
+        factor : float
+            The factor on the magnitude, at most 1.
         """
         is_reading = self.sign > 0.0
         squared_size = float((change.vector[is_reading] ** 2).sum())
@@ -205,22 +240,24 @@ class Screen:
         return self.change(change.term, change.term.rescaled(change.start, factor)), factor
 
     def changes(self, term: EffectTerm, *, fine: bool = True) -> Iterator[ScreenedChange]:
-        """Yield the changes by a term over a grid of its parameters, where the model can follow.
+        """Yield the changes by an effect over a grid of its parameters.
+
+        Points of the grid at which the model cannot be evaluated are left out.
 
         Parameters
         ----------
         term : EffectTerm
             The effect at its place.
         fine : bool
-            Whether signed magnitudes are tried at a small size too. One size is enough for an
-            effect that is linear in its magnitude.
+            Whether a magnitude that may be negative is tried at a small value too. One value is
+            enough for an effect that is linear in its magnitude.
         """
         has_change = False
         refusal = None
         for start in parameter_grid(term, self._spectral_peaks(term), fine=fine):
             try:
                 change = self.change(term, start)
-            except DiscrepancyError as cause:  # such as a spring softer than what is taken from it
+            except DiscrepancyError as cause:  # such as more stiffness removed than there is
                 refusal = cause
             else:
                 has_change = True
@@ -231,12 +268,11 @@ class Screen:
     # ---------------------------------------------------------------- lines in the spectrum
 
     def _spectral_peaks(self, term: EffectTerm) -> tuple[float, ...]:
-        """Return the peak frequencies of the residuals in a term's channel.
+        """Return the peak frequencies of the residuals in the channel of an effect.
 
-        They are relative to the first frequency of the structure.
-
-        Empty where the effect has no spectral parameter. Records of the same length and interval
-        are summed to one spectrum.
+        They are relative to the first natural frequency of the structure, and empty if the effect
+        has no parameter that is a frequency. The spectra of records of the same length and sampling
+        interval are added first.
         """
         if not term.effect.spectral:
             return ()
@@ -260,7 +296,11 @@ class Screen:
 
 
 def _largest_peaks(power: FloatArray) -> list[int]:
-    """Return the indices of the largest peaks of a spectrum, none on the flank of another."""
+    """Return the indices of the largest separate peaks of a power spectrum.
+
+    With zero padding one spectral line has several local maxima, so peaks must be more than two
+    lines of the unpadded spectrum apart.
+    """
     is_peak = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])
     peaks = np.flatnonzero(is_peak) + 1
     largest = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.peaks]]
@@ -278,24 +318,24 @@ def _largest_peaks(power: FloatArray) -> list[int]:
 def parameter_grid(
     term: EffectTerm, peaks: Sequence[float] = (), *, fine: bool = True
 ) -> Iterator[FloatArray]:
-    """Yield scaled parameters (E,) of a term to try, over the product of the values of each.
+    """Yield the points of a grid of an effect's scaled parameters (E,), for a screen.
 
-    The first magnitude is tried at one value or at levels of its own, since a change scales with
-    it. A spectral parameter is tried at the given peaks.
+    The first magnitude needs few values, since to first order the change is proportional to it. A
+    parameter that is a frequency is tried at the given peaks.
 
     Parameters
     ----------
     term : EffectTerm
         The effect at its place.
     peaks : sequence of float
-        The frequencies of peaks in the residuals, over the first frequency.
+        The frequencies of peaks in the residuals, over the first natural frequency.
     fine : bool
-        Whether a signed magnitude is tried at a small size too.
+        Whether a magnitude that may be negative is tried at a small value too.
     """
-    others = sum(not parameter.magnitude for parameter in term.parameters)
+    other_parameter_count = sum(not parameter.magnitude for parameter in term.parameters)
     levels = SEARCH.levels_of_many
-    if others < len(SEARCH.levels):
-        levels = SEARCH.levels[others]
+    if other_parameter_count < len(SEARCH.levels):
+        levels = SEARCH.levels[other_parameter_count]
     axes: list[tuple[float, ...]] = []
     has_magnitude = False
     for parameter in term.parameters:
@@ -320,9 +360,10 @@ def parameter_grid(
 def _magnitude_levels(
     parameter: EffectParameter | ShapeParameter, *, is_first: bool, fine: bool
 ) -> tuple[float, ...]:
-    """Return the scaled values at which a magnitude is tried.
+    """Return the scaled values of a magnitude in the grid.
 
-    The first magnitude of a term scales its change, which needs fewer values.
+    The first magnitude of an effect needs fewer values, as it only scales the change. A magnitude
+    is signed if the median of its prior is zero.
     """
     is_signed = parameter.prior.value(0.0) == 0.0
     if parameter.levels and is_first:
@@ -335,6 +376,9 @@ def _magnitude_levels(
 
 
 def _prior_quantiles(parameter: EffectParameter | ShapeParameter) -> tuple[float, ...]:
-    """Return as many scaled values as a parameter has levels, evenly over its prior probability."""
+    """Return scaled values of a parameter, one for each of its levels.
+
+    They are the medians of intervals of equal prior probability.
+    """
     count = parameter.levels
     return tuple(float(ndtri((k + 0.5) / count)) for k in range(count))

@@ -1,10 +1,10 @@
-"""A trial ready to be compared: the noise of its channels, the samples that count, its unknowns.
+"""Trials with all that is needed to compare them with a model: noise, used samples, and unknowns.
 
-Each unknown is a scaled variable u with prior N(0, 1), or a flat prior where nothing is known; its
-value is centre + scale u. Global unknowns are shared by all hypotheses and trials: calibrated
-parameters and gains of channels. Local unknowns belong to one trial: zeros of its channels, initial
-state and time zero of a ring-down, an unknown initial state and constants of inputs of a driven
-trial, and health where it is uncertain.
+Each unknown is a scaled variable u with the prior N(0, 1), or a flat prior if nothing is known of
+it. Its value is centre + scale u. *Global* unknowns have the same value in all hypotheses and
+trials: calibrated parameters and gains of channels. *Local* unknowns belong to one trial: zeros of
+its channels, an unknown initial state, the time of release of a ring-down, constants to be added to
+recorded inputs, and uncertain health (stiffness losses).
 """
 
 from collections.abc import Mapping
@@ -32,14 +32,23 @@ from discrepancy.system.response import Conditions
 FREE_MOTION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""
 LEAST_LOSS = -0.5
-"""Lower limit of an uncertain stiffness loss. A loss below zero means nothing, but a limit at zero,
-where most of a flight is, would stop fits: half of the readings of a healthy wing pull below it."""
+"""Lower limit of an uncertain stiffness loss. A loss below zero has no physical meaning. But with a
+limit at zero, the loss of a healthy wing, fits would stop there: by noise about half of the
+readings give a loss below zero."""
 LARGEST_LOSS = 0.95
 """Upper limit of an uncertain stiffness loss."""
 
 
 class ScaledPrior(NamedTuple):
-    """The prior of a shared unknown with value centre + scale u; precision 1 of u, or 0 if flat."""
+    """The prior of a shared unknown whose value is centre + scale u.
+
+    Attributes
+    ----------
+    centre, scale : float
+        The prior mean and standard deviation of the value.
+    precision : float
+        The prior precision of u: 1, or 0 for a flat prior.
+    """
 
     centre: float
     scale: float
@@ -55,7 +64,7 @@ class GlobalUnknowns:
     Attributes
     ----------
     centre : (Q,) array
-        The prior means; of gains those of their errors.
+        The prior means. For a gain, this is the mean of its error, gain - 1.
     scale : (Q,) array
         The prior standard deviations.
     precision : (Q,) array
@@ -65,8 +74,8 @@ class GlobalUnknowns:
     gain_channels : tuple of str
         The channels whose gain is unknown.
     fixed_gain : dict of str to float
-        The gain errors of signals that define the scale of the release amplitudes; they are not
-        fitted.
+        The gain errors, by channel, that are not fitted: that of a signal of unknown scale which
+        defines the scale of the release amplitudes.
     """
 
     centre: FloatArray
@@ -89,16 +98,19 @@ class GlobalUnknowns:
 
     @cached_property
     def ends(self) -> FloatArray:
-        """The least and greatest value of each scaled variable (2, Q), by the model's ranges."""
+        """The least and largest value of each scaled variable, (2, Q).
+
+        They come from the ranges of the calibrated parameters; gains have no limits.
+        """
         scaled_ends = np.tile([[-inf], [inf]], self.size)
         uncertain = np.flatnonzero(self.scale[: self.count])
-        ends = np.array([self.low, self.high])
+        physical_ends = np.array([self.low, self.high])
         centre = self.centre[uncertain]
-        scaled_ends[:, uncertain] = (ends[:, uncertain] - centre) / self.scale[uncertain]
+        scaled_ends[:, uncertain] = (physical_ends[:, uncertain] - centre) / self.scale[uncertain]
         return scaled_ends
 
     def parameters(self, u: FloatArray) -> FloatArray:
-        """Return the calibrated parameters (P,), clipped to the range of the model, of u (Q,)."""
+        """Return the calibrated parameters (P,) within their ranges, given scaled values u (Q,)."""
         return np.clip((self.centre + self.scale * u)[: self.count], self.low, self.high)
 
     def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
@@ -126,11 +138,12 @@ class LocalUnknowns:
         The shape of the unknown entries of the initial state: (R, 1) for displacements, (R, 2) for
         displacements and velocities.
     offset_inputs : (O,) array of int
-        The indices of recorded inputs that lack a constant.
+        The indices of the recorded inputs to which an unknown constant is added.
     has_time_zero : bool
         Whether the time of the release is unknown.
     health_rows, health_columns : (H,) array of int
-        The uncertain entries of the health, those of the first region first.
+        The row and column (region) of each uncertain entry of the health, those of the first region
+        first.
     """
 
     scale: FloatArray
@@ -154,7 +167,7 @@ class LocalUnknowns:
 
     @cached_property
     def ends(self) -> list[int]:
-        """The indices after zeros, initial state, constants of inputs, and time zero."""
+        """The index after the last of the zeros, initial state, input constants, and time zero."""
         counts = (
             self.zeros,
             prod(self.initial_shape),
@@ -170,7 +183,7 @@ class LocalUnknowns:
         return values
 
     def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
-        """Return the conditions under which the model responds in the trial.
+        """Return the conditions for which the model is evaluated: initial state, health and inputs.
 
         Parameters
         ----------
@@ -181,17 +194,22 @@ class LocalUnknowns:
         u : (L,) array
             The scaled variables of the trial.
         """
-        _, entries, constants, time_zero, losses = np.split(self.scale * u, self.ends)
+        _, initial_entries, input_constants, time_zero, loss_changes = np.split(
+            self.scale * u, self.ends
+        )
         rows, width = self.initial_shape
         initial = np.zeros((rows, 2))
-        initial[:, :width] = entries.reshape(rows, width)
+        initial[:, :width] = initial_entries.reshape(rows, width)
         offset = np.zeros(len(trial.inputs))
-        offset[self.offset_inputs] = constants
+        offset[self.offset_inputs] = input_constants
         health = trial.health[:1] if trial.is_dynamic else trial.health
-        if losses.size:
+        if loss_changes.size:
             health = health.copy()
-            entry = (self.health_rows, self.health_columns)
-            health[entry] = np.clip(health[entry] + losses, LEAST_LOSS, LARGEST_LOSS)
+            uncertain_entries = (self.health_rows, self.health_columns)
+            health[uncertain_entries] = np.clip(
+                health[uncertain_entries] + loss_changes, LEAST_LOSS, LARGEST_LOSS
+            )
+        # the sum is 0 without an unknown time zero, and its only entry otherwise
         times = (0.0, float(time_zero.sum()))
         return Conditions(parameters, initial, times, health, tuple(offset.tolist()))
 
@@ -222,7 +240,8 @@ def global_unknowns(
         estimate = data_over_model.get(name, 1.0) - 1.0
         has_unknown_scale = isinf(channel.gain_deviation)
         if has_unknown_scale and channel.quantity is Quantity.SIGNAL and not fixed_gain:
-            fixed_gain[name] = estimate  # it defines the scale of the release amplitudes
+            # amplitudes of releases and an unknown gain cannot both be fitted: fix the first gain
+            fixed_gain[name] = estimate
             continue
         gain_channels.append(name)
         if has_unknown_scale:
@@ -320,14 +339,14 @@ class TrialData:
     trial : Trial
         The trial as measured.
     deviation : (C,) array
-        The noise deviation s0 of each column; of whitened samples where the noise is whitened [unit
-        of the channel].
+        The noise standard deviation s0 of each column [unit of the channel]. If the column is
+        whitened, it is that of the whitened samples.
     groups : (C,) array of int
         The index of each column's channel among those of the campaign.
     unknowns : LocalUnknowns
         The layout of the unknowns of this trial.
     weight : (N, C) array
-        1 where a sample counts, else 0.
+        1 for a sample that is compared with the model, else 0.
     noise : tuple of NoiseModel
         The noise model of each column.
     """
@@ -340,7 +359,19 @@ class TrialData:
     noise: tuple[NoiseModel, ...]
 
     def standardised(self, columns: FloatArray) -> FloatArray:
-        """Return columns (..., N, C) over s0 and whitened; 0 where a sample does not count."""
+        """Return readings or their derivatives in units of the noise, whitened.
+
+        Parameters
+        ----------
+        columns : (..., N, C) array
+            Readings, predictions, or derivatives of predictions [unit of the channel].
+
+        Returns
+        -------
+        (..., N, C) array
+            The values over s0, after the whitening filter if the noise of the column is coloured;
+            0 for samples that are not compared.
+        """
         scaled = columns / self.deviation
         for number, noise in enumerate(self.noise):
             if noise.applies(self.trial.whitened_at):
@@ -351,7 +382,7 @@ class TrialData:
     def prepare(
         cls, campaign: Campaign, trial: Trial, models: Mapping[str, NoiseModel], model: Model
     ) -> "TrialData":
-        """Return a trial of a campaign with its noise, its unknowns, and the samples that count.
+        """Return a trial with its noise, its unknowns, and the samples that are compared.
 
         Parameters
         ----------
@@ -372,7 +403,8 @@ class TrialData:
         deviation = trial.noise_factor * np.where(
             is_whitened, innovation_deviation, sample_deviation
         )
-        # the whitening filter smears a sample that is left out over its order
+        # a whitened sample depends on as many samples before it as the filter has coefficients: it
+        # is not compared if one of them is left out
         weight = trial.used.astype(np.float64)
         for column in np.flatnonzero(is_whitened):
             order = len(noise[column].autoregression)
@@ -389,6 +421,9 @@ class TrialData:
 
 
 def stand_in_deviation(campaign: Campaign, name: str) -> float:
-    """Return what stands in for an unknown noise deviation: a thousandth of the channel's range."""
+    """Return a noise deviation for a channel without a noise record.
+
+    It is a thousandth of the largest range of readings in a record of the channel [its unit].
+    """
     ranges = [float(np.ptp(values)) for _, values, _ in campaign.records(name)]
     return 1e-3 * max(1e-12, *ranges)

@@ -1,7 +1,8 @@
-"""The share of the mean square error that a hypothesis removes, and it in words.
+"""The share of the mean square error that a hypothesis removes, as a number and in words.
 
-It is 1 - (rms after / rms before)^2 of the residuals without and with the hypothesis. Both are
-divided by the same noise, and by nothing else: what a posterior leaves open makes no error smaller.
+It is 1 - (rms after / rms before)^2, with the residuals before and after the hypothesis is added to
+the model. Both are divided by the same noise deviation. They are not divided by the uncertainty of
+the prediction, so that an uncertain posterior does not make an error look small.
 """
 
 from collections.abc import Mapping
@@ -33,10 +34,10 @@ CHANNELS_MENTIONED = 3
 
 
 def with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> ResidualSet:
-    """Return residuals over the noise of a reference, so that errors of two hypotheses compare.
+    """Return residuals with the noise deviation of a reference, to compare two hypotheses.
 
-    The two differ where no noise is recorded: there it is what each hypothesis leaves in the fitted
-    trials.
+    The noise deviations of the two differ in channels without a noise record: there they are
+    estimated from the residuals of each hypothesis in the fitted trials.
 
     Parameters
     ----------
@@ -54,7 +55,7 @@ def with_noise_of(residuals: ResidualSet, reference: ResidualSet) -> ResidualSet
 
 @dataclass(frozen=True, eq=False)
 class SquaredErrors:
-    """Sums of squared residuals over the noise, by block of the records.
+    """Sums of squared residuals over the noise variance, for each block of the records.
 
     Attributes
     ----------
@@ -76,11 +77,13 @@ class SquaredErrors:
         Blocks are drawn with replacement (Kuensch 1989, Ann. Statist. 17, 1217-1241). The ends are
         nan with fewer than five blocks.
         """
-        count = len(self.before)
-        if count < LEAST_BLOCKS:
+        block_count = len(self.before)
+        if block_count < LEAST_BLOCKS:
             return nan, nan
         generator = np.random.default_rng(BOOTSTRAP_SEED)
-        times_drawn = generator.multinomial(count, np.full(count, 1.0 / count), BOOTSTRAP_DRAWS)
+        times_drawn = generator.multinomial(
+            block_count, np.full(block_count, 1.0 / block_count), BOOTSTRAP_DRAWS
+        )
         before = times_drawn @ self.before
         after = times_drawn @ self.after
         has_error = before > 0.0
@@ -90,7 +93,13 @@ class SquaredErrors:
 
 
 def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
-    """Return the squared residuals of trials without and with a hypothesis, over the same noise."""
+    """Return the sums of squares of residuals without and with a hypothesis, over the same noise.
+
+    Parameters
+    ----------
+    before, after : ResidualSet
+        The same trials without and with the hypothesis.
+    """
     block_sums = []
     for without_effect, with_effect in zip(before.trials, after.trials, strict=True):
         noise = without_effect.noise_deviation
@@ -106,9 +115,9 @@ def squared_errors(before: ResidualSet, after: ResidualSet) -> SquaredErrors:
 
 
 def _block_count(fitted: FittedTrial) -> int:
-    """Return the number of blocks of a trial.
+    """Return the number of blocks of a trial for the bootstrap.
 
-    One at rest, where neighbouring loads are no repetition.
+    A static trial is one block, as its rows are different loads and no repetition of each other.
     """
     if not fitted.trial.is_dynamic:
         return 1
@@ -116,15 +125,13 @@ def _block_count(fitted: FittedTrial) -> int:
 
 
 def closed_share(before: ResidualSet, after: ResidualSet) -> ClosedShare | None:
-    """Return the share of the mean square error that a hypothesis removes.
-
-    None if there is no error.
+    """Return the share of the mean square error that a hypothesis removes; None without an error.
 
     Parameters
     ----------
     before, after : ResidualSet
-        All trials of a campaign without and with the hypothesis. Those held out count if there are
-        any, else those fitted.
+        All trials of a campaign without and with the hypothesis. The share is that of the held-out
+        trials if there are any, else that of the fitted ones.
     """
     trials = "fitted"
     if before.held_out is not None and after.held_out is not None:
@@ -155,7 +162,7 @@ def rms_by_channel(residuals: ResidualSet) -> dict[str, float]:
 
 
 def share_text(closed: ClosedShare) -> str:
-    """Return a share in percent with its interval where there is one, as in "93.1 % (91 to 95)"."""
+    """Return a share in percent with its interval, if it has one, as in "93.1 % (91 to 95)"."""
     interval = ""
     if isfinite(closed.low) and isfinite(closed.high):
         interval = f" ({_percent(closed.low)} to {_percent(closed.high)})"
@@ -163,7 +170,7 @@ def share_text(closed: ClosedShare) -> str:
 
 
 def _percent(share: float) -> str:
-    """Return a share in percent that is never rounded to 100."""
+    """Return a share in percent, with more digits if it would be rounded to 100."""
     percent = 100.0 * share
     if 99.95 <= percent < 100.0:
         return f"{percent:.2f}" if percent < 99.995 else "> 99.99"
@@ -171,7 +178,7 @@ def _percent(share: float) -> str:
 
 
 def trials_text(closed: ClosedShare) -> str:
-    """Return in words which trials a share is of."""
+    """Return in words the trials that a share refers to."""
     role = "not fitted" if closed.trials == "held-out" else "fitted"
     if closed.trial_count == 1:
         return f"one trial that was {role}"
@@ -212,7 +219,7 @@ def _noise_of(channel: Channel, fallback: float) -> float:
 
 
 def closed_text(before: ResidualSet, after: ResidualSet, closed: ClosedShare) -> str:
-    """Return the share in words, such as "it explains 93 % of the mean square error in ...".
+    """Return the share as a clause, such as "it explains 93 % of the mean square error in ...".
 
     Parameters
     ----------
@@ -235,7 +242,7 @@ def closed_text(before: ResidualSet, after: ResidualSet, closed: ClosedShare) ->
 def compared_trials(
     before: ResidualSet, after: ResidualSet, closed: ClosedShare
 ) -> tuple[ResidualSet, ResidualSet]:
-    """Return the trials that a share is of, without and with the hypothesis."""
+    """Return the trials that a share refers to, without and with the hypothesis."""
     if closed.trials == "held-out":
         return before.held_out or before, after.held_out or after
     return before.fitted or before, after.fitted or after

@@ -1,4 +1,7 @@
-"""Verdicts where a fit leaves noise of the colour that its records have, and nothing else."""
+"""Verdicts if the residuals of a fit are coloured noise as in the noise records, and nothing else.
+
+Coloured noise is correlated in time.
+"""
 
 from dataclasses import replace
 
@@ -19,9 +22,10 @@ from .simulation_comparison import SimulationComparison
 
 
 def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOutcome | None:
-    """Return the verdict where a fit leaves noise of the colour of its records, and nothing else.
+    """Return the verdict if the residuals of a fit are coloured noise as in the noise records.
 
-    None where no hypothesis does.
+    The fit is that without effect, or that of the best hypothesis. None is returned if neither
+    leaves such noise alone, or if the best hypothesis may not be named.
     """
     problem = comparison.problem
     search = comparison.search
@@ -53,7 +57,19 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
 def _nothing_under_coloured_noise(
     conclusion: Conclusion, no_effect: CandidateFit, gate: Gate, probability_of_none: float
 ) -> VerdictOutcome:
-    """Return the verdict that nothing is missing under coloured noise, or too little to tell."""
+    """Return the verdict that nothing is missing, or that it is too small to be detected.
+
+    Parameters
+    ----------
+    conclusion : Conclusion
+        The hypotheses with their probabilities.
+    no_effect : CandidateFit
+        The fit without effect, whose residuals are coloured noise.
+    gate : Gate
+        The test of absolute fit of that fit.
+    probability_of_none : float
+        The probability that no effect is missing.
+    """
     remainders = remainder_estimates(conclusion.search.problem, no_effect)
     if probability_of_none >= SEARCH.unsure:
         return conclusion.outcome(
@@ -65,31 +81,33 @@ def _nothing_under_coloured_noise(
             gates=(gate,),
             remainders=remainders,
         )
-    hints = []
+    possible_effects = []
     for name, probability in conclusion.inclusion.items():
         if probability > 1.0 - SEARCH.sure:
-            hints.append(name)
-    hints.sort()
-    total = min(probability_of_none + sum(conclusion.inclusion[name] for name in hints), 1.0)
+            possible_effects.append(name)
+    possible_effects.sort()
+    total_probability = min(
+        probability_of_none + sum(conclusion.inclusion[name] for name in possible_effects), 1.0
+    )
     return conclusion.outcome(
         VerdictKind.BELOW_LIMIT,
-        below_limit_sentence(hints, " that is coloured"),
-        total,
+        below_limit_sentence(possible_effects, " that is coloured"),
+        total_probability,
         no_effect,
-        group=tuple(hints),
+        group=tuple(possible_effects),
         gates=(gate,),
         remainders=remainders,
     )
 
 
 def _leaves_recorded_colour(fit: CandidateFit) -> bool:
-    """Return whether a fit leaves noise of the colour of its records, and nothing else."""
+    """Return whether all residuals of a fit are noise, correlated as in the noise records."""
     process = fit.residual_process
     return process is not None and process.is_all_recorded_colour
 
 
 def remainder_estimates(problem: Problem, fit: CandidateFit) -> tuple[RemainderEstimate, ...]:
-    """Return what a fit leaves beside the noise, for each channel with such a residual process."""
+    """Return the residual process of each channel whose residuals are more than noise."""
     process = fit.residual_process
     if process is None:
         return ()

@@ -1,10 +1,10 @@
-"""Comparison of hypotheses where none leaves noise alone.
+"""Comparison of hypotheses if the residuals of none of them are noise alone.
 
-Which may be named, and what objects to others.
-
-Where no simulation leaves noise alone, hypotheses are compared by their simulations under a wider
-noise, or by the missing force that they follow. In both ways each hypothesis has evidence, and
-explains a share of the gap, in the trials that were fitted and in those that were held out.
+Hypotheses are then compared by simulations under a noise that is wider than recorded, or by how
+well their force agrees with the *missing force*, which is estimated from the readings without any
+law. In both cases each hypothesis has evidence, and explains a share of the *gap* between the model
+and the readings, in fitted and in held-out trials. The comparison decides which hypotheses may be
+named in the verdict.
 """
 
 from abc import ABC, abstractmethod
@@ -43,7 +43,7 @@ EffectsAtPlaces = frozenset[tuple[str, str]]
 
 
 class Comparison(ABC, Generic[H]):
-    """Hypotheses of a search that are compared with each other.
+    """A comparison of the hypotheses of a search; how it is made depends on the subclass.
 
     Parameters
     ----------
@@ -53,11 +53,12 @@ class Comparison(ABC, Generic[H]):
     Attributes
     ----------
     least_low_end : float
-        The least lower end of the interval of the share that a name needs.
+        The least value that the lower end of the 90 % interval of the explained share must have for
+        a hypothesis to be named.
     has_held_out : bool
         Whether there are trials that were not fitted.
     standing : H or None
-        The hypothesis that the verdict is about, once there is one.
+        The hypothesis that the verdict is about, if there is one.
     """
 
     least_low_end: float
@@ -68,7 +69,7 @@ class Comparison(ABC, Generic[H]):
         self.has_held_out = bool(self.problem.campaign.held_out)
         self.standing: H | None = None
         self._subsets: dict[CandidateKey, H | None] = {}
-        # each is computed once for a hypothesis
+        # the methods are cached, so that each result is computed once for a hypothesis
         self.share = cache(self._gap_share)
         self.simulation = cache(self._simulation)
         self.closed_share = cache(self._closed_share)
@@ -88,7 +89,7 @@ class Comparison(ABC, Generic[H]):
 
     @abstractmethod
     def gap_sentence(self) -> str:
-        """Return a sentence on what is known of the gap; empty if nothing is."""
+        """Return a sentence that describes the gap; empty if nothing is known of it."""
 
     @abstractmethod
     def _gap_share(self, hypothesis: H, *, held_out: bool) -> GapShare:
@@ -96,14 +97,19 @@ class Comparison(ABC, Generic[H]):
 
     @abstractmethod
     def fit_followed(self, candidate: Candidate, effect: FloatArray) -> H | None:
-        """Return a further hypothesis, begun at scaled effect parameters (E,).
+        """Return the fit of a further candidate; None if it cannot be fitted.
 
-        None if it cannot be fitted.
+        Parameters
+        ----------
+        candidate : Candidate
+            The effects.
+        effect : (E,) array
+            The scaled effect parameters from which the fit begins.
         """
 
     @abstractmethod
     def with_free_shape(self, hypothesis: H) -> H | None:
-        """Return a hypothesis of one law with its shape free, if that was compared."""
+        """Return the fit of a single law with its shape free; None if that was not compared."""
 
     @abstractmethod
     def start_point(self, hypothesis: H) -> Point:
@@ -111,11 +117,11 @@ class Comparison(ABC, Generic[H]):
 
     @abstractmethod
     def check_fit(self, hypothesis: H) -> Gate:
-        """Test whether the simulation that a hypothesis rests on leaves noise alone."""
+        """Test whether the residuals of the simulation of a hypothesis are noise alone."""
 
     @abstractmethod
     def failed_check(self, hypothesis: H) -> str:
-        """Return what a hypothesis that leaves noise alone fails nevertheless; empty if nothing."""
+        """Return the reason of a further test that a hypothesis fails; empty if it fails none."""
 
     @abstractmethod
     def _simulation(self, hypothesis: H) -> CandidateFit:
@@ -123,14 +129,14 @@ class Comparison(ABC, Generic[H]):
 
     @abstractmethod
     def remaining_text(self, hypothesis: H, share: GapShare) -> str:
-        """Return in words how much of the gap a hypothesis leaves, of how much there is."""
+        """Return in words how much of the gap a hypothesis does not explain."""
 
     def score(self, hypothesis: H) -> float:
         """Return ln (evidence times prior) of a hypothesis [nat]."""
         return hypothesis.log_evidence + self.search.log_prior(hypothesis.candidate)
 
     def passes_absolute_fit(self, hypothesis: H) -> bool:
-        """Return whether the simulation of a hypothesis leaves no more than the recorded noise."""
+        """Return whether the residuals of a hypothesis agree with the noise records."""
         simulation = self.search.exact_fits.get(hypothesis.candidate.key)
         if simulation is None:
             start = self.start_point(hypothesis)
@@ -140,14 +146,21 @@ class Comparison(ABC, Generic[H]):
         return check_absolute_fit(self.problem, simulation).passed is not False
 
     def _residuals(self, simulation: CandidateFit) -> ResidualSet:
-        """Return the fitted and held-out trials beside the predictions of a simulation."""
+        """Return the residuals of a simulation in the fitted and held-out trials."""
         return residual_set(self.problem, simulation, sensitivities=False)
 
     def _closed_share(self, hypothesis: H) -> tuple[ClosedShare | None, str]:
-        """Return the share of the mean square error that a hypothesis removes, and it in words.
+        """Return the share of the mean square error that a hypothesis removes.
 
-        It is that of simulations without and with the hypothesis, whatever hypotheses are compared
-        by. Where no share can be given it is None with the reason.
+        The errors are those of simulations without and with the hypothesis, even if hypotheses are
+        compared by the missing force.
+
+        Returns
+        -------
+        share : ClosedShare or None
+            The share; None if none can be given.
+        clause : str
+            The share in words, or the reason why none can be given.
         """
         before = self.residuals(self.search.no_effect)
         after = self.residuals(self.simulation(hypothesis))
@@ -167,9 +180,9 @@ class Comparison(ABC, Generic[H]):
     # ---------------------------------------------------------------- which may be named
 
     def decisive_share(self, hypothesis: H) -> GapShare:
-        """Return the share of the gap that counts.
+        """Return the share of the gap by which a hypothesis is judged.
 
-        In held-out trials if any can test the hypothesis.
+        It is that in held-out trials if these can test the hypothesis, else that in fitted trials.
         """
         if self.has_held_out:
             held_out_share = self.share(hypothesis, held_out=True)
@@ -178,11 +191,11 @@ class Comparison(ABC, Generic[H]):
         return self.share(hypothesis, held_out=False)
 
     def acts_on_structure(self, term: EffectTerm) -> bool:
-        """Return whether a term acts on the structure, and does not only describe readings."""
+        """Return whether an effect changes the structure or its loads, and not only readings."""
         return acts_within(term.effect, self.problem.setting)
 
     def objection(self, hypothesis: H) -> str:
-        """Return why a hypothesis cannot be a name; empty if nothing objects to it."""
+        """Return the reason why a hypothesis may not be named; empty if it may be named."""
         candidate = hypothesis.candidate
         if not any(self.acts_on_structure(term) for term in candidate.terms):
             return "it describes readings, causes nothing and leaves more than noise"
@@ -201,29 +214,36 @@ class Comparison(ABC, Generic[H]):
         return self.failed_check(hypothesis)
 
     def _strained_unknowns(self, hypothesis: H) -> str:
-        """Return which kind of shared unknowns a hypothesis moves far from their priors.
+        """Return the kind of shared unknowns that a hypothesis moves far from their priors.
 
-        Empty if none.
-
-        The priors count as wider than stated, since calibrated values take up what the hypothesis
-        leaves.
+        It is empty if there is none. The test is that of χ² with prior deviations that are
+        `SEARCH.widened` times the stated ones, since calibrated values take up errors that the
+        hypothesis does not explain.
         """
         shared = self.problem.shared
         has_prior = shared.precision > 0.0
-        kinds = {
+        indices_by_kind = {
             "calibrated parameters": slice(shared.count),
             "gains": slice(shared.count, None),
         }
-        for kind, numbers in kinds.items():
-            u = hypothesis.shared[numbers][has_prior[numbers]]
+        for kind, indices in indices_by_kind.items():
+            u = hypothesis.shared[indices][has_prior[indices]]
             if u.size and chi2.sf(u @ u / SEARCH.widened**2, u.size) < ABSOLUTE_LEVEL:
                 return kind
         return ""
 
     def _survives_held_out(self, hypothesis: H, least_low_end: float) -> bool:
-        """Return whether held-out trials confirm a hypothesis, or cannot test it.
+        """Return whether held-out trials confirm a hypothesis, or at least do not contradict it.
 
-        Trials that cannot test it must not contradict it either.
+        Trials in which a law has hardly any force cannot test it. They contradict the law only if
+        the gap is clearly larger with it.
+
+        Parameters
+        ----------
+        hypothesis : H
+            The hypothesis.
+        least_low_end : float
+            The least lower end of the interval of its share in held-out trials.
         """
         share = self.share(hypothesis, held_out=True)
         if share.tested:
@@ -232,27 +252,32 @@ class Comparison(ABC, Generic[H]):
 
     @cached_property
     def contenders(self) -> list[H]:
-        """The hypotheses that may be named, as data do not exclude them, the most probable first.
+        """The hypotheses that may be named, in descending order of score.
 
-        Errors of readings are no part of a name: beside a law they take up whatever it leaves.
+        Errors of readings are removed from sets that contain laws too, since together with a law
+        they describe whatever the law does not explain. A set without them keeps the score of the
+        whole set.
         """
         contenders: dict[CandidateKey, tuple[H, float]] = {}
         for hypothesis in self.ranked:
             terms = hypothesis.candidate.terms
             laws = [number for number, term in enumerate(terms) if self.acts_on_structure(term)]
-            core: H | None = hypothesis
+            laws_only: H | None = hypothesis
             if 0 < len(laws) < len(terms):
-                core = self._subset(hypothesis, laws)
-            if not terms or core is None or core.candidate.key in contenders:
+                laws_only = self._subset(hypothesis, laws)
+            if not terms or laws_only is None or laws_only.candidate.key in contenders:
                 continue
-            if not self.objection(core):
-                contenders[core.candidate.key] = (core, self.score(hypothesis))
+            if not self.objection(laws_only):
+                contenders[laws_only.candidate.key] = (laws_only, self.score(hypothesis))
         best_score = max((score for _, score in contenders.values()), default=0.0)
         least_score = best_score - SEARCH.contenders
         return [hypothesis for hypothesis, score in contenders.values() if score > least_score]
 
     def _subset(self, hypothesis: H, numbers: Sequence[int]) -> H | None:
-        """Return the hypothesis of some of the terms of a hypothesis, given their indices."""
+        """Return the hypothesis of some terms of a hypothesis, given their indices.
+
+        It is None if these terms cannot be fitted alone.
+        """
         candidate, effect = hypothesis.candidate.subset(numbers, hypothesis.effect)
         key = candidate.key
         for known in self.ranked:
@@ -263,7 +288,10 @@ class Comparison(ABC, Generic[H]):
         return self._subsets[key]
 
     def simplest_equivalent(self, best: H) -> H:
-        """Return the simplest hypothesis that explains as much of the gap as a given one."""
+        """Return the simplest hypothesis that explains nearly as much of the gap as the best one.
+
+        The simplest has the fewest effects, then the fewest free shapes, then the highest score.
+        """
         count = len(best.candidate.terms)
         options: dict[CandidateKey, H] = {}
         for hypothesis in self.ranked:
@@ -281,7 +309,11 @@ class Comparison(ABC, Generic[H]):
         )
 
     def _is_simpler(self, option: H, best: H) -> bool:
-        """Return whether a hypothesis is simpler than the best one and may replace it."""
+        """Return whether a hypothesis may replace the best one because it is simpler.
+
+        Its families must be among those of the best one, it must explain nearly the same share of
+        the gap, and it must be one that may be named.
+        """
         if not option.candidate.terms or _complexity(option) >= _complexity(best):
             return False
         if not families_at_places(option) <= families_at_places(best):
@@ -294,66 +326,78 @@ class Comparison(ABC, Generic[H]):
         return not self.objection(option)
 
     def probability(self, *hypotheses: H) -> float:
-        """Return the probability that one of some hypotheses holds.
+        """Return the probability that at least one of some hypotheses is true.
 
-        A hypothesis holds, too, where another one has all of its families at its places. Refuted
-        hypotheses have no probability.
+        A hypothesis is also counted as true if a larger one is, that is one which contains all of
+        its families at their places. Hypotheses that trials refute have no probability.
         """
-        remaining = []
+        not_refuted = []
         for other in self.ranked:
             is_asked = any(other is hypothesis for hypothesis in hypotheses)
             if is_asked or not other.candidate.terms or not self._is_refuted(other):
-                remaining.append(other)
-        scores = np.array([self.score(other) for other in remaining])
-        asked = [families_at_places(hypothesis) for hypothesis in hypotheses]
+                not_refuted.append(other)
+        scores = np.array([self.score(other) for other in not_refuted])
+        families_asked = [families_at_places(hypothesis) for hypothesis in hypotheses]
         includes_asked = []
-        for other in remaining:
+        for other in not_refuted:
             families = families_at_places(other)
-            includes_asked.append(any(asked_families <= families for asked_families in asked))
+            includes_asked.append(
+                any(asked_families <= families for asked_families in families_asked)
+            )
         holds = np.array(includes_asked)
         if not holds.any():
             return 0.0
         return float(np.exp(logsumexp(scores[holds]) - logsumexp(scores)))
 
     def _is_refuted(self, hypothesis: H) -> bool:
-        """Return whether trials show that a hypothesis does not explain the gap."""
+        """Return whether trials show that a hypothesis does not explain enough of the gap."""
         _, high = self.share(hypothesis, held_out=False).interval
         if high < SEARCH.least_share:
             return True
         return self.has_held_out and not self._survives_held_out(hypothesis, 0.0)
 
     def competitors(self, best: H) -> list[H]:
-        """Return other names that neither evidence nor trials separate from the best one."""
+        """Return the hypotheses that could be named instead of the best one.
+
+        The data do not separate them from it: their score is within `SEARCH.force_rival` of that of
+        the best one, and their share of the gap is not smaller beyond chance.
+
+        Parameters
+        ----------
+        best : H
+            The hypothesis that would be named.
+        """
         best_share = self.decisive_share(best)
-        least_score = self.score(best) - SEARCH.force_rival
-        others: dict[EffectsAtPlaces, H] = {}
+        least_competing_score = self.score(best) - SEARCH.force_rival
+        by_effects: dict[EffectsAtPlaces, H] = {}
         for hypothesis in self.contenders:
             candidate = hypothesis.candidate
             is_same_family = families_at_places(hypothesis) == families_at_places(best)
             is_longer = len(candidate.terms) > len(best.candidate.terms)
+            # the same law with a free shape is no other cause, and more effects are no simpler one
             if (candidate.is_family and is_same_family) or is_longer:
                 continue
-            if self.score(hypothesis) <= least_score:
+            if self.score(hypothesis) <= least_competing_score:
                 continue
             if not best_share.is_larger_than(self.decisive_share(hypothesis)):
-                others.setdefault(effects_at_places(hypothesis), hypothesis)
-        others.pop(effects_at_places(best), None)
-        return list(others.values())
+                by_effects.setdefault(effects_at_places(hypothesis), hypothesis)
+        by_effects.pop(effects_at_places(best), None)
+        return list(by_effects.values())
 
 
 def _is_small(share: GapShare, least_low_end: float) -> bool:
-    """Return whether the interval of a share is too low for a name."""
+    """Return whether the 90 % interval of a share is too low for a hypothesis to be named."""
     low, high = share.interval
     return high < SEARCH.least_share or low < least_low_end
 
 
 def families_at_places(hypothesis: ComparedHypothesis) -> EffectsAtPlaces:
-    """Return the families of a hypothesis with their places."""
+    """Return the pairs (family, place) of the effects of a hypothesis."""
     return frozenset((term.effect.family, term.place) for term in hypothesis.candidate.terms)
 
 
 def effects_at_places(hypothesis: ComparedHypothesis) -> EffectsAtPlaces:
-    """Return the effects of a hypothesis with their places."""
+    """Return the pairs (identifier, place) of the effects of a hypothesis."""
     return frozenset((term.effect.identifier, term.place) for term in hypothesis.candidate.terms)
 
 

@@ -1,7 +1,6 @@
-"""What all verdicts on a search have in common: the record of a verdict, and its sentences.
+"""What all verdicts on a search have in common: records of hypotheses, and sentences.
 
-Also here: which errors of instruments are too small to be a name, when a gap is there, and which
-effects could not be tested.
+The module also decides which errors of instruments are too small to be named.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,10 +34,7 @@ from reporting.words import listing
 
 
 class ComparedHypothesis(Protocol):
-    """A fitted hypothesis as it is compared.
-
-    A simulation (`CandidateFit`), or a fit to the missing force.
-    """
+    """A fitted hypothesis: a simulation (`CandidateFit`), or a fit to the missing force."""
 
     @property
     def candidate(self) -> Candidate:
@@ -61,14 +57,14 @@ class ComparedHypothesis(Protocol):
         """The log evidence [nat]."""
 
     def __hash__(self) -> int:
-        """Return the hash of the object: each fit is one of its own."""
+        """Return the hash of the object, by its identity: two fits are never equal."""
 
 
 class VerdictOutcome(NamedTuple):
-    """A verdict, the search that it rests on, and the fit that stands for it.
+    """A verdict, the search on which it is based, and the fit that represents it.
 
-    The fit is that of the named set, of the family, of the most probable member of a group, or of
-    what is too small to tell; else the one without effect.
+    The fit is that of the named set or family, of the most probable member of a group, or of the
+    effects that are too small to be detected; else the one without effect.
     """
 
     verdict: Verdict
@@ -85,7 +81,7 @@ class WeightedHypothesis(NamedTuple):
 
 @dataclass(frozen=True)
 class Conclusion:
-    """The hypotheses of a search with their probabilities, from which verdicts on it are made.
+    """The hypotheses of a search with their probabilities, from which a verdict is made.
 
     Attributes
     ----------
@@ -112,8 +108,8 @@ class Conclusion:
         search : Search
             The search.
         best : CandidateFit
-            The best set of effects; its evidence is divided by the number of places it was chosen
-            from.
+            The best set of effects. For the Bayes factor its evidence is divided by the number of
+            places from which its places were chosen.
         probabilities : mapping of tuple of str to float
             The probability of each set of identifiers, the most probable first.
         """
@@ -129,7 +125,7 @@ class Conclusion:
 
     @cached_property
     def inclusion(self) -> dict[str, float]:
-        """The probability of each effect to be in the set that explains the data, by identifier."""
+        """The probability of each effect to be one of the missing effects, by its identifier."""
         inclusion = {}
         for effect in self.search.effects:
             total: float = 0
@@ -153,14 +149,14 @@ class Conclusion:
         resembles: tuple[str, ...] = (),
         remainders: tuple[RemainderEstimate, ...] = (),
     ) -> VerdictOutcome:
-        """Return a verdict with the fit that stands for it.
+        """Return a verdict with the fit that represents it.
 
         Parameters
         ----------
         kind, sentence, probability
             What is concluded, see `Verdict`.
         fit : CandidateFit, optional
-            The fit that stands for the verdict; the one without effect if left out.
+            The fit that represents the verdict; the one without effect if left out.
         effects, group, family, gates, resembles, remainders
             Further attributes of the `Verdict`.
         """
@@ -202,7 +198,7 @@ class Conclusion:
         gates : tuple of Gate
             The outcomes of the tests, that of absolute fit first.
         remainders : tuple of RemainderEstimate
-            What the fit leaves beside the noise.
+            The residual processes of the fit, by channel.
         """
         effects = named_effects(self.search.problem, fit)
         probability_clause = f"probability {probability_text(probability)}"
@@ -223,7 +219,17 @@ class Conclusion:
     def family(
         self, fit: CandidateFit, probability: float, gates: tuple[Gate, ...]
     ) -> VerdictOutcome:
-        """Return the verdict that names the family of a fit with a free shape."""
+        """Return the verdict that names the family of a law that was fitted with a free shape.
+
+        Parameters
+        ----------
+        fit : CandidateFit
+            The fit.
+        probability : float
+            The probability of the set.
+        gates : tuple of Gate
+            The outcomes of the tests.
+        """
         fit_with_draws = with_draws(self.search.problem, fit)
         effects = named_effects(self.search.problem, fit_with_draws)
         family = ", ".join(sorted({effect.family for effect in effects if effect.shape}))
@@ -245,7 +251,7 @@ class Conclusion:
 
 
 def plain_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Return identifiers of effects without the mark of a free shape."""
+    """Return identifiers of effects without the suffix `FREE_SHAPE`."""
     return tuple(name.removesuffix(FREE_SHAPE) for name in names)
 
 
@@ -275,26 +281,26 @@ def hypothesis_record(
 def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[NamedEffect, ...]:
     """Return the effects of a hypothesis with the values and 90 % intervals of their parameters.
 
-    Intervals are those of its draws, where it has any, else of its covariance.
+    Intervals are those of the posterior draws if the fit has any, else of its covariance.
     """
     low, high = _scaled_interval(hypothesis)
-    first = 0
+    first_parameter = 0
     effects = []
     for term, values in hypothesis.candidate.split(hypothesis.effect):
         estimates = []
         for index, parameter in enumerate(term.parameters):
-            bounds = (float(low[first + index]), float(high[first + index]))
+            bounds = (float(low[first_parameter + index]), float(high[first_parameter + index]))
             estimates.append(_estimate(parameter, float(values[index]), bounds))
-        first += len(estimates)
-        count = len(term.effect.parameters)
+        first_parameter += len(estimates)
+        parameter_count = len(term.effect.parameters)
         effects.append(
             NamedEffect(
                 identifier=term.effect.identifier,
                 name=term.effect.name,
                 place=term.place,
                 family=term.effect.family,
-                parameters=tuple(estimates[:count]),
-                shape=tuple(estimates[count:]),
+                parameters=tuple(estimates[:parameter_count]),
+                shape=tuple(estimates[parameter_count:]),
                 patch=term.patch(problem.setting, values),
             )
         )
@@ -302,11 +308,11 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
 
 
 def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of the 90 % intervals of the scaled effect parameters, (E,) each."""
+    """Return the lower and upper ends (E,) of the 90 % intervals of scaled effect parameters."""
     value = hypothesis.effect
     if isinstance(hypothesis, CandidateFit) and hypothesis.draws is not None:
         low, high = np.quantile(hypothesis.draws, (0.05, 0.95), axis=0)
-        # the most probable value may be one of many optima along a ridge
+        # the most probable value may lie outside of the quantiles, and is included
         return np.minimum(low, value), np.maximum(high, value)
     variances = np.diag(hypothesis.covariance)[len(hypothesis.shared) :]
     half_width = NINETY * np.sqrt(variances)
@@ -316,7 +322,17 @@ def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatA
 def _estimate(
     parameter: EffectParameter | ShapeParameter, scaled: float, bounds: tuple[float, float]
 ) -> Estimate:
-    """Return a parameter with its interval, given its scaled value and scaled interval."""
+    """Return the estimate of a parameter in its unit.
+
+    Parameters
+    ----------
+    parameter : EffectParameter or ShapeParameter
+        The parameter, whose prior maps scaled to physical values.
+    scaled : float
+        The scaled value.
+    bounds : tuple of float
+        The ends of its scaled 90 % interval.
+    """
     ends = [parameter.prior.value(bound) for bound in bounds]
     return Estimate(
         name=parameter.name,
@@ -358,7 +374,7 @@ def effects_text(effects: Iterable[NamedEffect]) -> str:
 
 
 def probability_text(probability: float) -> str:
-    """Return a probability in words that is neither rounded to one nor to zero."""
+    """Return a probability as text that is never rounded to one or to zero."""
     if isnan(probability):
         return "not known"
     if probability > 0.9995:
@@ -369,12 +385,12 @@ def probability_text(probability: float) -> str:
 
 
 def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
-    """Return the sentence on effects that are too small to be told from noise.
+    """Return the sentence that effects may be missing, but are too small to be detected.
 
     Parameters
     ----------
     names : sequence of str
-        The identifiers of the effects, of which the first are mentioned.
+        The identifiers of the effects, of which the first four are mentioned.
     noise_clause : str
         A clause on the noise, such as " that is coloured".
     """
@@ -386,17 +402,17 @@ def below_limit_sentence(names: Sequence[str], noise_clause: str = "") -> str:
 
 
 LEAST_SIZE = 1e-3
-"""Size of a gain, tare or clock error over what it acts on, below which it is a nuisance and no
-name."""
+"""Relative size of a gain, tare or clock error below which it is not named, as any instrument has
+errors of this size."""
 UNSTATED_GAIN = 1e-2
-"""The same for the gain of a channel without a stated deviation, beside a law that explains as
-much: a calibration that nobody stated is not exact."""
+"""The same for the gain of a channel without a stated deviation, if laws alone explain as much. A
+gain is never exact, even if the campaign states no deviation."""
 
 
 def has_one_driven_channel(problem: Problem) -> bool:
-    """Return whether a campaign has driven trials and one channel only.
+    """Return whether all trials of a campaign have a recorded drive, and there is only one channel.
 
-    No error of that channel has a pattern of its own then.
+    An error of that channel cannot then be told from a change of the model's parameters.
     """
     driven_kinds = (TrialKind.DRIVEN, TrialKind.FORCED)
     is_driven = all(trial.kind in driven_kinds for trial in problem.campaign.trials)
@@ -404,14 +420,14 @@ def has_one_driven_channel(problem: Problem) -> bool:
 
 
 def is_small(problem: Problem, patch: ModelPatch, *, unstated: float = LEAST_SIZE) -> bool:
-    """Return whether a patch has only errors of instruments that are too small to be a name.
+    """Return whether a change consists of errors of instruments that are too small to be named.
 
     Parameters
     ----------
     problem : Problem
-        The campaign and model, by whose scales sizes are measured.
+        The campaign and model, whose scales make the sizes relative.
     patch : ModelPatch
-        The patch.
+        The change of the model by an effect.
     unstated : float
         The least size of a gain of a channel without a stated deviation.
     """
@@ -427,16 +443,13 @@ def is_small(problem: Problem, patch: ModelPatch, *, unstated: float = LEAST_SIZ
 
 
 def _is_exact(problem: Problem, gain: SensorGain) -> bool:
-    """Return whether a campaign states no deviation of the gain of a channel."""
+    """Return whether a campaign states no uncertainty of the gain of a channel."""
     channel = problem.campaign.channels.get(gain.channel)
     return channel is not None and channel.gain_deviation == 0.0
 
 
 def _instrument_error(problem: Problem, primitive: Primitive) -> float | None:
-    """Return the size of an error of an instrument over what it acts on.
-
-    None for other primitives.
-    """
+    """Return the relative size of an error of an instrument; None for other primitives."""
     scales = problem.setting.scales
     if isinstance(primitive, LoadGain):
         tare = abs(primitive.tare) / scales.force if scales.force > 0.0 else 0.0

@@ -1,12 +1,11 @@
-"""The test of consistency.
+"""The test of consistency: residuals of a fit must not depend on load, run, or sensor channel.
 
-What a named effect leaves must not follow loads, runs, or its own channel.
-
-An effect that is not in the catalogue can be imitated by one that is, closely enough for the sum of
-squares of many thousand samples. The difference then lies along few directions: the response of one
-kind of test has another size, slope over the span or zero than the name allows. A score test (Rao
-1948, Proc. Camb. Phil. Soc. 44, 50-57) looks along these directions only, with nuisances and effect
-free to follow.
+An effect that is not in the catalogue can be imitated by one that is, so closely that the sum of
+squares of many thousand samples does not show it. The difference then lies in few patterns of the
+readings: the response of one kind of trial has another size, slope over the span, or zero than the
+fitted effect gives it. Such a pattern is called a *direction* here. A score test (Rao 1948, Proc.
+Camb. Phil. Soc. 44, 50-57) examines whether the misfit falls along these directions more than by
+chance, while nuisances and the parameters of the effect are refitted.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,16 +27,18 @@ from fe.runtime.patch import SENSORS
 from reporting.words import counted
 
 CONSISTENCY_LEVEL = 1e-3
-"""Level of the test, by Bonferroni over its parts; a true name fails it this often."""
+"""Level of the whole test, with Bonferroni's correction for its parts: the probability that a true
+hypothesis fails it."""
 IDENTIFIED = 0.5
-"""Posterior over prior deviation of an effect parameter below which its prior does not count in the
-test."""
+"""Ratio of posterior to prior deviation of an effect parameter below which its prior is left out of
+the test."""
 SEPARATE = 1e-6
-"""Share of a direction that must remain when nuisances and effect have followed."""
+"""Fraction of the squared length of a direction that must remain after the part that nuisances and
+the effect can compensate is projected out."""
 LEAST_FREEDOM = 20.0
-"""Degrees of freedom from which on the noise of the channels concerned is known well enough."""
+"""Least degrees of freedom of the noise estimate for a test."""
 LEAST_STATIONS = 3
-"""Stations along the span from which on a slope over it is tested."""
+"""Least number of different stations along the span for a slope over the span to be tested."""
 
 Direction = Mapping[int, FloatArray]
 """The change of the prediction (N, C) of each trial, by the index of the trial."""
@@ -52,13 +53,14 @@ class ScoreTest:
     name : str
         The name of the group of directions that was tested.
     statistic : float
-        The fall of the sum of squares, in units of the noise, that the directions promise.
+        The decrease of the sum of squares along the directions, to first order, in units of the
+        noise variance.
     count : int
-        The number of directions that can be told from nuisances and effect.
+        The number of independent directions that nuisances and effect cannot compensate.
     p_value : float
-        The probability of a fall as large if the fit is right.
+        The probability of a decrease at least as large if the hypothesis is true.
     strongest : str
-        The direction that departs most by itself, with its size in standard deviations.
+        The single direction of the largest score, with its score in standard deviations.
     """
 
     name: str
@@ -69,7 +71,7 @@ class ScoreTest:
 
 
 def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
-    """Test whether the residuals of a fit follow loads, runs or the channel of its effect.
+    """Test whether the residuals of a fit depend on load, run or the sensor channel of its effect.
 
     Parameters
     ----------
@@ -81,8 +83,8 @@ def check_consistency(problem: Problem, fit: CandidateFit) -> Gate:
     Returns
     -------
     Gate
-        The outcome. `passed` is None where there is no static trial, no flight, and no effect of a
-        single channel, or too few readings.
+        The outcome. `passed` is None if there is nothing to test: no static trial, no flight and no
+        effect of a single channel; or if there are too few readings.
     """
     tests = score_tests(problem, fit, directions(problem, fit))
     if not tests:
@@ -124,10 +126,11 @@ def score_tests(
     Returns
     -------
     list of ScoreTest
-        The tests of the groups that have a direction left and enough readings.
+        The tests of the groups that have enough readings and at least one direction that nuisances
+        and effect cannot compensate.
     """
-    # An effect parameter that the data determine follows without its prior: that its value is
-    # unlikely says nothing of what the effect leaves.
+    # An effect parameter that the data determine is refitted without its prior: the test is about
+    # the residuals, and not about how probable the value of the parameter is.
     is_determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
     effect_precision = np.where(is_determined, 0.0, 1.0)
     screen = Screen(problem, fit, record_noise=False, effect_precision=effect_precision)
@@ -142,16 +145,16 @@ def score_tests(
 
 
 class _ProjectedDirections(NamedTuple):
-    """Directions of unit length, without what nuisances and effect can do.
+    """Directions of unit length after projection, see `Screen.project`.
 
     Attributes
     ----------
     labels : list of str
         The names of the K directions.
     gradient : (K,) array
-        The slope of the misfit along each direction: their scores.
+        The negative slope of the misfit along each direction, which is its score.
     information : (K, K) array
-        The inner products of the directions: the Fisher information of their sizes.
+        The inner products of the projected directions: the Fisher information of their amplitudes.
     """
 
     labels: list[str]
@@ -162,29 +165,48 @@ class _ProjectedDirections(NamedTuple):
 def _projected_directions(
     problem: Problem, screen: Screen, group: Mapping[str, Direction]
 ) -> _ProjectedDirections:
-    """Return a group of directions without what nuisances and effect can do."""
+    """Return a group of directions after the part that nuisances and effect can do is removed.
+
+    Parameters
+    ----------
+    problem : Problem
+        The campaign and model.
+    screen : Screen
+        The fit, with its nuisances and effect parameters eliminated.
+    group : mapping of str to Direction
+        The directions by their names.
+    """
     sign = screen.sign
     labels = []
     vectors = []
-    slopes = []
+    scores = []
     for label, direction in group.items():
         changes = {}
         for number, change in direction.items():
             changes[number] = problem.trials[number].standardised(change)
-        vector, slope, _ = screen.project(changes)
+        vector, score, _ = screen.project(changes)
         length = float(np.linalg.norm(vector[sign > 0.0]))
         if length > 0.0:
             labels.append(label)
             vectors.append(vector / length)
-            slopes.append(slope / length)
+            scores.append(score / length)
     if not labels:
         return _ProjectedDirections(labels, np.zeros(0), np.zeros((0, 0)))
     information = (np.array(vectors) * sign) @ np.array(vectors).T
-    return _ProjectedDirections(labels, np.array(slopes), information)
+    return _ProjectedDirections(labels, np.array(scores), information)
 
 
 class _NoiseFreedom(NamedTuple):
-    """The degrees of freedom of the noise of channels, and their share not spent by the fit."""
+    """The degrees of freedom of the noise estimate of some channels.
+
+    Attributes
+    ----------
+    freedom : float
+        The degrees of freedom of noise records and residuals together; infinite if the noise of one
+        of the channels is known.
+    share : float
+        The fraction of the degrees of freedom of records and readings that the fit did not absorb.
+    """
 
     freedom: float
     share: float
@@ -199,12 +221,12 @@ def _noise_freedom(
         for number, change in direction.items():
             is_changed = np.any(change != 0.0, axis=0)
             channels.update(problem.trials[number].groups[is_changed].tolist())
-    numbers = sorted(channels)
-    freedom = problem.freedom[numbers] + problem.counts[numbers]
+    channel_numbers = sorted(channels)
+    freedom = problem.freedom[channel_numbers] + problem.counts[channel_numbers]
     if np.any(np.isinf(freedom)):
         return _NoiseFreedom(np.inf, 1.0)
-    remaining = float(np.sum(freedom - fit.spent[numbers]))
-    return _NoiseFreedom(remaining, remaining / float(freedom.sum()))
+    residual_freedom = float(np.sum(freedom - fit.spent[channel_numbers]))
+    return _NoiseFreedom(residual_freedom, residual_freedom / float(freedom.sum()))
 
 
 def _score_test(
@@ -212,42 +234,58 @@ def _score_test(
 ) -> ScoreTest | None:
     """Return the score test of a group of directions; None if nothing can be tested.
 
-    The statistic is g' I^+ g, with g the gradient and I^+ the pseudo-inverse of the information.
+    The statistic is g^T I^+ g, with the gradient g and the pseudo-inverse I^+ of the information.
+
+    Parameters
+    ----------
+    name : str
+        The name of the group.
+    projected : _ProjectedDirections
+        The directions.
+    noise : _NoiseFreedom
+        The degrees of freedom of the noise of the channels that they change.
     """
     gradient = projected.gradient
-    values, modes = np.linalg.eigh(projected.information)
-    is_separate = values > SEPARATE
+    eigenvalues, eigenvectors = np.linalg.eigh(projected.information)
+    is_separate = eigenvalues > SEPARATE
     count = int(is_separate.sum())
-    components = (modes.T @ gradient)[is_separate]
-    statistic = float(np.sum(components**2 / values[is_separate]))
+    gradient_components = (eigenvectors.T @ gradient)[is_separate]
+    statistic = float(np.sum(gradient_components**2 / eigenvalues[is_separate]))
     if not count or noise.freedom - count < LEAST_FREEDOM:
         return None
     # the strongest direction by itself
     single_information = np.diag(projected.information)
     single_information = np.where(single_information > SEPARATE, single_information, np.inf)
-    deviations = np.abs(gradient) / np.sqrt(single_information)
-    strongest = int(np.argmax(deviations))
+    z_scores = np.abs(gradient) / np.sqrt(single_information)
+    strongest = int(np.argmax(z_scores))
     return ScoreTest(
         name=name,
         statistic=statistic,
         count=count,
         p_value=_p_value(statistic, count, noise),
-        strongest=f"{projected.labels[strongest]} ({deviations[strongest]:.1f} deviations)",
+        strongest=f"{projected.labels[strongest]} ({z_scores[strongest]:.1f} deviations)",
     )
 
 
 def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
-    """Return the tail probability of a score statistic of some directions.
+    """Return the p-value of a score statistic: by χ² if the noise is known, else by an F test.
 
-    Χ², or F for an estimated noise.
+    Parameters
+    ----------
+    statistic : float
+        The score statistic.
+    count : int
+        The number of independent directions.
+    noise : _NoiseFreedom
+        The degrees of freedom of the noise estimate.
     """
     if isinf(noise.freedom):
         return float(chi2.sf(statistic, count))
-    scaled = statistic * noise.share
-    if scaled >= noise.freedom:
+    scaled_statistic = statistic * noise.share
+    if scaled_statistic >= noise.freedom:
         return 0.0
     remaining_freedom = noise.freedom - count
-    ratio = (scaled / count) / ((noise.freedom - scaled) / remaining_freedom)
+    ratio = (scaled_statistic / count) / ((noise.freedom - scaled_statistic) / remaining_freedom)
     return float(f.sf(ratio, count, remaining_freedom))
 
 
@@ -255,42 +293,66 @@ def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
 
 
 class _DirectionGroups:
-    """Directions that are collected, by group and label."""
+    """The directions of all tests while they are collected, by group and label."""
 
     def __init__(self) -> None:
         self.groups: dict[str, dict[str, dict[int, FloatArray]]] = {}
 
     def add(self, group: str, label: str, number: int, change: FloatArray) -> None:
-        """Add the change of a trial's prediction (N, C) to a direction."""
+        """Add the change of the prediction of a trial to a direction.
+
+        Parameters
+        ----------
+        group, label : str
+            The name of the test, and that of the direction in it.
+        number : int
+            The index of the trial.
+        change : (N, C) array
+            The change of its prediction [unit of the channel].
+        """
         self.groups.setdefault(group, {}).setdefault(label, {})[number] = change
 
 
 def directions(problem: Problem, fit: CandidateFit) -> Mapping[str, Mapping[str, Direction]]:
     """Return the directions of each test by their names.
 
-    Loads at rest and in flight: size, zero (at rest only) and slope over the span of the response,
-    by place of the load. Runs: a zero that all channels of a quantity share. The channel of an
-    effect: the size of its response by kind of trial and place of the load, and its drift.
+    There are three kinds of tests. For static loads and for flight, the directions are the size,
+    the zero (static only) and the slope over the span of the response, for each place of the load.
+    For static runs, they are zeros that all channels of one quantity have in common. For the sensor
+    channel of an effect, they are the size of its response, for each kind of trial and place of the
+    load, and a drift over the campaign.
     """
-    collected = _DirectionGroups()
+    groups = _DirectionGroups()
     own_channels = _own_channels(problem, fit)
     last_start = max(abs(data.trial.start) for data in problem.trials) or 1.0
     for number, data in enumerate(problem.trials):
         response = _response(problem, fit, number)
         if data.trial.kind in (TrialKind.STATIC, TrialKind.FLIGHT):
-            _add_loads(collected, problem, number, response)
+            _add_loads(groups, problem, number, response)
         if data.trial.kind is TrialKind.STATIC:
-            _add_runs(collected, problem, number)
+            _add_runs(groups, problem, number)
         for channel in own_channels:
             if channel in data.trial.channels:
-                _add_channel(collected, problem, number, channel, response, last_start)
-    return collected.groups
+                _add_channel(groups, problem, number, channel, response, last_start)
+    return groups.groups
 
 
 def _add_loads(
     collected: _DirectionGroups, problem: Problem, number: int, response: FloatArray
 ) -> None:
-    """Add size, zero and slope over the span of the response (N, C) of a trial under load."""
+    """Add the size, zero and slope over the span of the response of a trial under load.
+
+    Parameters
+    ----------
+    collected : _DirectionGroups
+        The directions.
+    problem : Problem
+        The campaign and model.
+    number : int
+        The index of the trial.
+    response : (N, C) array
+        Its response to the load.
+    """
     data = problem.trials[number]
     is_static = data.trial.kind is TrialKind.STATIC
     group = "static loads" if is_static else "loads of flight"
@@ -306,7 +368,7 @@ def _add_loads(
 
 
 def _add_runs(collected: _DirectionGroups, problem: Problem, number: int) -> None:
-    """Add the zeros of a static trial's run that all channels of a quantity share."""
+    """Add, for each quantity, a zero that all its channels have in common in a static run."""
     data = problem.trials[number]
     trial = data.trial
     quantities = [problem.campaign.channels[name].quantity for name in trial.channels]
@@ -359,20 +421,20 @@ def _add_channel(
 
 
 def _response(problem: Problem, fit: CandidateFit, number: int) -> FloatArray:
-    """Return what the motion or load of a trial does to its readings (N, C)."""
+    """Return the part of a trial's predicted readings (N, C) that its motion or load causes."""
     trial = problem.trials[number].trial
     response = fit.responses[number]
     if trial.kind is TrialKind.STATIC:
-        # temperature and the offset of a run are no response to the load
+        # subtract the row of least force: temperature and the offset of a run are no response to it
         response = response - response[np.argmin(np.abs(trial.force))]
     gains = problem.shared.gains(fit.point.shared, trial.channels)
     return np.asarray((1.0 + gains) * response)
 
 
 def _zero_scale(problem: Problem, quantity: Quantity) -> float:
-    """Return the size of a zero of a quantity.
+    """Return the amplitude of a common zero of the channels of a quantity [SI].
 
-    The least noise of its channels, the same in all trials.
+    It is the least noise deviation of these channels, so that it is the same in all trials.
     """
     deviations = []
     for channel in problem.campaign.channels.values():
@@ -389,19 +451,20 @@ def _load_place(data: TrialData) -> str:
 
 
 def _along_span(problem: Problem, data: TrialData) -> FloatArray | None:
-    """Return the station of each channel (C,) from their mean, over their range.
+    """Return the position of each channel along the span (C,); None with too few stations.
 
-    0 where it is not known.
-
-    None with too few stations.
+    It is the difference of the channel's station from their mean, over their range; 0 for a channel
+    without a station.
     """
     stations = [problem.campaign.channels[name].station for name in data.trial.channels]
-    values = np.array([np.nan if station is None else station for station in stations])
-    is_known = np.isfinite(values)
-    known = values[is_known]
-    if len(np.unique(known)) < LEAST_STATIONS:
+    station_values = np.array([np.nan if station is None else station for station in stations])
+    is_known = np.isfinite(station_values)
+    known_stations = station_values[is_known]
+    if len(np.unique(known_stations)) < LEAST_STATIONS:
         return None
-    return np.asarray(np.where(is_known, (values - known.mean()) / np.ptp(known), 0.0))
+    return np.asarray(
+        np.where(is_known, (station_values - known_stations.mean()) / np.ptp(known_stations), 0.0)
+    )
 
 
 def _own_channels(problem: Problem, fit: CandidateFit) -> Sequence[str]:
@@ -415,10 +478,7 @@ def _own_channels(problem: Problem, fit: CandidateFit) -> Sequence[str]:
 
 
 def _own_channel(problem: Problem, term: EffectTerm) -> str:
-    """Return the channel that a term acts on, if it acts on one channel alone.
-
-    Else an empty name.
-    """
+    """Return the only sensor channel that a term acts on; empty if it acts on anything else."""
     patch = term.patch(problem.setting, term.start() + 1.0)
     if not all(isinstance(primitive, SENSORS) for primitive in patch):
         return ""

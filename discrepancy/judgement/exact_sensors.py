@@ -1,4 +1,7 @@
-"""Zeros and gains that a campaign states as exact, but that close the misfit when they are free."""
+"""Zeros and gains of sensors that a campaign states as exact, but that explain the misfit.
+
+They are found by fitting the model again with these zeros or gains as unknowns.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,13 +17,12 @@ from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.problem import Problem
 
 LEAST_DROP = 16.0
-"""Least drop of a channel's sum of squares that a free zero or gain must promise: four
-deviations."""
+"""Least expected drop of a channel's sum of squares for a free zero or gain to be fitted: that
+of four noise deviations."""
 MOST_FITS = 3
-"""Number of channels that are set free one by one, the most promising first."""
+"""Number of channels whose zero or gain is fitted one by one, the most promising first."""
 LEAST_SHARE = 0.9
-"""Least share of the misfit of all channels that a free zero or gain must close once it is
-fitted."""
+"""Least share of the misfit of all channels that a fitted zero or gain must remove for a remark."""
 WIDE_GAIN = 1.0
 """Relative deviation that stands for a gain of which nothing is known."""
 
@@ -50,10 +52,10 @@ _GAIN = _Nuisance("gain_deviation", "gain", WIDE_GAIN)
 def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]:
     """Return a sentence for each zero or gain that the campaign wrongly states as exact.
 
-    Such a zero or gain explains what the model leaves. The channels whose zero (or gain) promises
-    most by its first step are set free and fitted, one by one and then together; the promise alone
-    would not decide, as other unknowns hide it. They are reported where that closes nine tenths of
-    the misfit of all channels.
+    The drop of the sum of squares by a free zero (or gain) is first estimated with all other
+    unknowns fixed. The channels of the largest drops are then fitted with the zero free, one by one
+    and at last all together, since other unknowns may compensate it. A channel is reported if its
+    fit removes at least `LEAST_SHARE` of the misfit of all channels.
 
     Parameters
     ----------
@@ -63,12 +65,12 @@ def exact_sensor_remarks(problem: Problem, no_effect: CandidateFit) -> list[str]
         The fit of the model without any effect.
     """
     for nuisance in (_ZERO, _GAIN):
-        drops: dict[str, float] = {}
+        drop_by_channel: dict[str, float] = {}
         for name in problem.channel_names:
             drop = _promised_drop(problem, no_effect, name, nuisance)
             if drop > 0.0:
-                drops[name] = drop
-        promising = sorted(drops, key=lambda name: drops[name])
+                drop_by_channel[name] = drop
+        promising = sorted(drop_by_channel, key=lambda name: drop_by_channel[name])
         sets_of_channels = [[name] for name in promising[::-1][:MOST_FITS]]
         if len(promising) > 1:
             sets_of_channels.append(promising)
@@ -91,10 +93,11 @@ def _remark(name: str, nuisance: _Nuisance, share: float) -> str:
 def _promised_drop(
     problem: Problem, no_effect: CandidateFit, name: str, nuisance: _Nuisance
 ) -> float:
-    """Return the drop of a channel's sum of squares that a free zero or gain promises.
+    """Return the drop of a channel's sum of squares by a free zero or gain, other unknowns fixed.
 
-    It is 0 where a fit is not worth it, the campaign does not state it as exact, or the noise of
-    the channel is not known.
+    With the residuals r and their derivative d it is (r.d)^2 / d.d. It is 0 if the drop is below
+    `LEAST_DROP`, if the campaign does not state the zero or gain as exact, or if the channel has no
+    noise record.
     """
     channel = problem.campaign.channels[name]
     if channel.noise is None or getattr(channel, nuisance.key) != 0.0:
@@ -115,7 +118,15 @@ def _promised_drop(
 
 
 class _ChannelDerivative(NamedTuple):
-    """The residual (N,) of a channel in a trial, and its derivative (N,) by the zero or gain."""
+    """The residuals of a channel in a trial, and their derivative by a zero or gain.
+
+    Attributes
+    ----------
+    residual : (N,) array
+        The standardised residuals.
+    derivative : (N,) array
+        The standardised derivative of the prediction by the zero or gain.
+    """
 
     residual: FloatArray
     derivative: FloatArray
@@ -124,7 +135,7 @@ class _ChannelDerivative(NamedTuple):
 def _channel_derivatives(
     problem: Problem, no_effect: CandidateFit, name: str, nuisance: _Nuisance
 ) -> list[_ChannelDerivative]:
-    """Return residual and derivative by a channel's zero or gain, for each trial that has it."""
+    """Return the residuals and derivatives of a channel for each trial that has the channel."""
     derivatives = []
     for number, data in enumerate(problem.trials):
         if name not in data.trial.channels:
@@ -144,7 +155,11 @@ def _channel_derivatives(
 def _closed_share(
     problem: Problem, no_effect: CandidateFit, names: Sequence[str], nuisance: _Nuisance
 ) -> float:
-    """Return the share of the misfit that closes when the zeros or gains of channels are free."""
+    """Return the share of the misfit that is removed if zeros or gains of channels are fitted.
+
+    The misfit is the sum of squared standardised residuals beyond that of noise alone, which is the
+    number of readings.
+    """
     channels = dict(problem.campaign.channels)
     for name in names:
         if nuisance is _ZERO:
@@ -156,8 +171,8 @@ def _closed_share(
     free_problem = Problem(campaign, problem.model, setting)
     free_fit = fit(free_problem, Candidate(), free_problem.start(Candidate()))
     free_fit = refit_from_first_readings(free_problem, free_fit)
-    count = float(problem.counts.sum())
-    misfit = no_effect.chi_square - count
-    if misfit <= 0.0:
+    reading_count = float(problem.counts.sum())
+    excess_before = no_effect.chi_square - reading_count
+    if excess_before <= 0.0:
         return 0.0
-    return 1.0 - max(free_fit.chi_square - count, 0.0) / misfit
+    return 1.0 - max(free_fit.chi_square - reading_count, 0.0) / excess_before

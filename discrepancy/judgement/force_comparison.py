@@ -1,4 +1,7 @@
-"""Comparison of hypotheses by how they follow the missing force."""
+"""Comparison of hypotheses by how well their force agrees with the missing force.
+
+The missing force is estimated from the readings without any law.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +26,7 @@ from .comparison import Comparison
 
 
 class ForceComparison(Comparison[ForceHypothesis]):
-    """Hypotheses compared by how they follow the missing force.
+    """A comparison of hypotheses by how well their force agrees with the missing force.
 
     Parameters
     ----------
@@ -43,7 +46,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
 
     @property
     def no_effect(self) -> ForceHypothesis:
-        """The missing forces alone."""
+        """The hypothesis of free missing forces without any law."""
         return self.force_search.whole
 
     @property
@@ -56,34 +59,35 @@ class ForceComparison(Comparison[ForceHypothesis]):
         return self._force_shares.share_of(hypothesis, held_out=held_out)
 
     def fit_followed(self, candidate: Candidate, effect: FloatArray) -> ForceHypothesis | None:
-        """Return a further hypothesis, begun at scaled effect parameters (E,).
+        """Return the fit of a further candidate, from scaled effect parameters (E,).
 
-        None if it cannot be fitted.
+        None if the candidate cannot be fitted.
         """
         return self.force_search.followed(self.force_search.whole, candidate, effect)
 
     def with_free_shape(self, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
-        """Return a hypothesis of one law with its shape free, if that was compared."""
+        """Return the hypothesis of a single law with its shape free; None if there is none."""
         (term,) = hypothesis.candidate.terms
         key = Candidate((replace(term, free_shape=True),)).key
         return next((other for other in self.ranked if other.candidate.key == key), None)
 
     def start_point(self, hypothesis: ForceHypothesis) -> Point:
-        """Return the point of a hypothesis along the missing force."""
+        """Return the values of all unknowns of a hypothesis as fitted to the missing force."""
         return self.force_search.whole_point(hypothesis)
 
     def failed_check(self, hypothesis: ForceHypothesis) -> str:
-        """Return an empty reason: there are no further tests along the missing force."""
+        """Return an empty reason, as there are no further tests with a missing force."""
         return ""
 
     def check_fit(self, hypothesis: ForceHypothesis) -> Gate:
-        """Test whether the best simulation leaves noise alone."""
+        """Test whether the residuals of the best simulation are noise as in the noise records."""
         return check_absolute_fit(self.problem, self.search.best())
 
     def _simulation(self, hypothesis: ForceHypothesis) -> CandidateFit:
-        """Return the simulation of a hypothesis at its values, with their covariance.
+        """Return the simulation with the parameters of a hypothesis, and their covariance.
 
-        It is the fit without effect if the hypothesis cannot be simulated.
+        Only the trials' own unknowns are fitted. It is the fit without effect if the hypothesis
+        cannot be simulated.
         """
         start = self.start_point(hypothesis)
         try:
@@ -93,14 +97,17 @@ class ForceComparison(Comparison[ForceHypothesis]):
         return replace(simulation, covariance=hypothesis.covariance)
 
     def remaining_text(self, hypothesis: ForceHypothesis, share: GapShare) -> str:
-        """Return in words how much a hypothesis leaves of the missing force."""
+        """Return in words how much of the missing force a hypothesis does not explain."""
         unit = self._force_unit(hypothesis)
         return (
             f"{share.remaining_rms:.3g} of {share.total_rms:.3g} {unit} (rms) of the missing force"
         )
 
     def _force_unit(self, hypothesis: ForceHypothesis) -> str:
-        """Return the unit of the force at a hypothesis's port, or else of the missing force."""
+        """Return the unit of the force at the port of a hypothesis's law.
+
+        If no law acts at a port, it is that of the first missing force.
+        """
         ports = self.force_search.ports
         law_ports = [term.place for term in hypothesis.candidate.terms if term.place in ports]
         port = law_ports[0] if law_ports else ports[next(iter(hypothesis.processes))]
@@ -108,7 +115,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
         return force_unit
 
     def gap_sentence(self) -> str:
-        """Return a sentence on the missing force: size, port, and the variables that order it."""
+        """Return a sentence on the size and port of the missing force, and on what it depends."""
         missing = missing_force(self.force_search, self.force_search.best())
         if missing is None:
             return ""

@@ -1,9 +1,10 @@
-"""Verdicts where no simulation leaves noise alone: named in part, a group, or unexplained.
+"""Verdicts if the residuals of every simulation are more than noise.
 
-A set of effects is named in part if it is probable and explains most of the gap, in the trials that
-were fitted and in those held out, with calibrated values within twice their prior deviations.
-Hypotheses are compared by the missing force where it can be seen, else by simulations under the
-noise that they leave.
+A verdict then names a set of effects *in part*, or a group of hypotheses that cannot be told apart,
+or says that the gap between model and readings is unexplained. A set is named in part if it is
+probable and explains most of the gap, in fitted and in held-out trials, with calibrated values that
+are consistent with priors of twice the stated deviations. Hypotheses are compared by the missing
+force if it can be estimated, else by simulations under a noise as large as their residuals.
 """
 
 from collections.abc import Sequence
@@ -38,24 +39,25 @@ from .part_sentences import shape_sentence, unproved_addition_sentence
 from .simulation_comparison import SimulationComparison
 
 LEAST_MENTIONED = 0.1
-"""Share of the gap from which on a hypothesis is mentioned as the best one where none is named."""
+"""Least share of the gap for a hypothesis to be mentioned as the best one if none is named."""
 
 
 def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
-    """Return the verdict where the best simulation leaves more than the recorded noise.
+    """Return the verdict if the residuals of the best simulation are more than the recorded noise.
 
     Parameters
     ----------
     search : Search
-        All candidates as fitted to the recorded noise, and hypotheses along the missing force if it
-        is seen.
+        The candidates as fitted under the recorded noise, and the hypotheses that were fitted to
+        the missing force, if there is any.
     first : Verdict
-        The verdict that the simulations led to.
+        The verdict on the simulations.
 
     Returns
     -------
     VerdictOutcome
-        The verdict; its fit is that of the best hypothesis for an unexplained gap, too.
+        The verdict. If the gap is unexplained, its fit is that of the best hypothesis that the
+        sentence mentions.
     """
     if search.force_search is not None and search.force_hypotheses:
         return _verdict_by_comparison(ForceComparison(search, search.force_search), first)
@@ -69,14 +71,16 @@ def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
 
 
 def verdict_by_laws_alone(search: Search, first: Verdict) -> VerdictOutcome | None:
-    """Return the verdict that names laws in part which explain nearly all of the missing force.
+    """Return the verdict that names laws alone in part, without errors of readings.
+
+    They must explain nearly all of the missing force.
 
     Parameters
     ----------
     search : Search
-        The search, with hypotheses along the missing force.
+        The search, with hypotheses that were fitted to the missing force.
     first : Verdict
-        The verdict that the simulations led to.
+        The verdict on the simulations.
 
     Returns
     -------
@@ -93,15 +97,16 @@ def verdict_by_laws_alone(search: Search, first: Verdict) -> VerdictOutcome | No
 
 
 def without_negligible_effect(search: Search, first: Verdict, fit: CandidateFit) -> VerdictOutcome:
-    """Return the verdict on a named set of effects, one of which may explain next to nothing.
+    """Return the verdict on a named set, without an effect that explains hardly anything.
 
-    Where a fit leaves nearly noise, a wider noise explains that as well as such an effect does. The
-    effect stays if the evidence of the whole set is far above that of the set without it.
+    If the residuals are nearly noise, a slightly wider noise explains them as well as such an
+    effect does. So the subsets of the set are compared with it under the wider noise. The effect
+    remains if the evidence of the whole set is far above that of the set without it.
 
     Parameters
     ----------
     search : Search
-        All candidates as fitted to the recorded noise.
+        The candidates as fitted under the recorded noise.
     first : Verdict
         The verdict that names the set.
     fit : CandidateFit
@@ -146,10 +151,10 @@ def _has_equal_subset(
 def _key_of_notable_terms(
     comparison: SimulationComparison, fit: CandidateFit
 ) -> set[tuple[str, str]]:
-    """Return labels and places of the effects of a fit that may be a name beside the others.
+    """Return the pairs (label, place) of the effects of a fit that are worth a name of their own.
 
-    Errors of instruments that are too small may not, and with one driven channel no error of
-    readings.
+    Errors of instruments that are too small are not. If the campaign has one channel under a
+    recorded drive, no error of readings is.
     """
     problem = comparison.problem
     one_channel = has_one_driven_channel(problem)
@@ -174,7 +179,7 @@ def _verdict_by_comparison(comparison: Comparison[H], first: Verdict) -> Verdict
     comparison : Comparison
         The hypotheses.
     first : Verdict
-        The verdict that the simulations led to, which says how they failed.
+        The verdict on the simulations, with the tests that they failed.
     """
     if not comparison.contenders:
         return _unexplained(comparison, first)
@@ -206,20 +211,30 @@ def _verdict_by_comparison(comparison: Comparison[H], first: Verdict) -> Verdict
 
 
 def _named_in_part(comparison: Comparison[H], best: H, probability: float) -> VerdictOutcome:
-    """Return the verdict that names a hypothesis in part."""
+    """Return the verdict that names the effects of a hypothesis in part.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The hypotheses.
+    best : H
+        The hypothesis that is named.
+    probability : float
+        Its probability.
+    """
     effects = named_effects(comparison.problem, best)
     share = comparison.decisive_share(best)
     families = {term.effect.family for term in best.candidate.terms if term.free_shape}
     family = ", ".join(sorted(families))
-    parts = []
+    phrases = []
     canonical = effects_text(effect for effect in effects if not effect.shape)
     if canonical:
-        parts.append(canonical)
+        phrases.append(canonical)
     if family:
-        parts.append(f"an effect of the family {family}, with a shape of its own,")
+        phrases.append(f"an effect of the family {family}, with a shape of its own,")
     _, explains = comparison.closed_share(best)
     sentence = (
-        f"{capital(listing(parts))} is missing (probability {probability_text(probability)}): "
+        f"{capital(listing(phrases))} is missing (probability {probability_text(probability)}): "
         f"{explains}."
     )
     if comparison.has_held_out and not share.held_out:
@@ -241,17 +256,26 @@ def _named_in_part(comparison: Comparison[H], best: H, probability: float) -> Ve
 
 
 def _group(comparison: Comparison[H], members: Sequence[H], probability: float) -> VerdictOutcome:
-    """Return the verdict that one of several hypotheses is what is missing.
+    """Return the verdict that one of several hypotheses is true, which cannot be told apart.
 
-    What all of them share is stated first.
+    The sentence begins with the effects that all of them have in common.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        The hypotheses.
+    members : sequence of H
+        The hypotheses of the group, the best one first.
+    probability : float
+        The probability that one of them is true.
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
-    texts = []
+    member_texts = []
     for member, effects in zip(members, effects_by_member, strict=True):
         closed, _ = comparison.closed_share(member)
-        in_brackets = "" if closed is None else f" ({share_text(closed)})"
-        texts.append(f"{effects_text(effects)}{in_brackets}")
-    sentence = f"Either {listing(texts, 'or')} is missing; these data cannot tell which."
+        share_in_brackets = "" if closed is None else f" ({share_text(closed)})"
+        member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
+    sentence = f"Either {listing(member_texts, 'or')} is missing; these data cannot tell which."
     closed, reason = comparison.closed_share(members[0])
     if closed is None:
         sentence += f" {capital(reason)}."
@@ -289,21 +313,23 @@ def _group(comparison: Comparison[H], members: Sequence[H], probability: float) 
 def _unexplained(
     comparison: Comparison[H], first: Verdict, nearest: H | None = None, reason: str = ""
 ) -> VerdictOutcome:
-    """Return the verdict that there is a gap without a name, and what comes nearest to one.
+    """Return the verdict that there is an unexplained gap, with the hypothesis that explains most.
 
     Parameters
     ----------
     comparison : Comparison
         The hypotheses.
     first : Verdict
-        The verdict that the simulations led to.
+        The verdict on the simulations.
     nearest : H, optional
-        The hypothesis that comes nearest to a name.
+        The hypothesis that was considered for a name; if left out, the one that explains the
+        largest share of the gap is mentioned.
     reason : str
-        Why it is no name; what objects to it if left out, or else its probability.
+        The reason why it is not named. If left out, it is that of `Comparison.objection`, or else
+        that its probability is too low.
     """
-    failed = next((gate.reason for gate in first.gates if gate.passed is False), "")
-    gap = f"There is a gap that no effect of the catalogue fits. {failed}".strip()
+    failed_gate_reason = next((gate.reason for gate in first.gates if gate.passed is False), "")
+    gap = f"There is a gap that no effect of the catalogue fits. {failed_gate_reason}".strip()
     gap = f"{gap} {comparison.gap_sentence()}".strip()
     mentioned = nearest
     if mentioned is None:
@@ -322,10 +348,10 @@ def _unexplained(
         if nearest is not None and not reason:
             probability = comparison.probability(nearest)
             reason = f"its probability is {probability:.2g}: a name needs {SEARCH.sure:g}"
-        clause = f"; it is no name, as {reason}" if reason else ""
+        reason_clause = f"; it is no name, as {reason}" if reason else ""
         effects = effects_text(named_effects(comparison.problem, mentioned))
         _, explains = comparison.closed_share(mentioned)
-        sentence = f"{gap} The best hypothesis is {effects}: {explains}{clause}."
+        sentence = f"{gap} The best hypothesis is {effects}: {explains}{reason_clause}."
     resembles = () if mentioned is None else plain_names(mentioned.candidate.identifiers)
     return _outcome(
         comparison,
@@ -340,7 +366,7 @@ def _unexplained(
 
 
 def _larger_error_sentence(comparison: Comparison[H], hypothesis: H) -> str:
-    """Return the sentence on a hypothesis that is no name because it makes the error larger."""
+    """Return the sentence on a hypothesis that is not named because it makes the error larger."""
     effects = effects_text(named_effects(comparison.problem, hypothesis))
     nearest = f"The nearest in the catalogue is {effects}, but"
     if comparison.simulation(hypothesis) is comparison.search.no_effect:
@@ -372,7 +398,7 @@ def _outcome(
     kind, sentence, probability
         What is concluded, see `Verdict`.
     standing : H or None
-        The hypothesis that stands for the verdict; None stands for the model without effect.
+        The hypothesis that the verdict is about; None for the model without effect.
     members : sequence of H
         The hypotheses that are listed first, in their order.
     effects, group, family, gates, resembles

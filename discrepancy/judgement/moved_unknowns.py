@@ -1,6 +1,7 @@
-"""Parameters, gains and zeros that a fit moves far from what is stated of them.
+"""Parameters, gains and zeros that a fit moves far from their stated values.
 
-A wrong model can fit by moving calibrated values: what it takes up in this way leaves no residual.
+A wrong model can fit the readings by wrong calibrated values. Such an error of the model does not
+show in the residuals, but in these values.
 """
 
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ from discrepancy.verdict import MovedUnknown
 from reporting.words import listing
 
 MOVED_DEVIATIONS = 2.0
-"""Stated standard deviations from which on a moved parameter, gain or zero is reported."""
+"""Distance from the stated value, in stated deviations, above which an unknown is reported."""
 MOST_MENTIONED = 5
 """Number of moved unknowns that a sentence mentions."""
 
@@ -26,7 +27,7 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
     problem : Problem
         The campaign and model.
     fit : CandidateFit
-        The fit, mostly that of the model without effect.
+        The fit, usually that of the model without effect.
     """
     unknowns = [
         *_parameters(problem, fit),
@@ -38,7 +39,7 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
 
 
 def _parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
-    """Return the uncertain calibrated parameters in a fit."""
+    """Return the stated and fitted values of the calibrated parameters with a prior deviation."""
     shared = problem.shared
     values = shared.parameters(fit.point.shared)
     unknowns = []
@@ -62,20 +63,20 @@ def _parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
 
 
 def _gains(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
-    """Return the gains with a stated deviation in a fit."""
+    """Return the fitted values of the gain errors with a stated deviation; they are stated as 0."""
     shared = problem.shared
     unknowns = []
-    for row, channel in enumerate(shared.gain_channels):
-        number = shared.count + row
-        if shared.precision[number] > 0.0:
-            u = float(fit.point.shared[number])
-            scale = float(shared.scale[number])
+    for gain_number, channel in enumerate(shared.gain_channels):
+        shared_number = shared.count + gain_number
+        if shared.precision[shared_number] > 0.0:
+            u = float(fit.point.shared[shared_number])
+            scale = float(shared.scale[shared_number])
             unknowns.append(_moved_from_zero(f"gain of {channel}", u, scale, "1"))
     return unknowns
 
 
 def _zeros_and_constants(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
-    """Return the zeros of channels and the constants of inputs with a stated deviation in a fit."""
+    """Return the fitted zeros of channels and constants of inputs that have a stated deviation."""
     unknowns = []
     for data, local in zip(problem.trials, fit.point.local, strict=True):
         layout = data.unknowns
@@ -90,7 +91,7 @@ def _zeros_and_constants(problem: Problem, fit: CandidateFit) -> list[MovedUnkno
 
 
 def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tuple[str, str]]:
-    """Return the names and SI units of a trial's unknown zeros, then of its constants of inputs."""
+    """Return the name and SI unit of each unknown zero, then of each input constant."""
     trial = data.trial
     names_and_units = []
     for column in data.unknowns.zero_columns:
@@ -105,14 +106,26 @@ def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tup
 
 
 def _moved_from_zero(name: str, u: float, scale: float, unit: str) -> MovedUnknown:
-    """Return an unknown that is stated as zero with a standard deviation, at a scaled value u."""
+    """Return the record of an unknown whose stated value is zero.
+
+    Parameters
+    ----------
+    name : str
+        The name of the unknown.
+    u : float
+        Its scaled value in the fit.
+    scale : float
+        Its stated standard deviation [unit].
+    unit : str
+        Its unit.
+    """
     return MovedUnknown(
         name=name, stated=0.0, deviation=scale, value=scale * u, deviations=u, unit=unit
     )
 
 
 def moved_sentence(moved: Sequence[MovedUnknown]) -> str:
-    """Return a sentence on what the model without effect moves; empty if nothing."""
+    """Return a sentence on the unknowns that the fit without effect moves; empty if none."""
     if not moved:
         return ""
     parts = [_moved_text(unknown) for unknown in moved[:MOST_MENTIONED]]
@@ -123,16 +136,16 @@ def moved_sentence(moved: Sequence[MovedUnknown]) -> str:
 
 
 def _moved_text(unknown: MovedUnknown) -> str:
-    """Return in words what is stated of an unknown, its value, and the deviations between them."""
+    """Return in words the stated and fitted value of an unknown, and their distance."""
     name = unknown.name
     value = unknown.value
     deviation = unknown.deviation
-    off = f"{abs(unknown.deviations):.1f} deviations"
+    distance = f"{abs(unknown.deviations):.1f} deviations"
     unit = "" if unknown.unit == "1" else f" {unknown.unit}"
     if name.startswith("gain of "):
         stated = f"stated to {100.0 * deviation:.3g} %"
-        return f"the {name} by {100.0 * value:+.3g} % ({stated}; {off})"
+        return f"the {name} by {100.0 * value:+.3g} % ({stated}; {distance})"
     if unknown.stated == 0.0:
-        return f"the {name} to {value:.3g}{unit} (stated to {deviation:.3g}{unit}; {off})"
+        return f"the {name} to {value:.3g}{unit} (stated to {deviation:.3g}{unit}; {distance})"
     stated = f"{unknown.stated:.4g} ± {deviation:.2g}"
-    return f"{name!r} from {stated} to {value:.4g}{unit} ({off})"
+    return f"{name!r} from {stated} to {value:.4g}{unit} ({distance})"

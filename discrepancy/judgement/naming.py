@@ -1,4 +1,4 @@
-"""The verdict on a campaign: search, rules, and what overrules them."""
+"""The verdict on a campaign: the search, the rules of a verdict, and the exceptions to them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -37,7 +37,7 @@ def reach_verdict(
     on_progress: OnProgress = no_progress,
     on_search: OnSearch = ignore_search,
 ) -> VerdictOutcome:
-    """Return the verdict on a campaign: what the model lacks, by its name if it has one.
+    """Return the verdict on a campaign: what the model lacks, named if that is possible.
 
     Parameters
     ----------
@@ -53,8 +53,8 @@ def reach_verdict(
     Returns
     -------
     VerdictOutcome
-        The verdict without next experiments and faults of the data, which others add; all
-        candidates; the fit that stands for the verdict.
+        The verdict, the search with all candidates, and the fit that represents the verdict. Next
+        experiments and faults of the data are added to the verdict elsewhere.
     """
     outcome = checked_verdict(_searched_verdict(problem, effects, on_progress, on_search))
     verdict = outcome.verdict
@@ -66,14 +66,17 @@ def reach_verdict(
 def _searched_verdict(
     problem: Problem, effects: Sequence[Effect], on_progress: OnProgress, on_search: OnSearch
 ) -> VerdictOutcome:
-    """Return the verdict on a search, where the missing force gives none on simulations."""
+    """Return the verdict on a search, and if the missing force gives no name, on a second search.
+
+    The second search compares simulations only.
+    """
     first_search = search(problem, effects, on_progress, on_search)
     first = _verdict_on_search(first_search)
     is_unexplained = first.verdict.kind is VerdictKind.UNEXPLAINED
     if not first_search.force_hypotheses or not is_unexplained:
         return first
     on_progress("nothing follows the missing force: comparing whole simulations")
-    # time steps may be finer by now
+    # the first search may have refined the time steps, so fit again
     no_effect = attempt(problem, Candidate(), first_search.no_effect.point)
     second_search = Search(
         problem, first_search.effects, no_effect or first_search.no_effect, on_progress=on_progress
@@ -86,7 +89,7 @@ def _searched_verdict(
     second_search.force_hypotheses = first_search.force_hypotheses
     is_named = second.verdict.kind is VerdictKind.NAMED_IN_PART
     has_law = any(_acts_on_structure(problem, second.fit))
-    # held-out trials alone give no name: most of the gap must be closed where it was fitted
+    # held-out trials alone are not enough: most of the gap in fitted trials must be closed too
     count = float(problem.counts.sum())
     gap = second_search.no_effect.chi_square - count
     remaining = second.fit.chi_square - count
@@ -95,35 +98,39 @@ def _searched_verdict(
 
 
 def _acts_on_structure(problem: Problem, fit: CandidateFit) -> list[bool]:
-    """Return for each effect of a fit whether it acts on the structure, not on readings only."""
+    """Return for each effect of a fit whether it changes the structure, and not only readings."""
     return [acts_within(term.effect, problem.setting) for term in fit.candidate.terms]
 
 
 def _verdict_on_search(search: Search) -> VerdictOutcome:
-    """Return the verdict on a search: by its simulations, or else by names in part."""
+    """Return the verdict on a search: by the rules for noise as recorded, or else in part.
+
+    The result of the rules is tested on held-out trials. If it fails, or if no set is named, the
+    verdict is that of `verdict_in_part`.
+    """
     outcome = verdict_by_simulations(search)
     verdict = outcome.verdict
-    stands = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
-    if stands or verdict.kind is VerdictKind.GROUP:
+    may_be_named = verdict.kind in (VerdictKind.NAMED, VerdictKind.FAMILY)
+    if may_be_named or verdict.kind is VerdictKind.GROUP:
         gate = check_held_out(residual_set(search.problem, outcome.fit, sensitivities=False))
         sentence = verdict.sentence
         if gate.passed is False:
             sentence = f"{sentence} {gate.reason}"
-            stands = False
+            may_be_named = False
         verdict = replace(verdict, sentence=sentence, gates=(*verdict.gates, gate))
     if verdict.kind in (VerdictKind.NAMED, VerdictKind.GROUP):
         overruled = _overruled_by_instruments(search, verdict)
         if overruled is not None:
             return VerdictOutcome(overruled, search, search.no_effect)
-    if stands and len(verdict.effects) > 1:
+    if may_be_named and len(verdict.effects) > 1:
         laws_alone = _laws_without_reading_errors(search, verdict, outcome.fit)
         if laws_alone is not None:
             return laws_alone
         return without_negligible_effect(search, verdict, outcome.fit)
     failed = {gate.name for gate in verdict.gates if gate.passed is False}
-    misfits = bool(failed & {"absolute fit", "held-out trials"})
+    has_misfit = bool(failed & {"absolute fit", "held-out trials"})
     open_kinds = (VerdictKind.NAMED, VerdictKind.FAMILY, VerdictKind.UNEXPLAINED)
-    is_open = not stands and (misfits or verdict.kind in open_kinds)
+    is_open = not may_be_named and (has_misfit or verdict.kind in open_kinds)
     is_open_group = verdict.kind is VerdictKind.GROUP and bool(search.force_hypotheses)
     if is_open_group or is_open:
         return verdict_in_part(search, verdict)
@@ -131,9 +138,10 @@ def _verdict_on_search(search: Search) -> VerdictOutcome:
 
 
 def verdict_by_simulations(search: Search) -> VerdictOutcome:
-    """Return the verdict if a right model leaves noise as the records say, and no more.
+    """Return the verdict under the assumption that a right model leaves only the recorded noise.
 
-    The sets that matter are fitted exactly first, since few steps give rough evidence.
+    The most probable sets are fitted to convergence first, since the evidence of a fit by few steps
+    is only approximate.
     """
     probabilities = search.set_probabilities()
     for _ in range(SEARCH.largest_group):
@@ -149,10 +157,11 @@ def verdict_by_simulations(search: Search) -> VerdictOutcome:
 def _laws_without_reading_errors(
     search: Search, verdict: Verdict, fit: CandidateFit
 ) -> VerdictOutcome | None:
-    """Return the verdict that names laws in part, without the errors of readings beside them.
+    """Return the verdict that names only the laws of a set, without its errors of readings.
 
-    Where laws are nearly all of the missing force, such an error takes up whatever they leave. None
-    where the verdict does not name both, or laws alone cannot be named.
+    If laws explain nearly all of the missing force, errors of readings only describe what the laws
+    do not explain. None is returned if the set does not contain both kinds of effects, or if laws
+    alone cannot be named.
     """
     acts = _acts_on_structure(search.problem, fit)
     names_both = any(acts) and not all(acts)
@@ -162,12 +171,12 @@ def _laws_without_reading_errors(
 
 
 def _overruled_by_instruments(search: Search, verdict: Verdict) -> Verdict | None:
-    """Return the verdict that named errors of instruments are no cause; None where they may be one.
+    """Return the verdict that rejects named errors of instruments; None if they may be the cause.
 
-    They are no cause below a size that any instrument has. Nor are they where they only keep
-    calibrated parameters within their priors: with one channel under a recorded drive a gain does
-    what all parameters of a linear model do together. Where the model as it is leaves no gap on
-    held-out trials either, nothing but these priors supports the name.
+    There are two reasons to reject them. The errors may be so small that any instrument has them.
+    Or they may only serve to keep calibrated parameters within their priors: with one channel and a
+    recorded drive, a gain has the same effect as all parameters of a linear model together. If the
+    model without effect predicts held-out trials, nothing but these priors supports the gain.
     """
     problem = search.problem
     without_name = replace(verdict, effects=(), group=())

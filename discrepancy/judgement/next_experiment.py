@@ -31,12 +31,13 @@ LEAST_INFORMATION = 0.03
 PROPOSED = 4
 """Largest number of experiments that are proposed."""
 LEAST_PROBABILITY = 1e-3
-"""Least probability that a hypothesis counts with."""
+"""Least probability with which a hypothesis enters the information."""
 FREE_PRECISION = 1e-4
 """Precision of a scaled unknown with a flat prior: a free zero is known to a hundred noise
 deviations."""
 LEAST_SINGULAR = 1e-6
-"""Relative singular value below which a direction of the prediction counts for nothing."""
+"""Singular value, relative to the largest, below which a direction in the space of readings is left
+out: all hypotheses predict the same there."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +47,13 @@ class Proposal:
     Attributes
     ----------
     trial : Trial
-        The trial; its values count for nothing.
+        The trial; its readings are not used, as it has not been made.
     description, reason : str
-        What to do, and why, for people.
+        Sentences for the user: what to do, and why.
     cost : float
         The cost relative to one more trial of a kind that was done already.
     added : ModelPatch
-        What is added to the structure on purpose.
+        The change of the structure for this trial, such as a mass at the tip.
     """
 
     trial: Trial
@@ -65,7 +66,9 @@ class Proposal:
 def next_experiments(
     problem: Problem, open_fits: Sequence[tuple[CandidateFit, float]]
 ) -> tuple[Experiment, ...]:
-    """Return the experiments that decide most between open hypotheses, the best for its cost first.
+    """Return the experiments that best separate the open hypotheses.
+
+    They are sorted by information over cost, the best first.
 
     Parameters
     ----------
@@ -74,14 +77,14 @@ def next_experiments(
     open_fits : sequence of (CandidateFit, float)
         The hypotheses that are still open, with their probabilities.
     """
-    weights = np.array([max(probability, LEAST_PROBABILITY) for _, probability in open_fits])
-    weights /= weights.sum()
+    probabilities = np.array([max(probability, LEAST_PROBABILITY) for _, probability in open_fits])
+    probabilities /= probabilities.sum()
     fits = [fit for fit, _ in open_fits]
     swings = oscillates(problem, fits[0]) if fits else True
     experiments = []
     for proposal in proposals(problem, swings=swings):
         try:
-            information = mutual_information(problem, proposal, fits, weights)
+            information = mutual_information(problem, proposal, fits, probabilities)
         except DiscrepancyError:  # not feasible with this model
             continue
         if information >= LEAST_INFORMATION:
@@ -98,38 +101,41 @@ def next_experiments(
 def mutual_information(
     problem: Problem, proposal: Proposal, fits: Sequence[CandidateFit], weights: FloatArray
 ) -> float:
-    """Return the mutual information of the hypothesis and the data of a trial [nat].
+    """Return how much a new trial would tell about which hypothesis is true [nat].
+
+    It is the mutual information of the hypothesis and the readings of the trial.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model of the fits.
     proposal : Proposal
-        The trial.
+        The new trial.
     fits : sequence of CandidateFit
-        The fit of each of the H hypotheses.
+        The fit of each of the H hypotheses, the most probable first.
     weights : (H,) array
         The probabilities of the hypotheses, of sum one.
     """
     model = problem.model.patched(proposal.added) if len(proposal.added) else problem.model
     trial_problem = problem.with_trials((proposal.trial,), model)
-    # without a noise record, what the most probable hypothesis leaves stands for the noise
-    residual_scale = np.sqrt(problem.precisions(fits[0].sums))
-    noise_scale = np.where(problem.freedom > 0.0, 1.0, residual_scale)
+    # without a noise record, the rms residual of the most probable hypothesis, which is the first,
+    # is taken for the noise deviation; a precision is (recorded / actual deviation)^2
+    recorded_over_residual = np.sqrt(problem.precisions(fits[0].sums))
+    noise_scale = np.where(problem.freedom > 0.0, 1.0, recorded_over_residual)
     predictions = [_predicted_trial(trial_problem, fit, noise_scale) for fit in fits]
     gaussians = _reduced(predictions, weights)
     return _information_of(gaussians, weights)
 
 
 class _PredictedTrial(NamedTuple):
-    """The Gaussian prediction of a trial's N C readings, in units of their noise.
+    """The Gaussian prediction of a trial's N C readings, in units of their noise deviation.
 
     Attributes
     ----------
     mean : (N C,) array
-        The mean.
+        The mean of the prediction.
     factor : (K, N C) array
-        A factor S of the covariance S^T S without noise.
+        A factor S of the prediction's covariance S^T S by K unknowns, without the noise.
     """
 
     mean: FloatArray
@@ -139,7 +145,10 @@ class _PredictedTrial(NamedTuple):
 def _predicted_trial(
     trial_problem: Problem, fit: CandidateFit, noise_scale: FloatArray
 ) -> _PredictedTrial:
-    """Return the prediction of a new trial by a hypothesis, with the uncertainty of all unknowns.
+    """Return the Gaussian prediction of a new trial by a hypothesis, over the noise deviation.
+
+    Its covariance comes from the prior of the trial's own unknowns, such as zeros of channels, and
+    from the posterior of the unknowns that the trial shares with the fitted trials.
 
     Parameters
     ----------
@@ -148,23 +157,34 @@ def _predicted_trial(
     fit : CandidateFit
         The fit of the hypothesis.
     noise_scale : (channels,) array
-        The recorded over the actual noise deviation of each channel.
+        The recorded noise deviation of each channel, divided by the actual one.
     """
     data = trial_problem.trials[0]
     local_count = data.unknowns.size
+    # the trial's own unknowns are at their prior means: no reading has determined them
     point = Point(fit.point.shared, (np.zeros(local_count),), fit.point.effect)
     derivatives = trial_problem.linearise(0, point, fit.candidate)
-    columns, index = trial_problem.prediction_derivatives(0, point, derivatives, fit.candidate)
-    scale = np.broadcast_to(noise_scale[data.groups], data.weight.shape).ravel()
-    rows = data.standardised(columns).reshape(len(columns), scale.size) * scale
-    local, shared = np.split(rows, [local_count])
+    by_unknowns, shared_indices = trial_problem.prediction_derivatives(
+        0, point, derivatives, fit.candidate
+    )
+    # derivatives of the readings, by the trial's own unknowns first, in actual noise deviations
+    reading_scale = np.broadcast_to(noise_scale[data.groups], data.weight.shape).ravel()
+    jacobian = (
+        data.standardised(by_unknowns).reshape(len(by_unknowns), reading_scale.size) * reading_scale
+    )
+    local_jacobian, shared_jacobian = np.split(jacobian, [local_count])
     prediction = trial_problem.prediction(0, point, derivatives.response)
-    mean = data.standardised(prediction).ravel() * scale
-    covariance = fit.covariance[np.ix_(index, index)]
-    root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(index)))
-    precision = np.maximum(data.unknowns.precision, FREE_PRECISION)
-    local_factor = local / np.sqrt(precision)[:, np.newaxis]
-    return _PredictedTrial(mean, np.concatenate((local_factor, root.T @ shared)))
+    mean = data.standardised(prediction).ravel() * reading_scale
+    # factors S of the covariance S^T S: with C = R R^T the posterior covariance of the shared
+    # unknowns and J their derivatives, J^T C J = (R^T J)^T (R^T J); own unknowns are independent
+    # with the variance 1 / precision
+    covariance = fit.covariance[np.ix_(shared_indices, shared_indices)]
+    covariance_root = np.linalg.cholesky(covariance + 1e-12 * np.eye(len(shared_indices)))
+    prior_precision = np.maximum(data.unknowns.precision, FREE_PRECISION)
+    local_factor = local_jacobian / np.sqrt(prior_precision)[:, np.newaxis]
+    return _PredictedTrial(
+        mean, np.concatenate((local_factor, covariance_root.T @ shared_jacobian))
+    )
 
 
 class _Gaussian(NamedTuple):
@@ -174,46 +194,60 @@ class _Gaussian(NamedTuple):
     root: FloatArray
 
     def log_density(self, outcomes: FloatArray) -> FloatArray:
-        """Return the log density at outcomes (M, K), up to a constant, (M,)."""
-        scaled = np.linalg.solve(self.root, (outcomes - self.mean).T)
+        """Return the log density (M,) at M outcomes (M, K), up to a constant."""
+        standardised = np.linalg.solve(self.root, (outcomes - self.mean).T)
         log_determinant = np.log(np.diag(self.root)).sum()
-        return np.asarray(-0.5 * (scaled**2).sum(axis=0) - log_determinant)
+        return np.asarray(-0.5 * (standardised**2).sum(axis=0) - log_determinant)
 
 
 def _reduced(predictions: Sequence[_PredictedTrial], weights: FloatArray) -> list[_Gaussian]:
-    """Return the predictions with noise in the space in which they differ or are uncertain.
+    """Return the predictions of all hypotheses, noise included, in a space of fewer dimensions.
 
-    Along all other directions the data are noise under every hypothesis, and say nothing.
+    The space is spanned by the differences of the means and by the factors of the covariances.
+    Along all other directions the readings are the same noise under every hypothesis, so they do
+    not separate the hypotheses.
     """
     means = [prediction.mean for prediction in predictions]
     factors = [prediction.factor for prediction in predictions]
-    middle = np.average(means, axis=0, weights=weights)
-    columns = np.concatenate((np.stack(means) - middle, *factors))
-    _, values, basis = np.linalg.svd(check_finite(columns), full_matrices=False)
-    basis = basis[values > LEAST_SINGULAR * max(values[0], 1e-300)]
+    mean_of_hypotheses = np.average(means, axis=0, weights=weights)
+    directions = np.concatenate((np.stack(means) - mean_of_hypotheses, *factors))
+    _, singular_values, basis = np.linalg.svd(check_finite(directions), full_matrices=False)
+    basis = basis[singular_values > LEAST_SINGULAR * max(singular_values[0], 1e-300)]
+    # the rows of the basis are orthonormal, so the noise keeps its unit covariance
     gaussians = []
     for mean, factor in zip(means, factors, strict=True):
         covariance = np.eye(len(basis)) + (basis @ factor.T) @ (basis @ factor.T).T
-        gaussians.append(_Gaussian(basis @ (mean - middle), np.linalg.cholesky(covariance)))
+        gaussians.append(
+            _Gaussian(basis @ (mean - mean_of_hypotheses), np.linalg.cholesky(covariance))
+        )
     return gaussians
 
 
 def _information_of(hypotheses: Sequence[_Gaussian], weights: FloatArray) -> float:
     """Return the mutual information of hypothesis and data [nat], by simulated outcomes.
 
-    It is the entropy of the hypotheses less its mean after the data.
+    It is the entropy of the hypotheses' probabilities, minus the mean entropy of their posterior
+    probabilities over the outcomes.
+
+    Parameters
+    ----------
+    hypotheses : sequence of _Gaussian
+        The predictions of the H hypotheses.
+    weights : (H,) array
+        Their probabilities, of sum one.
     """
     generator = np.random.default_rng(SEED)
-    noise = generator.standard_normal((SAMPLES, len(hypotheses[0].mean)))
+    standard_normal = generator.standard_normal((SAMPLES, len(hypotheses[0].mean)))
     entropy = float(-(weights * np.log(weights)).sum())
     entropy_after = 0.0
-    for true, weight in zip(hypotheses, weights, strict=True):
-        outcomes = true.mean + noise @ true.root.T
-        # posterior log probabilities (H, M) of the hypotheses
-        scores = np.stack([hypothesis.log_density(outcomes) for hypothesis in hypotheses])
-        scores += np.log(weights)[:, np.newaxis]
-        scores -= logsumexp(scores, axis=0)
-        entropy_after -= weight * float((np.exp(scores) * scores).sum(axis=0).mean())
+    for true_hypothesis, weight in zip(hypotheses, weights, strict=True):
+        outcomes = true_hypothesis.mean + standard_normal @ true_hypothesis.root.T
+        # log posterior (H, M) of the hypotheses at the outcomes, by Bayes' theorem
+        log_posterior = np.stack([hypothesis.log_density(outcomes) for hypothesis in hypotheses])
+        log_posterior += np.log(weights)[:, np.newaxis]
+        log_posterior -= logsumexp(log_posterior, axis=0)
+        entropy_after -= weight * float((np.exp(log_posterior) * log_posterior).sum(axis=0).mean())
+    # simulated outcomes may give a slightly negative difference
     return max(entropy - entropy_after, 0.0)
 
 
@@ -221,47 +255,56 @@ def _information_of(hypotheses: Sequence[_Gaussian], weights: FloatArray) -> flo
 
 
 def oscillates(problem: Problem, fit: CandidateFit) -> bool:
-    """Return whether a release oscillates in a fit.
+    """Return whether the motion after a release oscillates in a fit.
 
-    A channel reverses its motion more than once.
+    It does if the direction of motion changes more than once in a channel.
     """
     for data, response in zip(problem.trials, fit.responses, strict=True):
         if data.trial.kind is not TrialKind.RINGDOWN:
             continue
         steps = np.diff(response, axis=0)
+        # steps of the size of rounding errors have no direction
         is_large = np.abs(steps) > 1e-9 * np.abs(response).max(initial=0.0)
         for column in range(steps.shape[1]):
-            directions = np.sign(steps[is_large[:, column], column])
-            if np.count_nonzero(np.diff(directions)) > 1:
+            signs = np.sign(steps[is_large[:, column], column])
+            if np.count_nonzero(np.diff(signs)) > 1:
                 return True
     return False
 
 
 def proposals(problem: Problem, *, swings: bool = True) -> Iterator[Proposal]:
-    """Yield feasible trials: variations of those that were done, within twice their range.
+    """Yield feasible trials: trials of the campaign with one thing changed.
+
+    The changes are the [[proposal]] tables of `sentences.toml`.
 
     Parameters
     ----------
     problem : Problem
-        The campaign with what was done, and the model.
+        The campaign, whose trials are varied, and the model.
     swings : bool
-        Whether a release oscillates: a longer record of one that does not shows rest only.
+        Whether the motion after a release oscillates. If not, a longer record is not proposed, as
+        it would only show the structure at rest.
     """
     for row in SENTENCES.tables["proposal"]:
-        done = [trial for trial in problem.campaign.trials if trial.kind.value == row["kind"]]
-        if not done or (row["change"] == "length" and not swings):
+        trials_of_kind = [
+            trial for trial in problem.campaign.trials if trial.kind.value == row["kind"]
+        ]
+        if not trials_of_kind or (row["change"] == "length" and not swings):
             continue
-        choose = min if row.get("of") == "smallest" else max
-        model_trial = choose(done, key=lambda trial: trial.level)
-        changed = _changed_trial(problem, model_trial, row["change"], row["by"])
-        if changed is None:
+        min_or_max = min if row.get("of") == "smallest" else max
+        model_trial = min_or_max(trials_of_kind, key=lambda trial: trial.level)
+        changed_trial = _changed_trial(problem, model_trial, row["change"], row["by"])
+        if changed_trial is None:
             continue
         level = model_trial.level
         description = row["description"].format(
-            top=level, most=abs(row["by"]) * level, signed=row["by"] * level, value=changed.value
+            top=level,
+            most=abs(row["by"]) * level,
+            signed=row["by"] * level,
+            value=changed_trial.value,
         )
-        trial = replace(changed.trial, name=row["name"])
-        yield Proposal(trial, description, row["reason"], row["cost"], changed.added)
+        trial = replace(changed_trial.trial, name=row["name"])
+        yield Proposal(trial, description, row["reason"], row["cost"], changed_trial.added)
 
 
 class _ChangedTrial(NamedTuple):
@@ -272,9 +315,10 @@ class _ChangedTrial(NamedTuple):
     trial : Trial
         The trial.
     value : float
-        The new value of what is neither load nor release, as its description prints it.
+        The new value of a length, place or mass, as the description prints it; 0 if the load, the
+        release or the temperature is changed.
     added : ModelPatch
-        What is added to the structure.
+        The change of the structure.
     """
 
     trial: Trial
@@ -285,7 +329,7 @@ class _ChangedTrial(NamedTuple):
 def _changed_trial(
     problem: Problem, trial: Trial, change: str, amount: float
 ) -> _ChangedTrial | None:
-    """Return a trial with one thing changed; None if that is not possible, or shows nothing.
+    """Return a trial with one thing changed; None if the trial or the model does not allow it.
 
     Parameters
     ----------
@@ -294,9 +338,9 @@ def _changed_trial(
     trial : Trial
         The trial to vary.
     change : str
-        What is changed: `change` of a [[proposal]] in `sentences.toml`.
+        The kind of change: `change` of a [[proposal]] table in `sentences.toml`.
     amount : float
-        By how much: a factor, or a difference of temperature [K].
+        The size of the change: a factor, a fraction of the span, or a temperature difference [K].
     """
     model = problem.model
     stations = model.stations

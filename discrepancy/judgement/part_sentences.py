@@ -1,4 +1,4 @@
-"""Sentences that are added to a name in part: the shape of its law, and what may be beside it."""
+"""Sentences that are added to a verdict in part: the shape of a law, and a possible further law."""
 
 import numpy as np
 
@@ -13,22 +13,23 @@ from .conclusion import (
 
 
 def shape_sentence(comparison: Comparison[H], best: H) -> str:
-    """Return the sentence on the free shape of a single law.
+    """Return the sentence on the shape parameters of a single law that the data determine.
 
-    Empty if held-out trials speak against it.
+    It is empty if there are none, or if the law explains less with a free shape in the decisive
+    trials.
     """
     if len(best.candidate.terms) != 1:
         return ""
     (term,) = best.candidate.terms
-    free = comparison.with_free_shape(best)
-    if free is None:
+    free_shape_hypothesis = comparison.with_free_shape(best)
+    if free_shape_hypothesis is None:
         return ""
     least_share = comparison.decisive_share(best).value - SEARCH.slim
-    if comparison.decisive_share(free).value < least_share:
+    if comparison.decisive_share(free_shape_hypothesis).value < least_share:
         return ""
-    first_shape = len(free.shared) + len(term.effect.parameters)
-    deviations = np.sqrt(np.diag(free.covariance))[first_shape:]
-    (effect,) = named_effects(comparison.problem, free)
+    first_shape = len(free_shape_hypothesis.shared) + len(term.effect.parameters)
+    deviations = np.sqrt(np.diag(free_shape_hypothesis.covariance))[first_shape:]
+    (effect,) = named_effects(comparison.problem, free_shape_hypothesis)
     texts = []
     for parameter, deviation in zip(effect.shape, deviations, strict=True):
         if deviation < SEARCH.told_by_data:
@@ -39,26 +40,26 @@ def shape_sentence(comparison: Comparison[H], best: H) -> str:
 
 
 def unproved_addition_sentence(comparison: Comparison[H], best: H) -> str:
-    """Return the sentence on a further law that gains too little evidence for a name.
+    """Return the sentence on a further law that may act too, but has too little evidence.
 
-    Empty if there is none.
+    It is empty if there is none.
     """
     families = families_at_places(best)
     least_score = comparison.score(best) - SEARCH.contenders
-    addition = None
+    larger_hypothesis = None
     for other in comparison.ranked:
         has_more_laws = families_at_places(other) > families
         only_laws = all(comparison.acts_on_structure(term) for term in other.candidate.terms)
         if has_more_laws and only_laws and comparison.score(other) > least_score:
-            addition = other
+            larger_hypothesis = other
             break
-    if addition is None:
+    if larger_hypothesis is None:
         return ""
     least_share = comparison.decisive_share(best).value + SEARCH.sliver
-    if comparison.decisive_share(addition).value < least_share:
+    if comparison.decisive_share(larger_hypothesis).value < least_share:
         return ""
     added = []
-    for effect in named_effects(comparison.problem, addition):
+    for effect in named_effects(comparison.problem, larger_hypothesis):
         if (effect.family, effect.place) not in families:
             added.append(effect)
     return (

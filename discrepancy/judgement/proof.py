@@ -1,7 +1,7 @@
-"""Proof: errors and scores of the trials without and with an effect, on the same scale.
+"""Proof of an effect: errors and scores of the trials without and with it, on the same scale.
 
-Errors and χ² are of the residuals over the noise alone. What a posterior leaves open is in what is
-expected of χ², and in the probabilistic scores, never in the stated error.
+Errors and χ² are those of residuals over the noise deviation alone. The uncertainty of the fitted
+unknowns enters the expected value of χ² and the probabilistic scores, but not the stated errors.
 
 Scores follow Gneiting and Raftery 2007 (J. Am. Stat. Assoc. 102, 359-378); predictions are Gaussian
 with the predictive deviations of the fit.
@@ -26,16 +26,17 @@ from .closed_share import closed_share, rms_by_channel, with_noise_of
 PIT_BINS = 10
 """Bins of the histogram of probability integral transforms."""
 SMALLEST_GAP = 2.0
-"""Least gap that a hypothesis is tested by: deviations of χ² per sample above what is expected."""
+"""Least excess of χ² per sample over that of noise, in its standard deviations, for held-out trials
+to test a hypothesis."""
 HELD_OUT_DEVIATIONS = 3.0
-"""Deviations of χ² per sample of held-out trials above what is expected, beyond which a name
-fails."""
+"""Excess of χ² per sample of held-out trials over its expected value, in standard deviations, above
+which a hypothesis fails."""
 COVERAGE = (0.80, 0.97)
-"""Least and largest share of held-out samples that 90 % intervals may hold."""
+"""Least and largest fraction of held-out samples that may lie within their 90 % intervals."""
 LEAST_COVERED = 200
-"""Samples from which on that share is tested."""
+"""Least number of samples for that fraction to be tested."""
 ENOUGH_TRIALS = 5
-"""Trials from which on the scatter between them alone gives the standard error of a score."""
+"""Least number of trials for the scatter between them alone to give the error of a score."""
 PARTS_OF_RECORD = 16
 """Parts of a record whose scatter gives the error within a trial."""
 REMAINING_LEVEL = 0.01
@@ -51,9 +52,10 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     Parameters
     ----------
     residuals : ResidualSet
-        One or more trials beside their predictions.
+        One or more trials with their predictions.
     seed : int
-        The seed of the draw that restores what the fit absorbed, for the test of whiteness.
+        The seed of the random numbers that are added to residuals of a fit to make them white, see
+        `ResidualSet.white`.
 
     Raises
     ------
@@ -62,25 +64,27 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     """
     transforms = [fitted.residual / fitted.predictive_deviation for fitted in residuals.trials]
     used = [fitted.used for fitted in residuals.trials]
-    z = np.concatenate([values[use] for values, use in zip(transforms, used, strict=True)])
-    if z.size == 0:
+    used_transforms = np.concatenate(
+        [values[use] for values, use in zip(transforms, used, strict=True)]
+    )
+    if used_transforms.size == 0:
         raise FitError("Scores need at least one used sample, but there is none.")
     densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
     chi_square = chi_square_of(residuals)
     white = residuals.white(np.random.default_rng(seed))
     p_values = [ljung_box(series)[1] for _, _, series in residuals.series(white)]
-    counts, _ = np.histogram(stats.norm.cdf(z), bins=PIT_BINS, range=(0.0, 1.0))
+    counts, _ = np.histogram(stats.norm.cdf(used_transforms), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
         rms=rms_by_channel(residuals),
         chi_square_per_sample=chi_square.per_sample,
         log_score=float(np.concatenate(densities).mean()),
-        coverage_50=float(np.mean(np.abs(z) <= stats.norm.ppf(0.75))),
-        coverage_90=float(np.mean(np.abs(z) <= stats.norm.ppf(0.95))),
+        coverage_50=float(np.mean(np.abs(used_transforms) <= stats.norm.ppf(0.75))),
+        coverage_90=float(np.mean(np.abs(used_transforms) <= stats.norm.ppf(0.95))),
         whiteness=min(1.0, len(p_values) * min(p_values)) if p_values else nan,
-        sample_count=int(z.size),
+        sample_count=int(used_transforms.size),
         chi_square_expected=chi_square.expected,
         chi_square_deviation=chi_square.deviation,
-        pit=tuple(float(share) for share in counts / z.size),
+        pit=tuple(float(share) for share in counts / used_transforms.size),
         pit_p_value=_uniformity_p_value(transforms, used, counts),
     )
 
@@ -114,15 +118,16 @@ class ChiSquare:
 
     @property
     def excess(self) -> float:
-        """By how many of its deviations it is above what is expected.
-
-        Nan without a noise record.
-        """
+        """The difference from the expected value in deviations; nan without a noise record."""
         return (self.per_sample - self.expected) / self.deviation
 
     @property
     def excess_over_noise(self) -> float:
-        """By how many of its deviations it is above noise alone, without posterior uncertainty."""
+        """The difference from noise alone (1) in deviations, without posterior uncertainty.
+
+        The deviation is proportional to the expected value, so that of noise alone is
+        deviation / expected.
+        """
         return (self.per_sample - 1.0) * self.expected / self.deviation
 
 
@@ -154,21 +159,21 @@ def chi_square_of(residuals: ResidualSet) -> ChiSquare:
 
 
 def correlation_time(series: FloatArray) -> float:
-    """Return how many samples (N,) count as one independent sample: 1 + 2 sum rho_k, at least one.
+    """Return the number of samples of a series (N,) per independent one: 1 + 2 sum rho_k.
 
-    The sum is Geyer's initial positive sequence (Geyer 1992, Statistical Science 7, 473-483): sums
-    of neighbouring pairs are added while they are positive.
+    It is at least 1. The sum is Geyer's initial positive sequence (Geyer 1992, Statistical Science
+    7, 473-483): sums of neighbouring pairs are added while they are positive.
     """
     count = series.size
     centred = series - series.mean()
-    power = float(centred @ centred)
-    if count < 4 or power == 0.0:
+    sum_of_squares = float(centred @ centred)
+    if count < 4 or sum_of_squares == 0.0:
         return 1.0
-    rho = lag_products(centred, count - 1)[0] / power
-    pairs = rho[0 : count - 1 : 2] + rho[1:count:2]
-    negative = np.flatnonzero(pairs <= 0.0)
-    positive_count = int(negative[0]) if negative.size else pairs.size
-    return max(1.0, 2.0 * float(pairs[:positive_count].sum()) - 1.0)
+    rho = lag_products(centred, count - 1)[0] / sum_of_squares
+    pair_sums = rho[0 : count - 1 : 2] + rho[1:count:2]
+    nonpositive = np.flatnonzero(pair_sums <= 0.0)
+    positive_count = int(nonpositive[0]) if nonpositive.size else pair_sums.size
+    return max(1.0, 2.0 * float(pair_sums[:positive_count].sum()) - 1.0)
 
 
 def _uniformity_p_value(
@@ -244,10 +249,10 @@ def score_gain(before: ResidualSet, after: ResidualSet) -> tuple[float, float]:
 
 
 def _variance_of_sum(series: FloatArray) -> float:
-    """Return the variance of the sum of a series (N,), from sums over neighbouring parts.
+    """Return the variance of the sum of a correlated series (N,), from sums over its parts.
 
-    Differences are taken as the expected gain itself changes slowly along a record, while the
-    motion decays.
+    Differences of neighbouring sums are used, because the expected value changes slowly along a
+    record as the motion decays. A difference has twice the variance of a sum.
     """
     parts = np.array_split(series, min(PARTS_OF_RECORD, series.size))
     sums = np.array([part.sum() for part in parts])
@@ -265,12 +270,12 @@ def check_held_out(after: ResidualSet) -> Gate:
     Parameters
     ----------
     after : ResidualSet
-        All trials beside their predictions by the hypothesis.
+        All trials with their predictions by the hypothesis.
 
     Returns
     -------
     Gate
-        Failed where χ² per sample of the held-out trials is more than `HELD_OUT_DEVIATIONS` of its
+        It fails if χ² per sample of the held-out trials is more than `HELD_OUT_DEVIATIONS` of its
         deviations above what is expected, or the coverage of 90 % intervals is outside `COVERAGE`.
         `passed` is None without a held-out trial or without a noise record.
     """
@@ -298,7 +303,7 @@ def _held_out_gate(passed: bool | None, excess: float, reason: str) -> Gate:
 
 
 def chi_square_text(trial_scores: Scores) -> str:
-    """Return χ² per sample in words, beside what a right model would have."""
+    """Return χ² per sample in words, with the value that is expected of a right model."""
     expected = f"{trial_scores.chi_square_expected:.3g} ± {trial_scores.chi_square_deviation:.2g}"
     return (
         f"{trial_scores.chi_square_per_sample:.3g}, where {expected} is expected of a right model"
@@ -313,9 +318,9 @@ def closed_share_or_reason(
 ) -> tuple[ClosedShare | None, str]:
     """Return the share of the mean square error that a hypothesis removes, or None and the reason.
 
-    There is none where held-out trials are predicted within their noise without the hypothesis and
-    with it: they do not test it. An error beyond the noise counts even where the posterior leaves
-    that much open.
+    There is no share if held-out trials are predicted within their noise both without and with the
+    hypothesis, as they do not test it. An error beyond the noise is counted even if it is within
+    the uncertainty of the posterior.
 
     Parameters
     ----------
@@ -327,7 +332,7 @@ def closed_share_or_reason(
     share : ClosedShare or None
         The share.
     reason : str
-        Why there is no share; or why it is not of held-out trials, empty if it is.
+        The reason why there is no share, or why it is that of fitted trials; else empty.
     """
     closed = closed_share(before, after)
     if closed is None:
@@ -344,9 +349,9 @@ def closed_share_or_reason(
 
 
 def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
-    """Return χ² per sample, with its deviation as if the fit had made no residuals correlated.
+    """Return χ² per sample, with a deviation that neglects correlations caused by the fit.
 
-    It is the same whether sensitivities were computed or not.
+    So it does not depend on whether sensitivities were computed.
     """
     trials = tuple(replace(fitted, sensitivity=None) for fitted in residuals.trials)
     return chi_square_of(replace(residuals, trials=trials))
@@ -402,32 +407,33 @@ def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
 
 
 def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:
-    """Return a sentence on what is still not explained.
+    """Return a sentence on the residuals that the effect does not explain.
 
     Parameters
     ----------
     residuals : ResidualSet
-        The trials with the effect: those held out, or the fitted ones without any.
+        The residuals with the effect, of the held-out trials, or of the fitted ones if no trial is
+        held out.
     after : Scores
         Their scores.
     """
     if not isfinite(after.chi_square_per_sample):
         return "Without a noise record it is not known what remains."
     trials = "held-out trials" if residuals.trials[0].trial.held_out else "fitted trials"
-    size = f"χ² per sample {after.chi_square_per_sample:.3g} on {trials}"
+    chi_square_phrase = f"χ² per sample {after.chi_square_per_sample:.3g} on {trials}"
     channels = residuals.recorded
-    square, freedom = mean_square(residuals, channels)
+    mean_square_residual, freedom = mean_square(residuals, channels)
     noise_freedom = min(residuals.degrees_of_freedom(name) for name in channels)
-    if variance_p_value(square, freedom, noise_freedom) < REMAINING_LEVEL:
+    if variance_p_value(mean_square_residual, freedom, noise_freedom) < REMAINING_LEVEL:
         by_channel = {name: _channel_chi_square(residuals, name) for name in channels}
         worst = max(by_channel, key=lambda name: by_channel[name])
-        return f"Still unexplained: {size}, most on {worst} ({by_channel[worst]:.3g})."
+        return f"Still unexplained: {chi_square_phrase}, most on {worst} ({by_channel[worst]:.3g})."
     if after.whiteness < REMAINING_LEVEL:
         return (
-            f"The size is that of noise ({size}), but residuals are not white "
+            f"The size is that of noise ({chi_square_phrase}), but residuals are not white "
             f"(p = {after.whiteness:.1g})."
         )
-    return f"Nothing that these data can show remains ({size})."
+    return f"Nothing that these data can show remains ({chi_square_phrase})."
 
 
 def _channel_chi_square(residuals: ResidualSet, name: str) -> float:

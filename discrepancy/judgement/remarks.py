@@ -1,4 +1,4 @@
-"""Sentences beside a verdict: when there is a gap, and which effects were not compared."""
+"""Sentences added to a verdict: when there is a gap, and which effects were not compared."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ def moment_text(moment: Moment) -> str:
 
 
 def window_text(window: GapWindow) -> str:
-    """Return in words since when and until when there is a gap."""
+    """Return in words when a gap begins and ends."""
     if window.begin is None and window.end is None:
         return "throughout the record"
     since = "from the first sample"
@@ -60,13 +60,13 @@ def when_sentence(windows: Sequence[GapWindow]) -> str:
         largest = max(without_effect, key=lambda window: window.size)
         count = len(without_effect)
         return f"The gap comes and goes, {count} times; the largest is {_sized_window(largest)}."
-    # those that begin in a record first, the largest of each first
+    # gaps that begin inside a record first, then the others; the largest of each first
     ordered = sorted(without_effect, key=lambda window: (window.begin is None, -window.size))
     return f"The gap is there {'; '.join(_sized_window(window) for window in ordered)}."
 
 
 def _sized_window(window: GapWindow) -> str:
-    """Return in words in which trial and when a gap is, and how large."""
+    """Return in words the trial, the time and the size of a gap."""
     size = f"{window.size:.2g}"
     if "e+0" in size:
         size = f"{float(size):,.0f}"
@@ -74,7 +74,7 @@ def _sized_window(window: GapWindow) -> str:
 
 
 def with_date(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
-    """Return the sentence of a verdict, and when its gap is there if that says something.
+    """Return the sentence of a verdict, with the times of its gap or effects if informative.
 
     Parameters
     ----------
@@ -91,18 +91,12 @@ def with_date(verdict: Verdict, windows: Sequence[GapWindow]) -> str:
 
 
 def begins_inside(windows: Sequence[GapWindow]) -> bool:
-    """Return whether a gap of the model without effect begins inside a record.
-
-    Something happened there.
-    """
+    """Return whether a gap of the model without effect begins inside a record, as by an event."""
     return any(window.begin is not None for window in windows if not window.with_effect)
 
 
 def acting_sentence(effects: Sequence[NamedEffect]) -> str:
-    """Return a sentence for each effect that acts in windows of time only.
-
-    Empty if all always act.
-    """
+    """Return the sentences on effects that act only in windows of time; empty if there are none."""
     sentences = []
     for effect in effects:
         windows = effect.patch.primitives[0].windows if len(effect.patch) else ()
@@ -113,10 +107,10 @@ def acting_sentence(effects: Sequence[NamedEffect]) -> str:
             since = "from the first sample" if begin is None else f"from {begin:.6g} s"
             until = "on" if end is None else f"until {end:.6g} s"
             texts.append(f"{since} {until} in {trial!r}")
-        mentioned = "; ".join(texts[:MOST_MENTIONED])
+        mentioned_windows = "; ".join(texts[:MOST_MENTIONED])
         if len(texts) > MOST_MENTIONED:
-            mentioned += f"; and in {len(texts) - MOST_MENTIONED} more"
-        sentences.append(f"{effect.name} acts {mentioned}.")
+            mentioned_windows += f"; and in {len(texts) - MOST_MENTIONED} more"
+        sentences.append(f"{effect.name} acts {mentioned_windows}.")
     return " ".join(sentences)
 
 
@@ -126,10 +120,9 @@ def acting_sentence(effects: Sequence[NamedEffect]) -> str:
 def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect]) -> Verdict:
     """Return the verdict with a sentence on the effects that could not be tested.
 
-    Only a verdict on a group or on several effects gets one.
-
-    A cause that needs another trial or a port is no member of a group, however similar its action
-    is. Those that are easily taken for a member are mentioned first.
+    The sentence is added only to a verdict on a group or on several effects. An effect that needs
+    another trial or port cannot be a member of the group, even if it acts in the same way. Effects
+    that are easily mistaken for a member are mentioned first.
 
     Parameters
     ----------
@@ -162,19 +155,19 @@ def with_untested(verdict: Verdict, setting: Setting, effects: Sequence[Effect])
 
 
 def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | None:
-    """Return a remark on what else a named effect could be, by the likenesses in the catalogue.
+    """Return a remark on effects of the catalogue that are similar to a named effect.
 
     Parameters
     ----------
     verdict : Verdict
         The verdict with its effects.
     compared : iterable of Effect
-        The effects that could act and were compared with the named ones.
+        The effects that can act in the campaign and were compared with the named ones.
 
     Returns
     -------
     str or None
-        One sentence or two; None where nothing is named.
+        One or two sentences; None if nothing is named.
     """
     if verdict.kind is not VerdictKind.NAMED:
         return None
@@ -201,7 +194,10 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
 
 
 def _likenesses(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
-    """Return the identifiers of effects that look like a named one, as either of both declares."""
+    """Return the identifiers of effects that are similar to a named one.
+
+    The catalogue declares this for either of the two effects (`Effect.confusable`).
+    """
     likenesses = set()
     for identifier, effect in compared.items():
         if not named.isdisjoint(effect.confusable):
@@ -212,5 +208,5 @@ def _likenesses(named: set[str], compared: Mapping[str, Effect]) -> set[str]:
 
 
 def _was(names: Sequence[str]) -> str:
-    """Return the verb of one or several names."""
+    """Return "was" for one name and "were" for several."""
     return "was" if len(names) == 1 else "were"

@@ -1,4 +1,8 @@
-"""The rules of a verdict: from the fitted candidates of a search to what may be said."""
+"""The rules by which a verdict follows from the fitted candidates of a search.
+
+They apply if the residuals of a right model are noise as in the noise records. A verdict *names* a
+set of effects if it is probable enough and passes all tests.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
@@ -45,7 +49,7 @@ class FittedMember(NamedTuple):
 
 
 class Case:
-    """A search to which the rules of a verdict are applied, with what they ask for.
+    """A search with all quantities that the rules of a verdict need, and the verdicts themselves.
 
     Parameters
     ----------
@@ -54,7 +58,7 @@ class Case:
     probabilities : mapping of tuple of str to float
         The probability of each set of effects, the most probable first.
     leading : tuple of str, optional
-        The set that may be named; the most probable one if left out.
+        The set that is considered for a name; the most probable one if left out.
     """
 
     def __init__(
@@ -79,15 +83,19 @@ class Case:
 
     @property
     def has_leading_set(self) -> bool:
-        """Whether a set of effects is ahead of the model without effect."""
+        """Whether a set of effects is preferred to the model without effect.
+
+        That is so if the most probable set is not the empty one, and either its Bayes factor is
+        large enough or the model without effect fails the test of absolute fit.
+        """
         return bool(self.leading) and (self.has_evidence or self.no_effect_gate.passed is False)
 
     @cached_property
     def probability(self) -> float:
-        """The probability of the leading set.
+        """The probability that the effects of the leading set are missing in the model.
 
-        It includes all sets that hold it, as a further effect is open then. That of a family
-        includes its members.
+        It is summed over all sets that contain the leading one, with or without further effects.
+        For a law of free shape it includes all effects of its family.
         """
         leading = set(plain_names(self.leading))
         total: float = 0
@@ -101,12 +109,12 @@ class Case:
 
     @property
     def is_sure(self) -> bool:
-        """Whether the set has the probability and the evidence that a name needs."""
+        """Whether the leading set is probable enough and has enough evidence to be named."""
         return self.probability >= SEARCH.sure and self.has_evidence
 
     @cached_property
     def probable_sets(self) -> list[EffectSet]:
-        """The most probable sets that together reach the probability of a name."""
+        """The most probable sets whose probabilities add up to that which a name needs."""
         return most_probable_sets(self.probabilities)
 
     # ---------------------------------------------------------------- tests
@@ -122,16 +130,16 @@ class Case:
 
     @cached_property
     def _best_free_shape(self) -> CandidateFit | None:
-        """The fit with the shape of one effect free that has the most evidence.
+        """The fit of the most evidence in which the shape of one effect of the set is free.
 
-        None without a shape.
+        None if no effect of the set has a shape parameter.
         """
-        free_fits = []
+        fits_with_free_shape = []
         for number in range(len(self.best.candidate.terms)):
             free_fit = fit_free_shape(self.problem, self.best, number)
             if free_fit is not None:
-                free_fits.append(free_fit)
-        return max(free_fits, key=lambda fit: fit.log_evidence, default=None)
+                fits_with_free_shape.append(free_fit)
+        return max(fits_with_free_shape, key=lambda fit: fit.log_evidence, default=None)
 
     @cached_property
     def shape_gate(self) -> Gate:
@@ -140,12 +148,15 @@ class Case:
 
     @property
     def family_fit(self) -> CandidateFit | None:
-        """The fit with a free shape, if it gains so much that the name gives way to it."""
+        """The fit with a free shape, if its evidence is enough to name the family instead."""
         return self._best_free_shape if self.shape_gate.statistic > SHAPE_GAIN else None
 
     @property
     def all_gates(self) -> tuple[Gate, ...]:
-        """The tests of absolute fit, shape and consistency; for a family no test of shape."""
+        """The outcomes of the tests of absolute fit, shape and consistency.
+
+        The test of shape is left out if a shape is free already.
+        """
         if self.best.candidate.is_family:
             return self.tested.absolute, self.tested.consistency
         return self.tested.absolute, self.shape_gate, self.tested.consistency
@@ -157,10 +168,10 @@ class Case:
 
     @cached_property
     def tested_family(self) -> CheckedFit | None:
-        """The set with one law of free shape and its tests, where that may be stated.
+        """The leading set with one law of free shape, and its tests; None if it may not be named.
 
-        A free shape counts as one more effect, and beside a second law it would imitate nearly
-        anything.
+        A free shape counts as one more effect, so the set must not have the largest size already.
+        A law of free shape together with a second law could fit nearly anything.
         """
         candidate = self.best.candidate
         family_fit = None if candidate.is_family else self.family_fit
@@ -201,34 +212,33 @@ class Case:
         )
 
     def common_effects(self) -> VerdictOutcome | None:
-        """Return the name of the effects that all probable sets hold, if these fit alone.
+        """Return the verdict that names the effects which all probable sets have in common.
 
-        Else None.
-
-        Which further effect there is beside them stays open, and a name does not depend on that.
+        It does not depend on which further effects there are. None is returned if these effects are
+        not a probable set themselves, or cannot be named.
         """
         common = set.intersection(*(set(plain_names(names)) for names in self.probable_sets))
-        alone = next((names for names in self.probable_sets if set(names) == common), None)
-        if not alone:
+        common_set = next((names for names in self.probable_sets if set(names) == common), None)
+        if not common_set:
             return None
-        case = Case(self.search, self.probabilities, alone)
+        case = Case(self.search, self.probabilities, common_set)
         if not case.is_sure:
             return None
         outcome = decide(case)
         return outcome if outcome.verdict.kind is VerdictKind.NAMED else None
 
     def open(self) -> VerdictOutcome:
-        """Return the verdict where no set reaches the probability that a name needs."""
+        """Return the verdict if no set reaches the probability that a name needs."""
         if () in self.probable_sets:
             return self._below_limit()
         members = []
         for names in self.probable_sets:
             fit = self.search.fit_exactly(self.search.best_of(names))
             members.append(FittedMember(names, fit, check_absolute_fit(self.problem, fit)))
-        # those that do not fit take their probability with them
+        # sets that fail the test are no members, and their probability is not counted
         fitting = [member for member in members if member.absolute.passed is not False]
         probability = sum(self.probabilities[member.names] for member in fitting)
-        # a law and its family are one member
+        # an effect with its canonical and with a free shape is one member
         distinct: dict[EffectSet, FittedMember] = {}
         for member in fitting:
             distinct.setdefault(plain_names(member.names), member)
@@ -238,19 +248,29 @@ class Case:
         return self._group(group, probability)
 
     def _below_limit(self) -> VerdictOutcome:
-        """Return the verdict that something may be missing, but too small to tell."""
-        hints = sorted({name for names in self.probable_sets for name in plain_names(names)})
+        """Return the verdict that something may be missing, but is too small to be detected."""
+        possible_effects = sorted(
+            {name for names in self.probable_sets for name in plain_names(names)}
+        )
         return self.conclusion.outcome(
             VerdictKind.BELOW_LIMIT,
-            below_limit_sentence(hints),
+            below_limit_sentence(possible_effects),
             sum(self.probabilities[names] for names in self.probable_sets),
             self.best,
-            group=tuple(hints),
+            group=tuple(possible_effects),
             gates=(check_absolute_fit(self.problem, self.best),),
         )
 
     def _no_group(self, first: FittedMember, count: int) -> VerdictOutcome:
-        """Return the verdict where none, or too many, of the probable sets fit."""
+        """Return the verdict of a gap if none of the probable sets passes the test, or too many do.
+
+        Parameters
+        ----------
+        first : FittedMember
+            The most probable set.
+        count : int
+            The number of sets that pass the test of absolute fit.
+        """
         sentence = f"There is a gap that no effect of the catalogue fits. {first.absolute.reason}"
         if count:
             sentence = f"There is a gap, and {count} explanations fit it alike."
@@ -263,7 +283,15 @@ class Case:
         )
 
     def _group(self, members: Sequence[FittedMember], probability: float) -> VerdictOutcome:
-        """Return the verdict that one of some sets is missing, which the data cannot tell apart."""
+        """Return the verdict that one of several sets is missing, which cannot be told apart.
+
+        Parameters
+        ----------
+        members : sequence of FittedMember
+            The sets.
+        probability : float
+            The probability that one of them is missing.
+        """
         fits = [with_draws(self.problem, member.fit) for member in members]
         effects: list[NamedEffect] = []
         for fit in fits:
@@ -291,7 +319,7 @@ class Case:
         return self.conclusion.named(fit, self.probability, self.all_gates)
 
     def family(self) -> VerdictOutcome:
-        """Return the verdict that names the family of the leading set, its shape being free."""
+        """Return the verdict that names the family of the leading set, with a free shape."""
         if self.tested_family is None:
             tested = self.tested
             gates: tuple[Gate, ...] = (tested.absolute, tested.consistency)
@@ -301,7 +329,7 @@ class Case:
         return self.conclusion.family(tested.fit, self.probability, gates)
 
     def unfit(self) -> VerdictOutcome:
-        """Return the verdict that there is a gap, as the leading set or its family fails a test."""
+        """Return the verdict of an unexplained gap, as the set or its family fails a test."""
         tested = self.tested_family or self.tested
         reason = tested.absolute.reason
         if tested.absolute.passed is not False and tested.consistency.passed is False:
@@ -327,7 +355,7 @@ class Case:
     def _unexplained(
         self, sentence: str, probability: float, gates: tuple[Gate, ...]
     ) -> VerdictOutcome:
-        """Return the verdict of an unexplained gap, which the leading set resembles."""
+        """Return the verdict of an unexplained gap, with the leading set as what it resembles."""
         return self.conclusion.outcome(
             VerdictKind.UNEXPLAINED,
             sentence,
@@ -359,18 +387,18 @@ def decide(case: Case) -> VerdictOutcome:
 
 
 def _any_fails(gates: Iterable[Gate]) -> bool:
-    """Return whether a test that could be applied fails."""
+    """Return whether a test fails; a test that could not be made has not failed."""
     return any(gate.passed is False for gate in gates)
 
 
 def most_probable_sets(probabilities: Mapping[EffectSet, float]) -> list[EffectSet]:
-    """Return the most probable sets that together reach the probability of a name."""
-    sums = np.cumsum(list(probabilities.values()))
-    return list(probabilities)[: int(np.searchsorted(sums, SEARCH.sure)) + 1]
+    """Return the most probable sets whose probabilities add up to that which a name needs."""
+    cumulative = np.cumsum(list(probabilities.values()))
+    return list(probabilities)[: int(np.searchsorted(cumulative, SEARCH.sure)) + 1]
 
 
 def _family_probability(search: Search, family: str) -> float:
-    """Return the probability of a family: of all single effects of it, with any shape."""
+    """Return the probability of a family: that of all its single effects, of any shape."""
     fits = list(search.compared_fits().values())
     scores = np.array([search.score(fit) for fit in fits])
     weights = np.exp(scores - scores.max())

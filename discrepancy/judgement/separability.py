@@ -1,8 +1,10 @@
-"""What a campaign can decide before its data are looked at: detectable sizes and confusion groups.
+"""Which effects a campaign can detect and tell apart, before its data are compared with the model.
 
-Every effect is put on the model at its prior median. The change that it makes, without what all
-nuisances can do, is compared with the noise (can it be seen?) and with what every other effect can
-do (can it be told apart?).
+Every effect is added to the model at the median of its prior. The part of the change of the
+readings that nuisances cannot compensate is compared with the noise, which shows whether the effect
+can be detected, and with the changes that every other effect can make, which shows whether the two
+can be told apart. A *confusion group* is a set of effects that cannot. Squared distances are in
+units of the noise variance, sigma^2.
 """
 
 from collections.abc import Sequence
@@ -35,23 +37,23 @@ LEAST_VISIBLE = 1e-6
 
 @dataclass(frozen=True)
 class Detectability:
-    """How well a campaign sees one effect.
+    """How well a campaign can detect one effect.
 
     Attributes
     ----------
     effect : Effect
         The effect.
     reason : str
-        Why it cannot be tested here; empty if it can.
+        The reason why the campaign cannot test it; empty if it can.
     place : str
-        The place at which it shows best.
+        The place at which the effect changes the readings most.
     distance : float
-        The squared distance from the model without it at the prior median [sigma^2].
+        The squared distance of the effect at its prior median from the model without it [sigma^2].
     parameter : str
-        The name of the parameter that scales it.
+        The name of the parameter that is the magnitude of the effect.
     detectable : float
-        The value of that parameter from which on the effect is found [unit of the parameter];
-        infinite if never.
+        The least detectable value of that parameter [unit of the parameter]; infinite if none
+        is.
     unit : str
         The unit of the parameter.
     typical : float
@@ -70,18 +72,18 @@ class Detectability:
 
 @dataclass(frozen=True)
 class Separability:
-    """What a campaign can and cannot decide.
+    """Which effects a campaign can detect, and which it can tell apart.
 
     Attributes
     ----------
     detectability : tuple of Detectability
-        How well each effect is seen, in the order of the catalogue.
+        How well each effect can be detected, in the order of the catalogue.
     identifiers : tuple of str
         The effects that can be tested: the rows and columns of `distance`.
     distance : (E, E) array
-        The squared distance of the row's effect from the nearest that the column's effect can do
-        [sigma^2]. It is that at the median of the row's effect, or where it is not seen there, at
-        the size from which it is. What nobody sees is close to everything.
+        The squared distance of the change by the row's effect from the nearest change that the
+        column's effect can make [sigma^2]. The row's effect is at its prior median, or at the least
+        detectable size if that is larger.
     groups : tuple of tuple of str
         The confusion groups of two or more effects.
     """
@@ -96,11 +98,11 @@ class Separability:
 
 
 def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
-    """Return a campaign whose readings are those that the model predicts.
+    """Return a campaign in which the readings are replaced by those that the model predicts.
 
-    Such data leave no residuals from which an unknown noise could be estimated: channels without a
-    noise record get one of a thousandth of their range. Where the initial state of a trial is
-    unknown it is taken from the data: from rest nothing would move, and nothing could be seen.
+    Such readings leave no residuals from which an unrecorded noise could be estimated. So a channel
+    without a noise record gets one, of a thousandth of its range. An unknown initial state of a
+    trial is fitted to the measured readings, since without it nothing would move.
 
     Parameters
     ----------
@@ -122,17 +124,17 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
         if trial.name in predictions:
             trial = replace(trial, values=predictions[trial.name])
         trials.append(trial)
-    predicted = replace(campaign, trials=tuple(trials))
+    predicted_campaign = replace(campaign, trials=tuple(trials))
     channels = dict(campaign.channels)
     for name, channel in campaign.channels.items():
         if channel.noise is None:
-            noise = NoiseRecord(stand_in_deviation(predicted, name), inf)
+            noise = NoiseRecord(stand_in_deviation(predicted_campaign, name), inf)
             channels[name] = replace(channel, noise=noise)
-    return replace(predicted, channels=channels)
+    return replace(predicted_campaign, channels=channels)
 
 
 def has_free_initial_state(trial: Trial) -> bool:
-    """Return whether a motion began before its record, in a state that only the data say."""
+    """Return whether a trial begins in a moving state that only its readings can tell."""
     if trial.begins is Start.UNKNOWN:
         return True
     return trial.release is not None and not trial.release.at_rest
@@ -151,16 +153,16 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
         return start
     # parameters are fitted, too: with a wrong frequency the initial motion would fade out
     fitted = fit(problem, Candidate(), start).point
-    local = []
+    local_unknowns = []
     for data, fitted_unknowns, prior_unknowns in zip(
         problem.trials, fitted.local, start.local, strict=True
     ):
         is_free = has_free_initial_state(data.trial)
-        local.append(fitted_unknowns if is_free else prior_unknowns)
-    return replace(start, local=tuple(local))
+        local_unknowns.append(fitted_unknowns if is_free else prior_unknowns)
+    return replace(start, local=tuple(local_unknowns))
 
 
-# ---------------------------------------------------------------- what can be seen and told apart
+# ---------------------------------------------------------------- detection and separation
 
 
 def separability(
@@ -171,8 +173,8 @@ def separability(
     Parameters
     ----------
     campaign : Campaign
-        The campaign. Its inputs, channels and noise count; the measured values do not, but where a
-        trial begins in a state that is not known. See `as_predicted`, for unknown noise too.
+        The campaign with its inputs, channels and noise records. The readings are used only to
+        determine unknown initial states, see `as_predicted`.
     model : Model
         The model as it is.
     setting : Setting
@@ -208,9 +210,16 @@ def separability(
 
 
 class _VisibleEffect(NamedTuple):
-    """An effect that changes readings.
+    """An effect that changes the readings.
 
-    Its identifier, its reference change, and all changes that it can make.
+    Attributes
+    ----------
+    identifier : str
+        The identifier of the effect.
+    reference : ScreenedChange
+        The change at its prior median, see `_reference_change`.
+    options : list of ScreenedChange
+        The changes over a grid of its parameters and places, the reference first.
     """
 
     identifier: str
@@ -236,11 +245,19 @@ def _all_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
 def _reference_change(
     screen: Screen, effect: Effect, options: Sequence[ScreenedChange]
 ) -> ScreenedChange | None:
-    """Return the most visible change by an effect at its prior median.
+    """Return the largest change of the readings by an effect at its prior median.
 
-    None if the structure carries none.
+    If that is not detectable, parameters such as a place along the span are varied too, while the
+    magnitude stays. None is returned if the model can be evaluated with no change.
 
-    Where the effect is not seen at its median place, other places are tried.
+    Parameters
+    ----------
+    screen : Screen
+        The fit without effect.
+    effect : Effect
+        The effect.
+    options : sequence of ScreenedChange
+        The changes by the effect over a grid of its parameters.
     """
     references = _changes_at_prior_median(screen, effect) or options
     if not references:
@@ -253,9 +270,10 @@ def _reference_change(
 
 
 def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedChange]:
-    """Return the changes by an effect at its prior median, where the structure can carry it.
+    """Return the changes by an effect at its prior median, one for each of its places.
 
-    Signed magnitudes, whose median is zero, are at one prior deviation.
+    A signed magnitude, whose median is zero, is at one prior deviation. Places at which the model
+    cannot be evaluated with the effect are left out.
     """
     changes = []
     for place in effect.places(screen.problem.setting):
@@ -278,7 +296,10 @@ def _has_reference_magnitude(change: ScreenedChange) -> bool:
 
 
 def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> Detectability:
-    """Return how well an effect is seen.
+    """Return how well an effect can be detected.
+
+    The squared distance grows with the square of the magnitude, so the least detectable magnitude
+    is typical * sqrt(DETECTED / distance).
 
     Parameters
     ----------
@@ -310,36 +331,43 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
 
 
 def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
-    """Return the squared distance (E, E) of each effect from the nearest that another can do.
+    """Return the squared distance of each effect from the nearest change by each other effect.
 
-    See `Separability.distance`. Both the effects as they are and effects made small are compared,
-    as effects that are far apart at their medians may be alike to first order.
+    The effects are compared at their prior medians and at small magnitudes, and the smaller
+    distance is taken: effects that differ at their medians may be alike to first order.
+
+    Returns
+    -------
+    (E, E) array
+        The distances, see `Separability.distance` [sigma^2].
     """
     small_options = [
         [_SmallChange(*screen.shrunk(change)) for change in effect.options] for effect in effects
     ]
     distance = np.zeros((len(effects), len(effects)))
     for i, effect in enumerate(effects):
-        target = effect.reference
-        small_target = small_options[i][0]
+        reference = effect.reference
+        small_reference = small_options[i][0]
         for j, other in enumerate(effects):
             if i == j:
                 continue
             other_changes = [small.change for small in small_options[j]]
-            first_order = _squared_distance(screen, small_target.change, other_changes)
-            first_order /= small_target.factor**2
-            least = min(_squared_distance(screen, target, other.options), first_order)
-            distance[i, j] = least * max(1.0, DETECTED / target.squared_size)
+            first_order = _squared_distance(screen, small_reference.change, other_changes)
+            # back to the size of the reference: squared distances grow with the square of it
+            first_order /= small_reference.factor**2
+            least_distance = min(_squared_distance(screen, reference, other.options), first_order)
+            distance[i, j] = least_distance * max(1.0, DETECTED / reference.squared_size)
     return distance
 
 
 def _squared_distance(
     screen: Screen, target: ScreenedChange, options: Sequence[ScreenedChange]
 ) -> float:
-    """Return the squared distance of a change from what an effect can do [sigma^2].
+    """Return the squared distance of a change from the changes that an effect can make [sigma^2].
 
-    What the effect can do is spanned by the option that is nearest to the target, and by its
-    derivatives with respect to the parameters of the effect there.
+    The changes that the effect can make are approximated by a linear space: it is spanned by the
+    option nearest in direction to the target, and by its differences when the parameters of the
+    effect are varied.
 
     Parameters
     ----------
@@ -363,21 +391,21 @@ def _squared_distance(
     nearest = max(options, key=cosine)
     if nearest.squared_size <= 0.0:
         return target.squared_size
-    # nearest option and its differences by the parameters
-    columns = [nearest.vector]
+    # spanning changes: the nearest option, and its differences by the parameters
+    changes = [nearest.vector]
     for number in range(len(nearest.start)):
         stepped = nearest.start.copy()
         stepped[number] += 10.0 * PARAMETER_STEP
-        with suppress(DiscrepancyError):  # the option may be the last that the structure can carry
+        with suppress(DiscrepancyError):  # the option may be at the limit of the model
             change = screen.change(nearest.term, stepped)
-            columns.append(change.vector - nearest.vector)
-    # least squares by scaled and regularised normal equations
-    span = np.stack(columns)
-    gram = (span * sign) @ span.T
-    scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-    gram = gram / np.outer(scale, scale) + 1e-6 * np.eye(len(gram))
-    right = (span * sign) @ target.vector / scale
-    explained = float(right @ np.linalg.solve(gram, right))
+            changes.append(change.vector - nearest.vector)
+    # least squares by normal equations, scaled to unit length and regularised
+    spanning_changes = np.stack(changes)
+    gram = (spanning_changes * sign) @ spanning_changes.T
+    lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    gram = gram / np.outer(lengths, lengths) + 1e-6 * np.eye(len(gram))
+    overlaps = (spanning_changes * sign) @ target.vector / lengths
+    explained = float(overlaps @ np.linalg.solve(gram, overlaps))
     return max(target.squared_size - explained, 0.0)
 
 

@@ -1,4 +1,4 @@
-"""Comparison of hypotheses by their simulations, under the noise that the best of them leaves."""
+"""Comparison of hypotheses by simulations, under a noise as large as the best one's residuals."""
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -24,7 +24,10 @@ from .proof import check_held_out
 
 
 class SimulationComparison(Comparison[CandidateFit]):
-    """Hypotheses compared by simulations, fitted under the noise that the best of them leaves."""
+    """A comparison of hypotheses by simulations that were fitted under the wider noise.
+
+    The wider noise is as large as the residuals of the best hypothesis, see `search.wide_noise`.
+    """
 
     least_low_end = SEARCH.least_share
 
@@ -48,20 +51,25 @@ class SimulationComparison(Comparison[CandidateFit]):
 
     @cached_property
     def _noise_scale(self) -> dict[str, float]:
-        """The noise deviation by channel, relative to that of residual sets.
+        """The factor on the noise deviation of residual sets, by channel.
 
-        Without a noise record that of residual sets is all that the model without effect leaves.
+        It is 1 with a noise record. Without one, the noise of the residual sets is that of all
+        residuals of the model without effect, and the factor reduces it to the level that is
+        estimated from second differences.
         """
         problem = self.problem
         has_record = problem.freedom > 0.0
         precisions = problem.precisions(self.search.no_effect.sums)
-        levels = np.where(
+        relative_variances = np.where(
             has_record, 1.0, precisions * unrecorded_noise_levels(problem, self.search.best())
         )
-        return dict(zip(problem.channel_names, np.sqrt(levels).tolist(), strict=True))
+        return dict(zip(problem.channel_names, np.sqrt(relative_variances).tolist(), strict=True))
 
     def _gap_share(self, hypothesis: CandidateFit, *, held_out: bool) -> GapShare:
-        """Return the share of the gap between readings and simulation that is explained."""
+        """Return the share of the gap between readings and simulation that a hypothesis explains.
+
+        Squared residuals are summed over blocks of the records, for the bootstrap of the share.
+        """
         blocks = []
         trial_count = 0
         without_effect = self.residuals(self.search.no_effect).trials
@@ -101,9 +109,9 @@ class SimulationComparison(Comparison[CandidateFit]):
         )
 
     def fit_followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
-        """Return a further hypothesis, begun at scaled effect parameters (E,).
+        """Return the fit of a further candidate, from scaled effect parameters (E,).
 
-        None if it cannot be fitted.
+        It is that under the wider noise; None if the candidate cannot be fitted.
         """
         no_effect = self.search.no_effect
         fitted = self.search.exact_fits.get(candidate.key)
@@ -113,15 +121,15 @@ class SimulationComparison(Comparison[CandidateFit]):
         return None if fitted is None else self._under_wide_noise(fitted)
 
     def _under_wide_noise(self, fitted: CandidateFit) -> CandidateFit | None:
-        """Return a fit under the wider noise by which hypotheses are compared."""
+        """Return the fit of a hypothesis under the wider noise; None if it cannot be fitted."""
         wide_problem = self.search.wide_problem or self.problem
         return refit_under_wide_noise(self.problem, wide_problem, fitted)
 
     def add_families(self) -> None:
-        """Compare the best law, and those easily taken for it, with free shapes too.
+        """Add laws of free shape to the compared fits, if the best hypothesis is a single law.
 
-        A free shape is compared only where the best hypothesis is a single law, and only if its
-        evidence is clearly above that of the law.
+        The best law and those that are easily mistaken for it are fitted with a free shape. A fit
+        is added if its evidence is above that of the best law by more than `SHAPE_GAIN`.
         """
         best = self.search.best()
         if len(best.candidate.terms) != 1 or not self.acts_on_structure(best.candidate.terms[0]):
@@ -138,7 +146,10 @@ class SimulationComparison(Comparison[CandidateFit]):
         self.search.wide_fits = compared
 
     def _related_single_laws(self, best: CandidateFit) -> list[CandidateFit]:
-        """Return the best fit of each family of laws that is easily taken for the best law."""
+        """Return the best single law of each family and place that is easily mistaken for the best.
+
+        The best law itself is one of them, if it has a shape parameter.
+        """
         (best_term,) = best.candidate.terms
         singles: dict[tuple[str, str], CandidateFit] = {}
         fits = (*self.search.rough_fits.values(), *self.search.exact_fits.values())
@@ -155,23 +166,23 @@ class SimulationComparison(Comparison[CandidateFit]):
         return list(singles.values())
 
     def with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
-        """Return a hypothesis of one law with its shape free, if that was compared."""
+        """Return the fit of a single law with its shape free; None if there is none."""
         if hypothesis.candidate.is_family:
             return hypothesis
         return self._free_shape_fits.get(hypothesis.candidate.key)
 
     def start_point(self, hypothesis: CandidateFit) -> Point:
-        """Return the point of a hypothesis."""
+        """Return the fitted point of a hypothesis."""
         return hypothesis.point
 
     def check_fit(self, hypothesis: CandidateFit) -> Gate:
-        """Test whether the simulation of a hypothesis leaves noise alone."""
+        """Test whether the residuals of a hypothesis are noise as in the noise records."""
         return check_absolute_fit(self.problem, hypothesis)
 
     def failed_check(self, hypothesis: CandidateFit) -> str:
-        """Return the reason of a failed test of a hypothesis that leaves noise alone.
+        """Return the reason why a hypothesis fails the test of consistency or of held-out trials.
 
-        Empty if none.
+        It is empty if it fails neither, or if its residuals are more than noise anyway.
         """
         if hypothesis.residual_process is not None:
             return ""
@@ -186,7 +197,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         return hypothesis
 
     def remaining_text(self, hypothesis: CandidateFit, share: GapShare) -> str:
-        """Return in words how much of the gap a hypothesis leaves, of how much there is."""
+        """Return in words how much of the gap a hypothesis does not explain."""
         return (
             f"{share.remaining_rms:.3g} of {share.total_rms:.3g} noise deviations "
             "(rms beyond the noise)"
@@ -199,5 +210,13 @@ def _in_role(trials: Iterable[FittedTrial], *, held_out: bool) -> list[FittedTri
 
 
 def _rms_beyond_noise(sums: FloatArray, noise_sums: FloatArray) -> float:
-    """Return the rms beyond the noise, in noise deviations, given sums of squares by block (B,)."""
+    """Return the rms residual beyond the noise, in noise deviations.
+
+    Parameters
+    ----------
+    sums : (B,) array
+        The sum of squared residuals of each block, over the noise variance.
+    noise_sums : (B,) array
+        The expected part of the noise in these sums: the number of samples.
+    """
     return float(np.sqrt(max(sums.sum() / noise_sums.sum() - 1.0, 0.0)))

@@ -1,7 +1,8 @@
-"""Checks of a verdict against the trials, whatever it rests on.
+"""Checks of a verdict against the trials, however it was reached.
 
-A hypothesis with which the error grows is no name. Held-out trials that are far off veto that
-nothing is missing. A fit that leaves more than the signal is no fit, and no evidence of anything.
+A hypothesis that makes the error larger is not named. The verdict that nothing is missing is
+rejected if the model is far off in held-out trials. A fit whose residuals are larger than the
+signal is rejected, and is no evidence of anything.
 """
 
 from collections.abc import Sequence
@@ -22,9 +23,9 @@ from .proof import closed_share_or_reason
 from .remarks import NO_GAP
 
 VETO_NOISES = 5.0
-"""rms over the noise from which on a channel of a held-out trial vetoes that nothing is missing."""
+"""rms residual over the noise deviation above which a channel of a held-out trial is far off."""
 VETO_DEVIATIONS = 3.0
-"""The same over the deviation of the prediction: what the fitted trials leave open is no gap."""
+"""The same over the predictive deviation, since the uncertainty of the fit is no gap."""
 MOST_MENTIONED = 3
 """Number of records that a sentence mentions."""
 WHITE_SECOND_DIFFERENCES = 6.0
@@ -32,12 +33,12 @@ WHITE_SECOND_DIFFERENCES = 6.0
 
 
 def checked_verdict(outcome: VerdictOutcome) -> VerdictOutcome:
-    """Return a verdict that the trials confirm: the same, or one that names nothing and says why.
+    """Return the verdict if the trials confirm it, or one that names nothing and gives the reason.
 
     Parameters
     ----------
     outcome : VerdictOutcome
-        A verdict, its search, and the fit that stands for it.
+        A verdict, its search, and the fit that represents it.
     """
     verdict, search, fit = outcome
     problem = search.problem
@@ -62,7 +63,7 @@ def checked_verdict(outcome: VerdictOutcome) -> VerdictOutcome:
 
 
 def _without_name(verdict: Verdict, sentence: str) -> Verdict:
-    """Return the verdict of an unexplained gap in the place of another verdict."""
+    """Return the verdict of an unexplained gap instead of the given one, with a new sentence."""
     return replace(
         verdict,
         kind=VerdictKind.UNEXPLAINED,
@@ -85,7 +86,7 @@ def _larger_error_sentence(verdict: Verdict, clause: str) -> str:
     verdict : Verdict
         The verdict that names it.
     clause : str
-        By how much the error grows, as `closed_text` returns it.
+        The clause on how much the error grows, from `closed_text`.
     """
     effects = effects_text(verdict.effects) or "the best hypothesis"
     return (
@@ -99,14 +100,14 @@ def _larger_error_sentence(verdict: Verdict, clause: str) -> str:
 
 @dataclass(frozen=True)
 class FarRecord:
-    """A channel of a trial that is far off the prediction.
+    """A channel of a trial whose readings are far off the prediction.
 
     Attributes
     ----------
     trial, channel : str
-        Their names.
+        The names of the trial and the channel.
     noises : float
-        The rms residual over the noise.
+        The rms residual over the noise deviation.
     """
 
     trial: str
@@ -166,10 +167,10 @@ def _with_unit(residuals: ResidualSet, channel: str, value: float) -> str:
 
 
 def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
-    """Return the records of fitted trials in motion that leave more than their own variance.
+    """Return the records of fitted trials in motion whose residuals are larger than the signal.
 
-    The variance is that about the mean of the readings. A channel that shows nothing but noise is
-    fitted: the residuals must be beyond `VETO_NOISES` of the noise, too.
+    The size of the signal is the standard deviation of the readings about their mean. A channel may
+    show nothing but noise, so the rms residual must also exceed `VETO_NOISES` noise deviations.
     """
     unfitted = []
     for fitted in residuals.trials:
@@ -188,9 +189,9 @@ def unfitted_records(residuals: ResidualSet) -> tuple[UnfittedRecord, ...]:
 
 
 def _noise_deviation(residuals: ResidualSet, fitted: FittedTrial, column: int) -> float:
-    """Return the noise deviation of a column of a trial.
+    """Return the noise deviation of a column of a trial [unit of the channel].
 
-    As recorded, or of its second differences.
+    It is the recorded one, or estimated from the second differences of the readings.
     """
     if residuals.degrees_of_freedom(fitted.trial.channels[column]) > 0.0:
         return float(fitted.noise_deviation[column])

@@ -1,4 +1,4 @@
-"""The whole way from a campaign to the calibration of a model's parameters."""
+"""Calibration: the posterior of a model's parameters given a campaign, with findings in words."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ from reporting.provenance import collect_provenance
 from reporting.words import counted, small
 
 SAMPLES = 1000
-"""Samples of a calibration, if nobody asks for another number."""
+"""Default number of samples of a calibration."""
 
 
 def calibrate_parameters(
@@ -44,7 +44,7 @@ def calibrate_parameters(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Return the posterior of a model's parameters given a campaign, if the model lacks nothing.
+    """Return the posterior of a model's parameters, assuming that the model lacks no effect.
 
     Trials that are held out are not fitted; the calibration contains their residuals.
 
@@ -53,7 +53,7 @@ def calibrate_parameters(
     campaign : Campaign
         The campaign; its `parameters` replace priors of the model.
     choice : ModelChoice
-        The model and where it comes from.
+        The model, with its file or source.
     asset : str, optional
         Name of what was measured; that of the campaign by default.
     samples : int
@@ -68,13 +68,13 @@ def calibrate_parameters(
     CampaignDataError
         If the data are at fault, or state a parameter that the model does not have.
     ModelError
-        If the model has no parameter to calibrate, or fails.
+        If the model has no parameter to calibrate, or cannot be evaluated.
     CalibrationRecordError
         If the name of the asset cannot be printed.
     """
     progress = reporter(progress)
     model = choice.model
-    # before the model is evaluated, which may refuse values outside its range
+    # before the model is evaluated: it may fail for values outside its range
     priors = stated_priors(campaign, choice)
     with progress.stage("Checking the data"):
         campaign, faults = checked(campaign, model, hold_out=False)
@@ -85,7 +85,7 @@ def calibrate_parameters(
     campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)
-    # noise that is coloured beyond what its record shows is not a discrepancy
+    # residuals that are correlated as the noise record itself are not a discrepancy
     best = posterior.optima[0]
     best = replace(best, residual_process=residual_process_of(problem, best))
     gate = check_absolute_fit(problem, best)
@@ -172,15 +172,18 @@ def _channel_fits(problem: Problem, posterior: ParameterPosterior) -> tuple[Chan
 
 
 FAR = 3.0
-"""Distance of a posterior mean from the prior mean, in prior deviations, that is a finding."""
+"""Distance of a posterior mean from the prior mean, in prior deviations, above which it is
+reported."""
 TIED = 0.95
-"""Correlation above which two parameters are determined together and not one by one."""
+"""Absolute correlation above which two parameters are reported as not determined separately."""
 EDGE = 0.02
-"""Fraction of a posterior beyond the model's range that is a finding.
+"""Probability of a posterior outside of the model's range above which it is reported.
 
-It is one only for a parameter that the data determine: any other is cut off as its prior is."""
+It is reported only for a parameter that the data determine, since any other is truncated just as
+its prior is."""
 REFUSED = 4.0
-"""Standard deviations from the optimum within which values that the model refuses are a finding."""
+"""Distance from the optimum, in standard deviations, within which a failure of the model is
+reported."""
 
 
 def findings(
@@ -190,7 +193,7 @@ def findings(
     faults: tuple[DataFault, ...],
     remarks: tuple[str, ...],
 ) -> tuple[str, ...]:
-    """Return all findings in sentences: disagreement, limits of the posterior, then remarks.
+    """Return all findings in sentences: misfit, limits of the posterior, faults and remarks.
 
     Parameters
     ----------
@@ -199,7 +202,7 @@ def findings(
     posterior : ParameterPosterior
         Their posterior.
     gate : Gate
-        The gate of absolute fit at the optimum.
+        The test of absolute fit at the optimum.
     faults : tuple of DataFault
         Faults of the data.
     remarks : tuple of str
@@ -225,7 +228,7 @@ def findings(
 
 
 def _parameter_values(priors: Sequence[ParameterPrior], values: FloatArray) -> str:
-    """Return values of the parameters (P,) as text; nan is left out."""
+    """Return values (P,) of the parameters as text such as "a = 1, b = 2"; nan is left out."""
     phrases = []
     for prior, value in zip(priors, values.tolist(), strict=True):
         if np.isfinite(value):
@@ -250,15 +253,15 @@ def _prior_findings(
 def _range_findings(
     priors: Sequence[ParameterPrior], posterior: ParameterPosterior
 ) -> Iterator[str]:
-    """Yield findings on posteriors at the ends of the range, and on refused values within it."""
+    """Yield findings on posteriors at an end of the range, and on failures within it."""
     marginal = posterior.marginal
     optimum = posterior.optima[0]
-    best = optimum.point.shared[marginal.free]
+    fitted_parameters = optimum.point.shared[marginal.free]
     deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.free]), 1e-12)
-    below = ndtr((marginal.low - best) / deviation)
-    above = ndtr((best - marginal.high) / deviation)
+    probability_below = ndtr((marginal.low - fitted_parameters) / deviation)
+    probability_above = ndtr((fitted_parameters - marginal.high) / deviation)
     is_determined = remaining_deviations(posterior) <= MOST_OF_PRIOR
-    is_cut_off = is_determined & (below + above > EDGE)
+    is_cut_off = is_determined & (probability_below + probability_above > EDGE)
     for prior, cut_off in zip(priors, is_cut_off.tolist(), strict=True):
         if cut_off:
             yield (
@@ -309,7 +312,7 @@ def _optimum_findings(
 def _undetermined_findings(
     priors: Sequence[ParameterPrior], posterior: ParameterPosterior
 ) -> Iterator[str]:
-    """Yield findings on parameters that the campaign does not determine, or not apart."""
+    """Yield findings on parameters that the campaign does not determine, or not separately."""
     for prior, ratio in zip(priors, remaining_deviations(posterior).tolist(), strict=True):
         if ratio > MOST_OF_PRIOR:
             remaining = "all" if ratio > 0.995 else f"{100.0 * ratio:.0f} %"
@@ -335,18 +338,21 @@ def _distance_from_optimum(posterior: ParameterPosterior, u: FloatArray) -> floa
     posterior : ParameterPosterior
         The posterior.
     u : (P,) ndarray
-        Scaled parameters; nan for those that may have any value.
+        Scaled parameters; nan for those that are not fixed, which are left out.
     """
     optimum = posterior.optima[0]
-    is_given = np.isfinite(u)
-    indices = posterior.marginal.free[is_given]
-    shift = u[is_given] - optimum.point.shared[indices]
+    is_known = np.isfinite(u)
+    indices = posterior.marginal.free[is_known]
+    shift = u[is_known] - optimum.point.shared[indices]
     covariance = optimum.covariance[np.ix_(indices, indices)]
     return float(np.sqrt(shift @ np.linalg.solve(covariance, shift)))
 
 
 def remaining_deviations(posterior: ParameterPosterior) -> FloatArray:
-    """Return the standard deviation of each parameter (P,) over that of its cut-off prior."""
+    """Return the posterior over the prior standard deviation of each parameter, (P,).
+
+    The prior is truncated at the range of the parameter.
+    """
     marginal = posterior.marginal
     prior_deviations = truncnorm.std(marginal.low, marginal.high)
     return np.asarray(posterior.draws.std(axis=0, ddof=1) / prior_deviations)

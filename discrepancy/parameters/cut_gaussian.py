@@ -1,4 +1,4 @@
-"""A Gaussian of parameters that is cut off at their range: its integral, moments and draws."""
+"""A Gaussian density of parameters truncated at their range: its integral, moments and draws."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,18 +15,18 @@ from discrepancy.campaign.records import FloatArray
 
 @dataclass(frozen=True)
 class CutGaussian:
-    """A Gaussian of P scaled parameters, cut off at their range.
+    """A Gaussian density of P scaled parameters, truncated at their range.
 
     Attributes
     ----------
     mean : (P,) ndarray
-        Mean of the Gaussian without the range; it may lie beyond the range.
+        Mean of the Gaussian before truncation; it may lie outside the range.
     covariance : (P, P) ndarray
-        Its covariance.
+        Covariance of the Gaussian before truncation.
     low, high : (P,) ndarray
-        Ends of the range.
+        Lower and upper ends of the range of each parameter.
     log_integral : float
-        Logarithm of its integral without the range, up to a constant [nat].
+        Logarithm of the integral of the density before truncation, up to a constant [nat].
     """
 
     mean: FloatArray
@@ -37,108 +37,133 @@ class CutGaussian:
 
     @cached_property
     def factor(self) -> FloatArray:
-        """Lower Cholesky factor (P, P) of the covariance."""
+        """Lower Cholesky factor L (P, P) of the covariance: L @ L.T is the covariance."""
         return np.asarray(np.linalg.cholesky(self.covariance))
 
     @cached_property
     def tilt(self) -> FloatArray:
-        """Shift (P,) of each standard normal variable towards where the density is largest.
+        """Shift (P,) of the standard normal variables of draws towards the mode within the range.
 
-        It is the exponential tilting of Botev 2017, J. R. Statist. Soc. B 79 (1).
+        Draws without a shift would be rare near the mode if the mean is outside the range
+        (exponential tilting, Botev 2017, J. R. Statist. Soc. B 79 (1)).
         """
-        inverse = np.linalg.inv(self.factor)
+        inverse_factor = np.linalg.inv(self.factor)
         bounds = (self.low, self.high)
-        mode = lsq_linear(inverse, inverse @ self.mean, bounds, method="bvls").x
-        normal = inverse @ (mode - self.mean)
-        return np.asarray(normal - np.diag(self.factor) * (inverse.T @ normal))
+        # mode within the range: least (u - mean)^T C^-1 (u - mean) = |L^-1 (u - mean)|^2
+        mode = lsq_linear(inverse_factor, inverse_factor @ self.mean, bounds, method="bvls").x
+        normal_at_mode = inverse_factor @ (mode - self.mean)
+        return np.asarray(
+            normal_at_mode - np.diag(self.factor) * (inverse_factor.T @ normal_at_mode)
+        )
 
     def weighted_draws(
         self, means: FloatArray, uniform: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return draws within the range, and the logarithms of their weights.
 
-        Each parameter is drawn within its range given the parameters before it, and its weight is
-        the probability of that range: the mean weight is the probability of the whole range (Genz
-        1992, J. Comput. Graph. Stat. 1 (2)). Draws are shifted by `tilt`, which their weights
-        correct.
+        The parameters are drawn one after another: each within its range, given those before it.
+        The weight of a draw is the product of the probabilities of these ranges, so the mean weight
+        is the probability of the whole range (Genz 1992, J. Comput. Graph. Stat. 1 (2)). Draws are
+        shifted by `tilt`, and the weights contain the ratio of the densities without and with the
+        shift.
 
         Parameters
         ----------
         means : (..., P) ndarray
-            Means in place of `mean`.
+            Means of the Gaussian for each draw, used instead of `mean`.
         uniform : (..., P) ndarray
-            Numbers between 0 and 1.
+            Uniform random numbers between 0 and 1, one for each parameter of each draw.
 
         Returns
         -------
         draws : (..., P) ndarray
+            Draws of the scaled parameters.
         log_weights : (...) ndarray
+            Logarithm of the weight of each draw.
         """
         normal = np.zeros_like(uniform)
         log_weight = np.zeros(uniform.shape[:-1])
         for index, shift in enumerate(self.tilt.tolist()):
-            row = self.factor[index]
-            conditional_mean = means[..., index] + normal @ row
-            low = (self.low[index] - conditional_mean) / row[index] - shift
-            high = (self.high[index] - conditional_mean) / row[index] - shift
+            factor_row = self.factor[index]
+            conditional_mean = means[..., index] + normal @ factor_row
+            low = (self.low[index] - conditional_mean) / factor_row[index] - shift
+            high = (self.high[index] - conditional_mean) / factor_row[index] - shift
             normal[..., index] = shift + truncnorm.ppf(uniform[..., index], low, high)
-            # probability between the ends, in the lower tail, where no digits are lost
-            is_upper = low > 0.0
-            lower_end = np.where(is_upper, -high, low)
-            upper_end = np.where(is_upper, -low, high)
+            # ln of the probability between the ends; an interval in the upper tail is mirrored, as
+            # the difference of two numbers close to one would lose digits
+            is_in_upper_tail = low > 0.0
+            lower_end = np.where(is_in_upper_tail, -high, low)
+            upper_end = np.where(is_in_upper_tail, -low, high)
             log_ratio = log_ndtr(lower_end) - log_ndtr(upper_end)
             log_weight += log_ndtr(upper_end) + np.log1p(-np.exp(log_ratio))
+            # ln of N(x; 0, 1) / N(x; shift, 1)
             log_weight += shift * (0.5 * shift - normal[..., index])
         draws = np.clip(means + normal @ self.factor.T, self.low, self.high)
         return draws, log_weight
 
     def energy(self, u: FloatArray) -> float:
-        """Return -ln of the density at scaled parameters (P,), up to a constant [nat]."""
+        """Return -ln of the density at scaled parameters u (P,), up to a constant [nat]."""
         shift = u - self.mean
         return 0.5 * float(shift @ np.linalg.solve(self.covariance, shift))
 
     @cached_property
     def _even_draws(self) -> tuple[FloatArray, FloatArray]:
-        """Evenly spread draws (N, P) by a Sobol sequence, and their log weights (N,)."""
-        count = len(self.mean)
-        uniform = Sobol(max(count, 1), rng=0).random(EVEN)[:, :count]
+        """Quasi-random draws (N, P) by a Sobol sequence, and their log weights (N,)."""
+        parameter_count = len(self.mean)
+        uniform = Sobol(max(parameter_count, 1), rng=0).random(EVEN)[:, :parameter_count]
         return self.weighted_draws(self.mean, uniform)
 
     @cached_property
     def moments(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (P,) and covariance (P, P) within the range."""
+        """Mean (P,) and covariance (P, P) of the truncated Gaussian."""
         points, log_weight = self._even_draws
         weight = softmax(log_weight)
         return weight @ points, np.atleast_2d(np.cov(points.T, aweights=weight))
 
     @property
     def log_evidence(self) -> float:
-        """Logarithm of its integral within the range, up to a constant [nat]."""
+        """Logarithm of the integral of the density within the range, up to a constant [nat]."""
         _, log_weight = self._even_draws
         return float(self.log_integral + logsumexp(log_weight) - np.log(EVEN))
 
     def draws(self, count: int, generator: np.random.Generator) -> FloatArray:
-        """Return draws (count, P) of equal weight, resampled from weighted ones."""
+        """Return equally weighted draws (count, P), resampled from `TRIED` times as many.
+
+        Parameters
+        ----------
+        count : int
+            Number of draws.
+        generator : Generator
+            Source of random numbers.
+        """
         uniform = generator.random((TRIED * count, len(self.mean)))
-        points, log_weight = self.weighted_draws(self.mean, uniform)
+        candidates, log_weight = self.weighted_draws(self.mean, uniform)
         cumulative = np.cumsum(softmax(log_weight))
         chosen = np.searchsorted(cumulative, stratified(generator, count))
-        return np.asarray(points[np.minimum(chosen, len(points) - 1)])
+        return np.asarray(candidates[np.minimum(chosen, len(candidates) - 1)])
 
     def draws_about(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
-        """Return a draw about each of several means (N, P), which replace the Gaussian's own.
+        """Return one draw (N, P) for each of several means, with the covariance of this Gaussian.
 
-        One of several weighted draws is chosen by the Gumbel-max trick.
+        For each mean, one of `TRIED` weighted draws is chosen with a probability proportional to
+        its weight: the one of largest log weight plus Gumbel noise (the Gumbel-max trick).
+
+        Parameters
+        ----------
+        means : (N, P) ndarray
+            Means that are used instead of `mean`.
+        generator : Generator
+            Source of random numbers.
         """
         shape = (TRIED, *means.shape)
-        points, log_weight = self.weighted_draws(
+        candidates, log_weight = self.weighted_draws(
             np.broadcast_to(means, shape), generator.random(shape)
         )
         chosen = np.argmax(log_weight + generator.gumbel(size=log_weight.shape), axis=0)
-        return np.asarray(points[chosen, np.arange(len(means))])
+        return np.asarray(candidates[chosen, np.arange(len(means))])
 
 
 EVEN = 1024
-"""Draws of a Gaussian from which its probability within the range is computed."""
+"""Number of draws from which the probability of the range and the moments are computed."""
 TRIED = 32
-"""Weighted draws of a Gaussian of which one is taken."""
+"""Number of weighted draws for each draw that is returned."""

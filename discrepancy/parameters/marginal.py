@@ -1,4 +1,8 @@
-"""The posterior density of a model's parameters, with all nuisances integrated out."""
+"""The posterior density of a model's parameters, with all nuisances integrated out.
+
+The nuisances are all other unknowns of a fit: gains, zeros and initial states. They are integrated
+by Laplace's method, as a Gaussian about their fitted values.
+"""
 
 from contextlib import suppress
 from copy import copy
@@ -19,20 +23,20 @@ from discrepancy.parameters.cut_gaussian import CutGaussian
 NOTHING = Candidate()
 """The hypothesis that the model lacks nothing."""
 STARTS = 4
-"""Draws of the prior from which further fits begin, to find several optima."""
+"""Number of draws of the prior at which further fits begin, to find several optima."""
 APART = 3.0
-"""Distance of two optima, in standard deviations, from which on they are different ones."""
+"""Distance of two fits, in standard deviations, from which on they are different optima."""
 COMPARABLE = 10.0
-"""Difference of evidence to the best optimum [nat] up to which another one counts."""
+"""Largest difference of log evidence from the best optimum for another one to be kept [nat]."""
 
 
 class Refusal(NamedTuple):
-    """Parameters within the range that the model refused.
+    """Parameters within the stated range for which the model could not be evaluated.
 
     Attributes
     ----------
     parameters : (P,) ndarray
-        Scaled parameters; nan for those that were fitted.
+        Scaled parameters; nan for those that were being fitted.
     reason : str
         Message of the model.
     """
@@ -44,8 +48,8 @@ class Refusal(NamedTuple):
 class Marginal:
     """The posterior density of the parameters, with all nuisances integrated out.
 
-    Called with scaled parameters u = (value - prior mean) / deviation it returns the energy: -ln
-    p(parameters | campaign) up to a constant [nat].
+    An instance is a function of the scaled parameters u = (value - prior mean) / prior deviation.
+    It returns the energy, -ln p(parameters | campaign) up to a constant [nat].
 
     Parameters
     ----------
@@ -55,11 +59,12 @@ class Marginal:
     Attributes
     ----------
     free : (P,) ndarray of int
-        Indices of the calibrated parameters with a prior deviation; u has an entry for each.
+        Indices of the calibrated parameters whose prior deviation is not zero; u has one entry for
+        each of them.
     low, high : (P,) ndarray
-        Ends of the model's range as scaled parameters; the prior is cut off there.
+        Ends of the model's range as scaled parameters; the prior is truncated there.
     refused : list of Refusal
-        Parameters within the range that the model refused.
+        Parameters within the range for which the model could not be evaluated.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -71,12 +76,12 @@ class Marginal:
         self.refused: list[Refusal] = []
 
     def values(self, u: FloatArray) -> FloatArray:
-        """Return the parameters (..., P) in their units, of scaled ones."""
+        """Return the parameters (..., P) in their units, given scaled parameters u (..., P)."""
         shared = self._problem.shared
         return shared.centre[self.free] + shared.scale[self.free] * u
 
     def inside(self, u: FloatArray) -> NDArray[np.bool_]:
-        """Return which scaled parameters (..., P) lie within the model's range."""
+        """Return whether points u (..., P) lie within the model's range, (...)."""
         return np.asarray(np.all((u >= self.low) & (u <= self.high), axis=-1))
 
     def fitted(
@@ -87,35 +92,38 @@ class Marginal:
         fixed: NDArray[np.bool_] | None = None,
         near: Point | None = None,
     ) -> CandidateFit:
-        """Return the fit of the nuisances, with parameters fixed at given values.
+        """Return the fit of the nuisances while parameters are fixed at given values.
 
         Parameters
         ----------
         u : (P,) ndarray
             Scaled parameters.
         trials : Problem, optional
-            Other trials of the campaign.
+            A problem with other trials of the campaign; that of this density by default.
         fixed : (P,) ndarray of bool, optional
-            Parameters that stay at `u`, all by default; the others are fitted with the nuisances.
+            True for parameters that are fixed at `u`, all by default; the others are fitted
+            together with the nuisances.
         near : Point, optional
-            Where the fit begins.
+            Point at which the fit begins; the best optimum by default, if it is known.
 
         Raises
         ------
         FitError, ModelError
-            If the model cannot have these parameters.
+            If the model cannot be evaluated or fitted with these parameters.
         """
         problem = copy(trials or self._problem)
         shared = problem.shared
         if fixed is None:
             fixed = np.ones(len(self.free), dtype=bool)
         fixed_indices = self.free[fixed]
-        # priors of the fixed parameters: no deviation, and the range is their value
-        arrays = {name: getattr(shared, name).copy() for name in ("centre", "low", "high", "scale")}
-        for array in arrays.values():
+        # a fixed parameter has a prior without deviation, and a range of one value
+        prior_arrays = {
+            name: getattr(shared, name).copy() for name in ("centre", "low", "high", "scale")
+        }
+        for array in prior_arrays.values():
             array[fixed_indices] = self.values(u)[fixed]
-        arrays["scale"][fixed_indices] = 0.0
-        problem.shared = replace(shared, **arrays)
+        prior_arrays["scale"][fixed_indices] = 0.0
+        problem.shared = replace(shared, **prior_arrays)
         start = near
         if start is None:
             start = self._near if trials is None else problem.start(NOTHING)
@@ -135,12 +143,14 @@ class Marginal:
             fitted = self.fitted(u)
         except (FitError, ModelError):
             return np.inf
+        # the evidence of the fit does not contain the prior of the fixed parameters
         return 0.5 * float(u @ u) - fitted.log_evidence
 
     def optima(self, seed: int) -> list[CandidateFit]:
-        """Return the maxima of the posterior that count, most probable first.
+        """Return the maxima of the posterior with notable probability, the most probable first.
 
-        Their evidence is that within the model's range.
+        Fits begin at the prior mean and at draws of the prior. The evidence of a maximum is that of
+        the Gaussian about it, integrated within the model's range.
 
         Parameters
         ----------
@@ -160,7 +170,7 @@ class Marginal:
             start.shared[self.free] = generator.standard_normal(len(self.free))
             with suppress(FitError, ModelError):
                 fits.append(fit(problem, NOTHING, start, iterations=40))
-        # of equal fits the first one counts
+        # of fits that agree within rounding the first one is kept, as the sort is stable
         fits.sort(key=lambda fitted: round(fitted.objective, 3))
         all_fitted = np.ones(len(self.free), dtype=bool)
         optima: list[CandidateFit] = []
@@ -175,28 +185,32 @@ class Marginal:
         return [optimum for optimum in optima if optimum.log_evidence > least_evidence]
 
     def _is_same_optimum(self, first: CandidateFit, second: CandidateFit) -> bool:
-        """Return whether two fits are one optimum, by their distance in standard deviations."""
+        """Return whether two fits are at the same optimum.
+
+        They are if their distance in posterior standard deviations (Mahalanobis) is below `APART`.
+        """
         free = self.free
         shift = first.point.shared[free] - second.point.shared[free]
         covariance = first.covariance[np.ix_(free, free)]
         return bool(shift @ np.linalg.solve(covariance, shift) < APART**2)
 
     def gaussian_about(self, fitted: CandidateFit, which: NDArray[np.bool_]) -> CutGaussian:
-        """Return the Gaussian approximation about a fit (Laplace's method), cut off at the range.
+        """Return the Gaussian approximation of the posterior about a fit, truncated at the range.
 
-        A fit may lie at an end of the range; the Gaussian has its mean beyond it then.
+        It is that of Laplace's method. If the fit is at an end of the range, the mean of the
+        Gaussian lies outside of the range.
 
         Parameters
         ----------
         fitted : CandidateFit
             The fit.
         which : (P,) ndarray of bool
-            The parameters that were fitted, of which the Gaussian is.
+            True for the parameters that were fitted, whose density the Gaussian is.
         """
         problem = self._problem
         indices = self.free[which]
         equations = normal_equations(problem, fitted, NOTHING, problem.precisions(fitted.sums))
-        # the Newton step to the maximum without the range
+        # the Newton step to the maximum without limits adds gradient @ step / 2 to the log density
         step = solve_factored(cholesky_factor(equations.matrix), equations.gradient)
         return CutGaussian(
             mean=fitted.point.shared[indices] + step[indices],

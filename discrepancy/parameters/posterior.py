@@ -1,6 +1,6 @@
-"""Draws of the posterior of a model's parameters: by quadrature, or of Gaussians.
+"""Draws of the posterior of a model's parameters, by quadrature or from Gaussians.
 
-A single Gaussian is checked against the posterior.
+A Gaussian is used only if the energy (-ln of the posterior density) agrees with it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,23 +22,25 @@ from discrepancy.parameters.cut_gaussian import CutGaussian
 from discrepancy.parameters.marginal import Marginal
 
 REACH = 6.0
-"""Range of a quadrature on either side of the prior mean, in prior deviations."""
+"""Half of the range of a quadrature about the prior mean, in prior deviations."""
 NEAR = 9
-"""Nodes within three standard deviations of an optimum."""
+"""Number of first nodes within three standard deviations of an optimum."""
 WIDE = 17
-"""Nodes over the whole prior."""
+"""Number of first nodes over the whole prior."""
 BETWEEN = 40
-"""Points of the density between two nodes."""
+"""Number of intervals between two nodes at which the density is interpolated."""
 LARGEST_MASS = 0.04
-"""Largest probability between two nodes; more nodes are added above it."""
+"""Probability between two neighbouring nodes above which a node is added between them."""
 MOST_NODES = 90
-"""Most nodes of a quadrature."""
+"""Largest number of nodes of a quadrature."""
 CHECKED = ((1.0, 0.12), (2.0, 0.5))
-"""Check of a Gaussian: standard deviations from the mean, and allowed errors of energy [nat]."""
+"""Pairs of a distance from the mean [standard deviations] at which a Gaussian is compared with the
+posterior, and the allowed error of its energy there [nat]."""
 EMPTY = 700.0
-"""Energy above the least [nat] from which on a density is zero."""
+"""Largest energy above the least one; higher energies are reduced to it, as exp(-700) is nearly the
+least number of double precision [nat]."""
 LEAST_SPREAD = 1e-9
-"""Distance of two nodes, as a fraction of the grid, below which they are one."""
+"""Distance of two nodes, as a fraction of the length of the grid, below which one is dropped."""
 
 
 @dataclass(frozen=True)
@@ -66,11 +68,12 @@ class ParameterPosterior:
 def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPosterior:
     """Return draws of the posterior of a problem's parameters.
 
-    A single parameter is integrated by quadrature. For several the Gaussian about the optimum, cut
-    off at the range, is used if the energy along its principal axes is that of a Gaussian.
-    Otherwise the least determined parameter is integrated by quadrature, and the others are such a
-    Gaussian given it (a nested Laplace approximation, Rue, Martino and Chopin 2009, J. R. Statist.
-    Soc. B 71 (2)). Several optima have a Gaussian each, weighted by their evidence.
+    There are three procedures. A single parameter is drawn by quadrature of its density. Several
+    parameters with one optimum are drawn from the Gaussian about it, truncated at the range, if the
+    energy along its principal axes is that of a Gaussian. If not, the parameter of the largest
+    variance is drawn by quadrature, and the others from a truncated Gaussian given its value (a
+    nested Laplace approximation, Rue, Martino and Chopin 2009, J. R. Statist. Soc. B 71 (2)).
+    Several optima are drawn from one Gaussian each, weighted by their evidence.
 
     Parameters
     ----------
@@ -107,7 +110,7 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
 def _draws_of_gaussians(
     gaussians: Sequence[CutGaussian], count: int, generator: np.random.Generator
 ) -> FloatArray:
-    """Return draws (count, P) of a mixture of Gaussians, weighted by their evidence."""
+    """Return draws (count, P) from a mixture of Gaussians that are weighted by their evidence."""
     probabilities = softmax([gaussian.log_evidence for gaussian in gaussians])
     chosen = generator.choice(len(gaussians), count, p=probabilities)
     draws = np.empty((count, len(gaussians[0].mean)))
@@ -118,10 +121,10 @@ def _draws_of_gaussians(
 
 
 def is_gaussian(marginal: Marginal, gaussian: CutGaussian) -> bool:
-    """Return whether a posterior is a Gaussian that is cut off at its range.
+    """Return whether a posterior agrees with a Gaussian that is truncated at the range.
 
-    The energies are compared at the distances `CHECKED` from the mean, or where the range ends
-    before.
+    Their energies are compared at points on the principal axes, at the distances `CHECKED` from the
+    mean, or at the end of the range if that is nearer.
 
     Parameters
     ----------
@@ -136,9 +139,9 @@ def is_gaussian(marginal: Marginal, gaussian: CutGaussian) -> bool:
     energy_at_mean = marginal(mean) - gaussian.energy(mean)
     for axis, (distance, allowed_error), side in product(axes, CHECKED, (-1.0, 1.0)):
         step = side * distance * axis
-        room = np.where(step > 0.0, gaussian.high - mean, mean - gaussian.low)
-        room_in_steps = room / np.maximum(np.abs(step), 1e-300)
-        point = mean + min(1.0, room_in_steps.min()) * step
+        distance_to_end = np.where(step > 0.0, gaussian.high - mean, mean - gaussian.low)
+        largest_step_fraction = distance_to_end / np.maximum(np.abs(step), 1e-300)
+        point = mean + min(1.0, largest_step_fraction.min()) * step
         point = np.clip(point, gaussian.low, gaussian.high)
         error = marginal(point) - gaussian.energy(point) - energy_at_mean
         if not abs(error) < allowed_error:
@@ -153,15 +156,15 @@ def _draws_by_quadrature(
     count: int,
     generator: np.random.Generator,
 ) -> FloatArray:
-    """Return draws of the posterior, with one parameter by quadrature and the others given it.
+    """Return draws of the posterior: one parameter by quadrature, and the others given its value.
 
-    At each node of the one, the others are fitted and integrated with the nuisances: they are a
-    Gaussian given the one, cut off at the model's range.
+    A node is a value of the one parameter. At each node the other parameters are fitted and
+    integrated together with the nuisances, by a Gaussian that is truncated at the model's range.
 
     Parameters
     ----------
     index : int
-        The parameter of the quadrature.
+        Index of the parameter of the quadrature.
     marginal : Marginal
         The posterior density.
     optima : tuple of CandidateFit
@@ -174,6 +177,7 @@ def _draws_by_quadrature(
     Returns
     -------
     (count, P) ndarray
+        Draws of the scaled parameters, of equal weight.
     """
     nodes = _QuadratureNodes(index, marginal, optima[0])
     first_nodes = _first_nodes(marginal, optima, index)
@@ -188,30 +192,31 @@ def _draws_by_quadrature(
         left, right = sorted(nodes.energy)[largest : largest + 2]
         nodes.visit(0.5 * (left + right))
         points, distribution = _distribution(nodes.energy)
-    values = np.interp(stratified(generator, count), distribution, points)
+    quadrature_values = np.interp(stratified(generator, count), distribution, points)
 
-    # means of the other parameters given these values, and draws about them
-    positions = np.array(sorted(nodes.gaussians))
-    gaussians = [nodes.gaussians[node] for node in positions.tolist()]
+    # the other parameters: their mean interpolates those at the nodes, and their covariance is
+    # that at the nearest node
+    node_values = np.array(sorted(nodes.gaussians))
+    gaussians = [nodes.gaussians[node] for node in node_values.tolist()]
     means = np.array([gaussian.mean for gaussian in gaussians])
-    inner_values = np.clip(values, positions[0], positions[-1])
-    means_of_draws = Akima1DInterpolator(positions, means)(inner_values)
-    draws: FloatArray = np.insert(means_of_draws, index, values, axis=1)
-    nearest = np.abs(values[:, None] - positions).argmin(axis=1)
-    for number, gaussian in enumerate(gaussians):
-        rows = np.flatnonzero(nearest == number)
-        others = np.ix_(rows, ~nodes.is_of_quadrature)
-        draws[others] = gaussian.draws_about(draws[others], generator)
+    inner_values = np.clip(quadrature_values, node_values[0], node_values[-1])
+    means_of_draws = Akima1DInterpolator(node_values, means)(inner_values)
+    draws: FloatArray = np.insert(means_of_draws, index, quadrature_values, axis=1)
+    nearest = np.abs(quadrature_values[:, None] - node_values).argmin(axis=1)
+    for node_number, gaussian in enumerate(gaussians):
+        draws_at_node = np.flatnonzero(nearest == node_number)
+        entries_of_others = np.ix_(draws_at_node, ~nodes.is_of_quadrature)
+        draws[entries_of_others] = gaussian.draws_about(draws[entries_of_others], generator)
     return draws
 
 
 class _QuadratureNodes:
-    """Nodes of a quadrature over one parameter, with the others as a Gaussian at each of them.
+    """Nodes of a quadrature over one parameter, with the Gaussian of the others at each node.
 
     Parameters
     ----------
     index : int
-        The parameter of the quadrature.
+        Index of the parameter of the quadrature.
     marginal : Marginal
         The posterior density.
     best : CandidateFit
@@ -238,7 +243,7 @@ class _QuadratureNodes:
         self._points = {self.centre: best.point}
 
     def visit(self, node: float) -> None:
-        """Add a node; the fit there begins at that of the nearest node."""
+        """Add a node with its energy; the fit there begins at the point of the nearest node."""
         nearest = min(self._points, key=lambda visited: abs(visited - node))
         self.energy[node] = np.inf
         with suppress(FitError, ModelError):
@@ -250,25 +255,40 @@ class _QuadratureNodes:
             gaussian = self._marginal.gaussian_about(fitted, ~self.is_of_quadrature)
             self._points[node] = fitted.point
             self.gaussians[node] = gaussian
+            # the evidence does not contain the prior of the parameter that is fixed at the node
             self.energy[node] = 0.5 * node**2 - gaussian.log_evidence
 
 
 def _first_nodes(marginal: Marginal, optima: tuple[CandidateFit, ...], index: int) -> list[float]:
-    """Return values of one parameter over the whole prior, and closer ones about each optimum."""
+    """Return the first nodes: values over the whole prior, and closer ones about each optimum.
+
+    Parameters
+    ----------
+    marginal : Marginal
+        The posterior density.
+    optima : tuple of CandidateFit
+        Its maxima.
+    index : int
+        Index of the parameter of the quadrature.
+    """
     low, high = marginal.low[index], marginal.high[index]
     shared_index = marginal.free[index]
-    grids = [np.linspace(max(low, -REACH), min(high, REACH), WIDE)]
+    node_grids = [np.linspace(max(low, -REACH), min(high, REACH), WIDE)]
     for optimum in optima:
         deviation = np.sqrt(optimum.covariance[shared_index, shared_index])
-        about = optimum.point.shared[shared_index] + deviation * np.linspace(-3.0, 3.0, NEAR)
-        grids.append(np.clip(about, low, high))
-    nodes = np.unique(np.concatenate(grids))
+        about_optimum = optimum.point.shared[shared_index] + deviation * np.linspace(
+            -3.0, 3.0, NEAR
+        )
+        node_grids.append(np.clip(about_optimum, low, high))
+    nodes = np.unique(np.concatenate(node_grids))
     is_apart = np.diff(nodes, prepend=-np.inf) > LEAST_SPREAD * (nodes[-1] - nodes[0])
     return [float(node) for node in nodes[is_apart]]
 
 
 def _distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return the distribution function of a density that is known at nodes.
+    """Return the cumulative distribution of a density whose energy is known at nodes.
+
+    The energy is interpolated between the nodes by Akima's method.
 
     Parameters
     ----------
@@ -277,15 +297,17 @@ def _distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray
 
     Returns
     -------
-    points, probability : (K,) ndarray
-        Nodes with `BETWEEN` - 1 points between them, and the probability below each.
+    points : (K,) ndarray
+        The nodes, with `BETWEEN` - 1 points between any two of them.
+    probability : (K,) ndarray
+        The probability below each point.
     """
     nodes = np.array(sorted(energy))
     energies = np.array([energy[node] for node in nodes.tolist()])
     energies = np.minimum(energies - energies.min(), EMPTY)
     fractions = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)
-    inner = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
-    points = np.append(inner, nodes[-1])
+    between_nodes = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
+    points = np.append(between_nodes, nodes[-1])
     density = np.exp(-Akima1DInterpolator(nodes, energies)(points))
     # trapezoidal rule
     masses = 0.5 * (density[1:] + density[:-1]) * np.diff(points)

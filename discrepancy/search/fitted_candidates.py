@@ -1,4 +1,4 @@
-"""The candidates that a search has fitted, and what is compared of them."""
+"""The candidates that a search has fitted, with their scores and probabilities."""
 
 from dataclasses import dataclass, field
 from math import exp
@@ -24,7 +24,7 @@ class FittedCandidates:
     problem : Problem
         The campaign and model.
     effects : tuple of Effect
-        The effects that can act here.
+        The effects of the catalogue that can act in the campaign.
     no_effect : CandidateFit
         The fit of the model without effect.
     exact_fits : dict of CandidateKey to CandidateFit
@@ -32,8 +32,8 @@ class FittedCandidates:
     rough_fits : dict of CandidateKey to CandidateFit
         The candidates that were fitted by few steps only; their evidence is approximate.
     wide_fits : dict of CandidateKey to CandidateFit
-        The candidates that were fitted under a wider noise; where there are any, they alone are
-        compared.
+        The candidates that were fitted under a wider noise than recorded; if there are any, only
+        these are compared.
     """
 
     problem: Problem
@@ -47,7 +47,7 @@ class FittedCandidates:
         self.exact_fits[()] = self.no_effect
 
     def log_prior(self, candidate: Candidate) -> float:
-        """Return the log prior probability of a candidate at its places."""
+        """Return the log prior probability of the effects of a candidate at their places [nat]."""
         return log_prior(candidate, len(self.effects), self.problem.setting)
 
     def score(self, fit: CandidateFit | ForceHypothesis) -> float:
@@ -55,7 +55,10 @@ class FittedCandidates:
         return fit.log_evidence + self.log_prior(fit.candidate)
 
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
-        """Return the fit of every candidate that is compared, the exact one where there is one."""
+        """Return the fit of every candidate by which it is compared.
+
+        It is the fit under the wider noise if there is any, else the exact fit, else the rough one.
+        """
         return self.wide_fits or {**self.rough_fits, **self.exact_fits}
 
     def best(self) -> CandidateFit:
@@ -63,7 +66,7 @@ class FittedCandidates:
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
     def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
-        """Return the most probable fit of a set of effects, over their places."""
+        """Return the fit of the highest score of a set of effects, at any places."""
         fits = self.compared_fits().values()
         return max(
             (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
@@ -87,10 +90,12 @@ class FittedCandidates:
         scores: dict[tuple[str, ...], list[float]] = {}
         for fit in self.compared_fits().values():
             scores.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
-        sums = {identifiers: float(logsumexp(values)) for identifiers, values in scores.items()}
-        total = float(logsumexp(list(sums.values())))
-        ordered = sorted(sums.items(), key=lambda entry: -entry[1])
-        return {identifiers: min(exp(value - total), 1.0) for identifiers, value in ordered}
+        log_weights = {
+            identifiers: float(logsumexp(values)) for identifiers, values in scores.items()
+        }
+        log_total = float(logsumexp(list(log_weights.values())))
+        ordered = sorted(log_weights.items(), key=lambda entry: -entry[1])
+        return {identifiers: min(exp(value - log_total), 1.0) for identifiers, value in ordered}
 
     def record(self, fit: CandidateFit, *, exact: bool) -> None:
         """Record a fit if its evidence is above that of an earlier fit of the same candidate."""
@@ -100,7 +105,10 @@ class FittedCandidates:
             fits[key] = fit
 
     def is_unexplained(self) -> bool:
-        """Return whether the best candidate cannot be shown to leave noise alone."""
+        """Return whether the best candidate does not pass the test of absolute fit.
+
+        It fails the test, or there is no noise record to test it by.
+        """
         return not check_absolute_fit(self.problem, self.best()).passed
 
     @property
@@ -109,9 +117,10 @@ class FittedCandidates:
         return all(data.trial.is_dynamic for data in self.problem.trials)
 
     def fit_exactly(self, rough: CandidateFit) -> CandidateFit:
-        """Return a candidate fitted to convergence, from a rough fit, and record it.
+        """Return a candidate fitted to convergence from a rough fit, and record the fit.
 
-        An exact fit that is known already is repeated only if the rough one is clearly better.
+        If the candidate was fitted to convergence before, the fit is repeated only if the rough fit
+        has clearly more evidence.
         """
         key = rough.candidate.key
         if key in self.wide_fits:
@@ -119,6 +128,6 @@ class FittedCandidates:
         known = self.exact_fits.get(key)
         if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
             exact = attempt(self.problem, rough.candidate, rough.point)
-            # few steps may have led to where the structure cannot follow
+            # the rough fit may be at a point from which the model cannot be fitted further
             self.record(rough if exact is None else exact, exact=True)
         return self.exact_fits[key]

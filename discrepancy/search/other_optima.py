@@ -1,6 +1,6 @@
-"""Starts at other optima of what was fitted.
+"""Starting points of fits near other optima than the one that was found.
 
-Another size of a single effect, or another place in a set.
+They have another magnitude of a single effect, or another place of one effect of a set.
 """
 
 from collections.abc import Iterable
@@ -19,7 +19,9 @@ from discrepancy.search_settings import SEARCH
 def canonical_relatives(
     leading: EffectTerm, hypotheses: Iterable[ForceHypothesis]
 ) -> list[ForceHypothesis]:
-    """Return the hypotheses of one canonical effect of the family and place of a leading term.
+    """Return the hypotheses of one effect that has the family and place of a given one.
+
+    The effects have their canonical shape, and a magnitude.
 
     Parameters
     ----------
@@ -41,7 +43,9 @@ def canonical_relatives(
 
 
 def points_at_other_sizes(problem: Problem, candidate: Candidate, start: Point) -> list[Point]:
-    """Return points at which a single effect has another magnitude, those of least objective first.
+    """Return points at which a single effect has another magnitude, to begin fits at.
+
+    They are sorted by their objective, the least first; `SEARCH.restarts` of them are returned.
 
     Parameters
     ----------
@@ -50,21 +54,21 @@ def points_at_other_sizes(problem: Problem, candidate: Candidate, start: Point) 
     candidate : Candidate
         The candidate of one effect.
     start : Point
-        The point at which the effect follows the missing force; all other unknowns stay there.
+        The point at which the effect agrees with the missing force. Only the magnitude is changed.
     """
     (term,) = candidate.terms
     valued_points: list[tuple[float, Point]] = []
     for factor in SEARCH.restart_sizes:
         effect = term.rescaled(start.effect, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
         point = replace(start, effect=effect)
-        with suppress(DiscrepancyError):  # more than the structure can carry
+        with suppress(DiscrepancyError):  # the effect is larger than the model allows
             valued_points.append((objective(problem, candidate, point), point))
     valued_points.sort(key=lambda valued_point: valued_point[0])
     return [point for _, point in valued_points[: SEARCH.restarts]]
 
 
 def sets_at_other_places(candidate: Candidate, setting: Setting) -> list[Candidate]:
-    """Return all candidates that have one effect of a set at another of its places."""
+    """Return all candidates that differ from a set of effects by the place of one effect."""
     moved_candidates = []
     for number, term in enumerate(candidate.terms):
         for place in term.effect.places(setting):

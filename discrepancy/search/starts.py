@@ -1,6 +1,7 @@
-"""Starts of fits.
+"""Points from which fits of effects begin.
 
-The most promising changes by each effect and by pairs, from a screen or a grid.
+They come from a screen, which predicts to first order how much each effect or pair of effects
+reduces the misfit, or from a grid of parameters at which the objective is computed.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -26,7 +27,7 @@ T = TypeVar("T")
 OnProgress = Callable[[str], None]
 """Takes a line that says what the search is doing."""
 LARGEST_CONDITION = 1e8
-"""Condition number beyond which the changes by two effects are the same one."""
+"""Condition number of the Gram matrix above which the changes by two effects are parallel."""
 
 
 class FitStart(NamedTuple):
@@ -43,7 +44,7 @@ def no_progress(message: str) -> None:
 def with_progress(
     on_progress: OnProgress, items: Sequence[T], describe: Callable[[T], str]
 ) -> Iterator[T]:
-    """Yield items, and report for each what is done with it and how many are still to come.
+    """Yield items, and before each one report what is done with it and how many follow.
 
     Parameters
     ----------
@@ -64,11 +65,14 @@ def with_progress(
 
 
 def acts_within(effect: Effect, setting: Setting) -> bool:
-    """Return whether an effect acts on the structure or its loads, and not only on readings."""
+    """Return whether an effect changes the structure or its loads, and not only the readings.
+
+    An error of a sensor, such as a gain, changes only the readings.
+    """
     term = EffectTerm(effect, effect.places(setting)[0])
     try:
         patch = term.patch(setting, term.start() + 1.0)
-    except DiscrepancyError:  # only a law within the structure can be too large
+    except DiscrepancyError:  # only a change of the structure can be too large for the model
         return True
     return not all(isinstance(primitive, SENSORS) for primitive in patch)
 
@@ -85,10 +89,11 @@ def are_related(first: Effect, second: Effect) -> bool:
 
 
 def starting_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
-    """Return the most promising changes by an effect, from which its fits may begin.
+    """Return the changes of the prediction by an effect from which its fits should begin.
 
-    An effect with several parameters that are no magnitudes, such as the place and width of a box,
-    gets more starts than others.
+    They are those of least `_cost`, over all places and a grid of parameters. An effect with
+    several parameters besides its magnitude, such as the place and width of a box, gets more starts
+    than others.
 
     Parameters
     ----------
@@ -100,35 +105,44 @@ def starting_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
     setting = screen.problem.setting
     places = effect.places(setting)
     has_few_places = len(places) <= SEARCH.few_places
-    others = sum(not parameter.magnitude for parameter in effect.parameters)
-    count = SEARCH.starts * 3 if others > 1 else SEARCH.starts
+    other_parameter_count = sum(not parameter.magnitude for parameter in effect.parameters)
+    count = SEARCH.starts * 3 if other_parameter_count > 1 else SEARCH.starts
     best_changes: list[ScreenedChange] = []
     for place in places:
         best_of_place: list[ScreenedChange] = []
         for change in screen.changes(EffectTerm(effect, place), fine=has_few_places):
             changes = [change]
             is_nonlinear = change.squared_size > SEARCH.first_order and acts_within(effect, setting)
+            # a large change that is not linear in its magnitude is tried at a small one too
             if has_few_places and is_nonlinear:
                 with suppress(DiscrepancyError):
                     small_change, _ = screen.shrunk(change)
                     changes.append(small_change)
-            visible = [change for change in changes if change.squared_size > 0.0]
-            best_of_place = sorted([*best_of_place, *visible], key=_cost)[:count]
+            nonzero_changes = [change for change in changes if change.squared_size > 0.0]
+            best_of_place = sorted([*best_of_place, *nonzero_changes], key=_cost)[:count]
         best_changes.extend(best_of_place)
     return sorted(best_changes, key=_cost)[:count]
 
 
 def _cost(change: ScreenedChange) -> float:
-    """Return the change of the objective at the best scale.
+    """Return the expected change of the objective by a change at its best scale [nat].
 
-    Its prior less the gained misfit [nat].
+    It is the negative log prior of the parameters minus the decrease of the misfit.
     """
-    scaled = change.best
-    return -change.gain + 0.5 * float(scaled @ scaled)
+    scaled_parameters = change.best
+    return -change.gain + 0.5 * float(scaled_parameters @ scaled_parameters)
 
 
 class ScreenedPair(NamedTuple):
-    """Two changes that explain most together at their scales, and the misfit they add [nat]."""
+    """Changes by two effects, scaled to reduce the misfit most together.
+
+    Attributes
+    ----------
+    misfit : float
+        The change of the misfit by both, negative for a decrease [nat].
+    first, second : ScreenedChange
+        The two changes with their best scales.
+    """
 
     misfit: float
     first: ScreenedChange
@@ -143,37 +157,44 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
     changes : sequence of ScreenedChange
         The changes by all effects.
     sign : (D,) array
-        The signs of the inner product, `Screen.sign`.
+        The signs of the inner product of changes, `Screen.sign`: entries of a vector that are
+        projections on nuisances count negative, as they are subtracted from those of readings.
     """
     best: dict[tuple[str, str], ScreenedPair] = {}
     for first, second in combinations(changes, 2):
         key = (first.term.effect.identifier, second.term.effect.identifier)
-        cross = float(first.vector * sign @ second.vector)
-        gram = np.array([[first.squared_size, cross], [cross, second.squared_size]])
+        inner_product = float(first.vector * sign @ second.vector)
+        gram = np.array([[first.squared_size, inner_product], [inner_product, second.squared_size]])
         overlap = np.array([first.overlap, second.overlap])
         if key[0] == key[1] or np.linalg.cond(gram) > LARGEST_CONDITION:
             continue
-        scale = np.linalg.solve(gram, overlap)
-        can_have_sign = [
+        # least misfit F(s) = F(0) - b^T s + s^T G s / 2: s = G^-1 b, F(s) - F(0) = -b^T s / 2
+        best_scales = np.linalg.solve(gram, overlap)
+        has_possible_sign = [
             factor >= 0.0 or change.term.may_be_negative
-            for factor, change in zip(scale, (first, second), strict=True)
+            for factor, change in zip(best_scales, (first, second), strict=True)
         ]
-        misfit = -0.5 * float(overlap @ scale)
-        is_better = key not in best or misfit < best[key].misfit
-        if all(can_have_sign) and is_better:
+        misfit_change = -0.5 * float(overlap @ best_scales)
+        is_best_of_effects = key not in best or misfit_change < best[key].misfit
+        if all(has_possible_sign) and is_best_of_effects:
             best[key] = ScreenedPair(
-                misfit, _with_scale(first, scale[0]), _with_scale(second, scale[1])
+                misfit_change,
+                _with_scale(first, best_scales[0]),
+                _with_scale(second, best_scales[1]),
             )
     return sorted(best.values(), key=lambda pair: pair.misfit)
 
 
 def _with_scale(change: ScreenedChange, scale: float) -> ScreenedChange:
-    """Return the change as one whose best scale is a given one, so that a fit begins there."""
+    """Return a change whose best scale is the given one, so that a fit begins there.
+
+    The best scale of a change is its overlap over its squared size (`ScreenedChange.scale`).
+    """
     return replace(change, overlap=scale * change.squared_size)
 
 
 def start_beside(base: CandidateFit, term: EffectTerm, values: FloatArray) -> FitStart:
-    """Return the start of a fit with one more effect.
+    """Return the start of a fit with one more effect than a base has.
 
     Parameters
     ----------
@@ -194,8 +215,8 @@ def start_beside(base: CandidateFit, term: EffectTerm, values: FloatArray) -> Fi
 def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[FitStart]:
     """Return the points of a grid of an effect's parameters at which the objective is least.
 
-    Far from the truth a screen, which is linear, says little; a grid needs a simulation for each
-    point.
+    A grid is used if the residuals are so large that a screen, which is linear, is not reliable. It
+    costs a simulation for each point.
 
     Parameters
     ----------
@@ -211,12 +232,12 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
         term = EffectTerm(effect, place)
         parameter_count = len(term.parameters)
         level_counts = SEARCH.far_levels
-        count = level_counts[min(parameter_count, len(level_counts) - 1)]
+        level_count = level_counts[min(parameter_count, len(level_counts) - 1)]
         # quantiles of the prior
-        levels = ndtri((np.arange(count) + 0.5) / max(count, 1))
+        levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
         for values in product(levels, repeat=parameter_count):
             start = start_beside(base, term, np.array(values))
-            with suppress(DiscrepancyError):  # more than the structure can carry
+            with suppress(DiscrepancyError):  # the effect is larger than the model allows
                 value = objective(problem, start.candidate, start.point)
                 valued_starts.append((value, start))
     valued_starts.sort(key=lambda valued_start: valued_start[0])

@@ -1,4 +1,11 @@
-"""The search for the set of effects that explains a campaign: screen, fit, add, drop."""
+"""The search for the set of effects that explains a campaign.
+
+Effects are screened at a fit (see `fits.screening`), the promising ones are fitted by few steps and
+the best of these to convergence; then effects are added to the best set, moved to other places, and
+dropped. The *score* of a fit is ln (evidence times prior). A *family* is a law whose shape
+parameters are fitted too. *Far from the truth* is a fit whose residuals are much larger than the
+noise, so that predictions are not linear between it and the right one.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -41,12 +48,13 @@ class Search(FittedCandidates):
     Attributes
     ----------
     screened_gains : dict of str to float
-        The largest gain of each effect that a screen at the fit without effect found [nat].
+        The largest decrease of the misfit by each effect, as expected by the screen at the fit
+        without effect [nat].
     on_progress : callable
-        Takes a line that says what is fitted, and how much is still to come.
+        Called with a line that says what is fitted, and how much is still to come.
     wide_problem : Problem or None
-        The problem under the noise by which `wide_fits` were fitted: as wide as what the best
-        hypothesis leaves.
+        The problem under the wider noise of `wide_fits`, which is as large as the residuals of the
+        best hypothesis.
     force_hypotheses : list of ForceHypothesis
         The sets of effects that were fitted to the missing force, the most probable first.
     """
@@ -58,10 +66,7 @@ class Search(FittedCandidates):
 
     @cached_property
     def force_search(self) -> ForceSearch | None:
-        """The search for missing forces in the trials in motion.
-
-        None where no force can be seen.
-        """
+        """The search for missing forces in the trials in motion; None if they show no force."""
         if not sees_forces(self.problem):
             return None
         self.on_progress("looking for the missing force")
@@ -76,24 +81,29 @@ class Search(FittedCandidates):
     def fit_roughly_beside(
         self, base: CandidateFit, effects: Iterable[Effect]
     ) -> list[CandidateFit]:
-        """Fit each effect beside those of a base by few steps.
+        """Add each effect to a fit and fit the set by few steps.
 
-        Return the best fit of each, best first.
-
-        Fits begin where a screen at the base leads. Far from the truth phases slip over a record
-        and nothing is linear; there they begin on a grid too, beside the missing force.
+        The fits begin where the screen expects the least objective. Far from the truth the phases
+        of predictions drift away from those of the readings, and the screen, which is linear, does
+        not help; then fits also begin at points of a grid.
 
         Parameters
         ----------
         base : CandidateFit
             The fit that effects are added to.
         effects : iterable of Effect
-            The effects to add.
+            The effects to add, one at a time.
+
+        Returns
+        -------
+        list of CandidateFit
+            The best fit of each effect, in descending order of score.
         """
         effects = tuple(effects)
         setting = self.problem.setting
         screened = effects
-        if self._misfits(base):  # only what acts on readings leaves phases alone
+        # with large residuals a screen is used only for errors of readings, which shift no phases
+        if self._misfits(base):
             screened = tuple(effect for effect in effects if not acts_within(effect, setting))
         fits = self._fit_from_screen(base, screened)
         is_explained = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
@@ -105,27 +115,41 @@ class Search(FittedCandidates):
                     starts_by_effect.append(grid_starts(self.problem, unbiased_base, effect))
             starts_by_effect = [starts for starts in starts_by_effect if starts]
             fits += self._fit_from_starts(starts_by_effect, unbiased_base, 0.0)
-        best: dict[tuple[str, ...], CandidateFit] = {}
+        best_by_effects: dict[tuple[str, ...], CandidateFit] = {}
         for fit in sorted(fits, key=self.score):
             self.record(fit, exact=False)
-            best[fit.candidate.identifiers] = fit
-        return sorted(best.values(), key=lambda fit: -self.score(fit))
+            best_by_effects[fit.candidate.identifiers] = fit
+        return sorted(best_by_effects.values(), key=lambda fit: -self.score(fit))
 
     def _misfits(self, base: CandidateFit) -> bool:
-        """Return whether a fit leaves much."""
+        """Return whether the residuals of a fit are much larger than the noise."""
         return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
 
     def _is_far(self, base: CandidateFit) -> bool:
         """Return whether a fit is far from the truth.
 
-        It leaves much, or shared unknowns left their priors.
+        Its residuals are then much larger than the noise, or a shared unknown is many deviations
+        from its prior mean.
         """
         has_prior = self.problem.shared.precision > 0.0
         deviations = np.abs(base.point.shared[has_prior])
         return self._misfits(base) or bool(deviations.max(initial=0.0) > SEARCH.strained)
 
     def _fit_from_screen(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
-        """Fit effects from where a screen at a base leads, the most promising first."""
+        """Fit effects by few steps from the best points of a screen, the most promising first.
+
+        Parameters
+        ----------
+        base : CandidateFit
+            The fit that effects are added to.
+        effects : sequence of Effect
+            The effects to add, one at a time. Those of too small a gain are not fitted.
+
+        Returns
+        -------
+        list of CandidateFit
+            The best fit of each effect that was fitted.
+        """
         has_effects = bool(base.candidate.terms)
         least_gain = SEARCH.worth_adding if has_effects else SEARCH.worth_fitting
         screen = Screen(self.problem, base)
@@ -149,10 +173,11 @@ class Search(FittedCandidates):
         return self._fit_from_starts(starts_by_effect, base, least_gain if has_effects else 0.0)
 
     def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
-        """Return a base with the nuisances that it has beside a free missing force.
+        """Return a base with nuisances that are not distorted by the errors of the model.
 
-        The nuisances of a wrong model are far off: a bad start. Beside a free force they are where
-        they belong. With trials at rest, which show no force, they are at their prior means.
+        The nuisances of a wrong model take up part of its error, which makes them a bad start. They
+        are taken from a fit that includes a free missing force. If a trial is at rest, or no force
+        can be seen, they are set to their prior means.
         """
         point = self.problem.start(base.candidate)
         force_search = self.force_search if self.is_all_in_motion else None
@@ -167,16 +192,16 @@ class Search(FittedCandidates):
     def _fit_from_starts(
         self, starts_by_effect: Sequence[Sequence[FitStart]], base: CandidateFit, least_gain: float
     ) -> list[CandidateFit]:
-        """Fit each effect by few steps from its starts; return the best fit of each.
+        """Fit each effect by few steps from several points, and return the best fit of each.
 
         Parameters
         ----------
         starts_by_effect : sequence of sequence of FitStart
-            The starts of the fits of each effect.
+            The starting points of the fits of each effect.
         base : CandidateFit
-            The fit that effects are added to; its derivatives begin the fits.
+            The fit that effects are added to; its derivatives are used for the first steps.
         least_gain : float
-            The gain on the objective of the base below which a fit is given up [nat].
+            The decrease of the objective below that of the base which a fit must reach [nat].
         """
         best_fits = []
         give_up = base.objective - least_gain
@@ -195,7 +220,7 @@ class Search(FittedCandidates):
                     iterations=SEARCH.rough_steps,
                     give_up=give_up,
                 )
-                if rough is not None:  # else it is more than the structure can carry
+                if rough is not None:  # None if the effect is larger than the model allows
                     fits.append(rough)
                     give_up = min(give_up, rough.objective + SEARCH.out_of_reach)
             if fits:
@@ -205,22 +230,22 @@ class Search(FittedCandidates):
     # ---------------------------------------------------------------- exact fits
 
     def fit_best_exactly(self, rough: Sequence[CandidateFit], floor: float) -> list[CandidateFit]:
-        """Fit the best of some rough fits to convergence; return these, the best first.
+        """Fit the best of some rough fits to convergence, and return them, the best first.
 
         Parameters
         ----------
         rough : sequence of CandidateFit
             The rough fits, the best first.
         floor : float
-            The score below which none is fitted exactly.
+            The score below which no candidate is fitted to convergence.
         """
         if not rough:
             return []
-        top = self.score(rough[0])
-        # far from the truth, few steps rank only roughly
-        margin = max(SEARCH.close, SEARCH.close_share * (top - floor))
-        least = max(top - margin, floor)
-        chosen = [fit for fit in rough[: SEARCH.exact_fits] if self.score(fit) > least]
+        best_score = self.score(rough[0])
+        # after few steps far from the truth the scores are only roughly in order
+        margin = max(SEARCH.close, SEARCH.close_share * (best_score - floor))
+        least_score = max(best_score - margin, floor)
+        chosen = [fit for fit in rough[: SEARCH.exact_fits] if self.score(fit) > least_score]
         exact = []
         for fit in with_progress(
             self.on_progress, chosen, lambda fit: f"fitting {fit.candidate.description} to the end"
@@ -229,9 +254,10 @@ class Search(FittedCandidates):
         return sorted(exact, key=lambda fit: -self.score(fit))
 
     def refine_time_steps(self) -> None:
-        """Halve the time steps while their error in the best candidate is large, and fit again.
+        """Halve the time steps until their error in the best candidate is small against the noise.
 
-        Verdicts rest on the best candidates only, so these alone are fitted again.
+        The best candidates are fitted again with the smaller steps. The others are not, as no
+        verdict depends on them.
         """
         problem = self.problem
         while (
@@ -250,16 +276,16 @@ class Search(FittedCandidates):
     # ---------------------------------------------------------------- the strategy
 
     def search_single_effects(self) -> None:
-        """Search among single effects, with time steps that are fine enough for the best."""
+        """Fit all single effects, and refine the time steps for the best of them."""
         rough = self.fit_roughly_beside(self.no_effect, self.effects)
         self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.hopeless)
         self.refine_time_steps()
 
     def search_sets(self) -> None:
-        """Search beyond a single effect: a law of free shape, more effects, all pairs."""
+        """Fit laws of free shape, sets of several effects, and pairs, if these explain more."""
         self.fit_families()
         self.refine_time_steps()
-        # beside a law whose shape is free a further effect would imitate nearly anything
+        # a law of free shape together with a further effect could fit nearly anything
         if not self.best().candidate.is_family:
             self.add_effects()
         if not self.best().candidate.is_family and self.is_unexplained():
@@ -269,9 +295,15 @@ class Search(FittedCandidates):
         self.refine_time_steps()
 
     def search_along_force(self, force_search: ForceSearch) -> None:
-        """Fit the sets of effects that follow the missing force best.
+        """Fit the sets of effects whose force agrees best with the missing force.
 
-        They replace what was fitted before.
+        The missing force is estimated from the readings without a law. The new fits replace all
+        earlier ones.
+
+        Parameters
+        ----------
+        force_search : ForceSearch
+            The search for the missing force.
         """
         self.exact_fits = {(): self.no_effect}
         self.rough_fits = {}
@@ -280,17 +312,17 @@ class Search(FittedCandidates):
         eligible = []
         for hypothesis in self.force_hypotheses:
             candidate = hypothesis.candidate
-            # beside another law a free shape would imitate nearly anything
+            # a law of free shape together with another law could fit nearly anything
             is_family_in_set = candidate.is_family and len(candidate.terms) > 1
             if candidate.terms and not is_family_in_set:
                 eligible.append(hypothesis)
-        close = []
+        leading = []
         for hypothesis in eligible:
             if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.followed:
-                close.append(hypothesis)
+                leading.append(hypothesis)
         for hypothesis in with_progress(
             self.on_progress,
-            close[: SEARCH.far_fits],
+            leading[: SEARCH.far_fits],
             lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
         ):
             start = force_search.whole_point(hypothesis)
@@ -303,12 +335,17 @@ class Search(FittedCandidates):
         self.refine_time_steps()
 
     def restart_leading_single(self, force_search: ForceSearch) -> None:
-        """Fit the leading single effect from other sizes, unless it explains the data.
+        """Fit the best single effect again from other magnitudes, unless it explains the data.
 
-        Dry friction that ends a motion has an optimum for every number of half swings. The missing
-        force leads near the right one, but the parameters that follow it may be left in the next.
-        With a free shape a law bends itself to a wrong optimum, so the laws of that family with
-        canonical shape are tried.
+        If dry friction ends a motion, there is an optimum of its magnitude for every number of half
+        swings. The magnitude that agrees with the missing force is near the right optimum, but the
+        fit may end in the next one. A law of free shape can adapt itself to a wrong optimum, so the
+        laws of its family with canonical shape are fitted.
+
+        Parameters
+        ----------
+        force_search : ForceSearch
+            The search for the missing force.
         """
         if not self.is_unexplained() and not self.best().candidate.is_family:
             return
@@ -329,7 +366,7 @@ class Search(FittedCandidates):
                     return
 
     def add_effects(self) -> None:
-        """Add one effect at a time to the best set while that makes a better one."""
+        """Add one effect at a time to the best set, as long as the score rises."""
         current = self.best()
         while 0 < len(current.candidate.terms) < SEARCH.largest_set:
             if len(current.candidate.terms) > 1 and self._is_far(current):
@@ -344,9 +381,10 @@ class Search(FittedCandidates):
             current = exact[0]
 
     def move_effects(self) -> None:
-        """Fit the best set with one effect at another place, while the set leaves more than noise.
+        """Fit the best set with one effect at another place, until the set explains the data.
 
-        Rough fits keep one place of each set, and few steps may rank places wrongly.
+        Of each set, only the fit at one place is kept after few steps, and these may have chosen a
+        wrong place.
         """
         best = self.best()
         while len(best.candidate.terms) > 1 and self.is_unexplained():
@@ -362,10 +400,10 @@ class Search(FittedCandidates):
             best = self.best()
 
     def drop_effects(self) -> None:
-        """Drop one effect at a time from the best set, while that makes a better one.
+        """Drop one effect at a time from the best set, as long as the score rises.
 
-        An effect may have come first because the right one stood at another place, or was not
-        followed to its place: beside the right one it may say nothing.
+        An effect may have been added before the right one was found, or while the right one was at
+        a wrong place. It may be of no use any more.
         """
         best = self.best()
         while len(best.candidate.terms) > 1:
@@ -383,11 +421,10 @@ class Search(FittedCandidates):
             best = self.best()
 
     def fit_families(self) -> None:
-        """Fit the families (free shape) of single effects that come close; record those that fit.
+        """Fit the best single effects with free shapes, and record those that explain the data.
 
-        A law with a free shape is a simpler cause than two laws, so it is tried before pairs are.
-        Where the best effect fits, families compete only if others fit as well: its own is for the
-        shape test.
+        One law with a free shape is a simpler cause than two laws, so it is tried before pairs. Of
+        each family at a place the fit of the best score is recorded.
         """
         singles = self._singles_with_open_shape()
         best_families: dict[tuple[str, str], CandidateFit] = {}
@@ -396,7 +433,7 @@ class Search(FittedCandidates):
             if family is None or family.log_evidence - single.log_evidence <= SHAPE_GAIN:
                 continue
             (term,) = family.candidate.terms
-            # a family is one verdict: keep the fit from the member that reaches it best
+            # all effects of a family lead to the same verdict: keep the fit of the best score
             key = (term.effect.family, term.place)
             is_best = key not in best_families or self.score(best_families[key]) < self.score(
                 family
@@ -407,7 +444,13 @@ class Search(FittedCandidates):
             self.record(family, exact=True)
 
     def _singles_with_open_shape(self) -> list[CandidateFit]:
-        """Return the single effects, the best first, beside which their families may compete."""
+        """Return the single effects that are to be fitted with a free shape, the best first.
+
+        If the best effect does not explain the data, these are all of the best ones. If it does,
+        they are those that explain the data with a score near that of the best; none if it is the
+        only one, or if the model without effect explains the data too. The free shape of the best
+        effect itself is then examined by the test of shape.
+        """
         singles = []
         for fit in self.exact_fits.values():
             if len(fit.candidate.terms) == 1 and not fit.candidate.is_family:
@@ -427,7 +470,7 @@ class Search(FittedCandidates):
         return competing
 
     def fit_pairs(self) -> None:
-        """Fit the most promising of all pairs of effects, by a screen at the fit without effect."""
+        """Fit the pairs of effects that reduce the misfit most by a screen without effect."""
         screen = Screen(self.problem, self.no_effect)
         changes: list[ScreenedChange] = []
         for effect in self.effects:

@@ -14,11 +14,11 @@ from .starts import OnProgress, no_progress
 from .strategy import Search
 
 OnSearch = Callable[[Search], None]
-"""Takes a search at its begin, to look at it while it goes on."""
+"""Called with a search when it begins, for example to display its state."""
 
 
 def ignore_search(search: Search) -> None:
-    """Ignore a search that begins."""
+    """Do nothing when a search begins."""
 
 
 def search(
@@ -27,19 +27,22 @@ def search(
     on_progress: OnProgress = no_progress,
     on_search: OnSearch = ignore_search,
 ) -> Search:
-    """Fit the model without effect, then search the catalogue for what explains the campaign.
+    """Search the catalogue for the set of effects that explains a campaign.
+
+    The model without effect is fitted first, then single effects, then sets. If a missing force can
+    be seen in the trials, sets of effects are compared with it instead.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model.
     effects : sequence of Effect
-        The catalogue. Effects that cannot act here are left out; those that an event of the
-        campaign may have begun or ended are tried in that form too.
+        The catalogue. Effects that cannot act in the campaign are left out. If an event of the
+        campaign may have begun or ended an effect, the effect is also tried in that form.
     on_progress : callable
-        Takes a line that says what is fitted, and how much is still to come.
+        Called with a line that says what is fitted, and how much is still to come.
     on_search : callable
-        Takes the search once it has the fit without effect.
+        Called with the search after the fit without effect.
 
     Returns
     -------
@@ -55,8 +58,8 @@ def search(
     result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
     _, own_laws = problem.model.apart()
     if len(own_laws) and result.force_search is not None and result.is_unexplained():
-        # a law of the model itself, such as dry friction that ends a motion, has many optima: begin
-        # again where the unknowns are beside a missing force
+        # a nonlinear law of the model itself, such as dry friction that ends a motion, has many
+        # optima: fit again from the unknowns of a fit that includes a missing force
         start = result.force_search.whole_point(result.force_search.whole)
         second_fit = attempt(problem, Candidate(), start)
         least_gain = SEARCH.worth_fitting
@@ -64,7 +67,7 @@ def search(
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)
     force_search = result.force_search if result.is_all_in_motion else None
-    # free forces at several ports take up nearly any law at one of them
+    # free forces at several ports could stand for nearly any law at one of them
     if force_search is not None and len(force_search.ports) <= 1:
         result.search_along_force(force_search)
         return result

@@ -1,14 +1,15 @@
-"""Evidence under a noise as wide as what the best hypothesis leaves.
+"""Evidence of hypotheses under a noise that is as large as the residuals of the best of them.
 
-The search itself goes by the noise as recorded: how far a fit is from the truth shows best there.
-Where no hypothesis leaves noise, thousands of nats separate what a model of a real structure cannot
-separate.
+The search itself uses the recorded noise, which shows best how far a fit is from the truth. But the
+residuals of a model of a real structure are never white noise of the recorded level (Kennedy and
+O'Hagan 2001, J. R. Stat. Soc. B 63, 425-464). Log evidence under the recorded noise then differs by
+thousands of nats between hypotheses that such a model cannot tell apart.
 
-No model of a real structure leaves white noise (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63,
-425-464). Where none does, hypotheses are compared under a noise that is as wide as what the best of
-them leaves, and that counts as many samples as are independent: the sum of squares of N samples of
-autocorrelation rho_k is as certain as that of N / (1 + 2 sum rho_k^2) independent ones (Bartlett
-1946, Suppl. J. R. Stat. Soc. 8, 27-41). Trials at rest have no such correlation.
+In that case hypotheses are compared under a *wider noise*. Its variance is that of the residuals of
+the best hypothesis, times the number of samples per independent sample: the sum of squares of N
+samples with the autocorrelation rho_k is as certain as that of N / (1 + 2 sum rho_k^2) independent
+ones (Bartlett 1946, Suppl. J. R. Stat. Soc. 8, 27-41). This correlation is considered in trials in
+motion only.
 """
 
 from collections.abc import Sequence
@@ -34,13 +35,13 @@ NEAR = 0.25
 """Relative difference of sampling intervals up to which a noise record is compared with
 residuals."""
 SWINGS = -0.25
-"""Autocorrelation at its first minimum below which a process swings."""
+"""Autocorrelation at its first minimum below which a process oscillates."""
 LIKE_RECORD = 3.0
-"""Deviations within which the correlation of residuals is that of the noise record."""
+"""Standard deviations within which the correlation of residuals agrees with the noise record."""
 LEAST_WHITE = 1e-12
-"""Least share of the residuals' mean square that is taken for noise where no noise is recorded."""
+"""Least variance of an unrecorded noise, as a fraction of the residuals' mean square."""
 SECOND_DIFFERENCES = 6.0
-"""Variance of the second differences of white noise over its own."""
+"""Variance of the second differences of white noise over its own: 1 + 4 + 1 by their weights."""
 
 
 # ---------------------------------------------------------------- what a fit leaves
@@ -48,9 +49,9 @@ SECOND_DIFFERENCES = 6.0
 
 @dataclass
 class _ChannelProcess:
-    """The residual process of one channel, with the meaning of `ResidualProcess`.
+    """The residual process of one channel; `ResidualProcess` defines the attributes.
 
-    At first white noise.
+    The defaults are those of white noise.
     """
 
     amplitude: float = 0.0
@@ -61,7 +62,7 @@ class _ChannelProcess:
 
 
 def residual_process_of(problem: Problem, fit: CandidateFit) -> ResidualProcess:
-    """Return the random process that describes what a fit leaves beside the recorded noise.
+    """Return the random process in the residuals of a fit besides the recorded noise.
 
     Parameters
     ----------
@@ -97,51 +98,59 @@ def _channel_process(
     channel : int
         The index of the channel.
     noise_level : float
-        The variance of the noise, relative to s0^2.
+        The variance of the noise over s0^2, with s0 its recorded deviation or a stand-in.
     """
     process = _ChannelProcess()
     records = residual_records(problem, fit, channel)
     if not records:
         return process
-    series = [record.values for record in records]
+    residual_series = [record.values for record in records]
     sample_count = sum(float(record.is_used.sum()) for record in records)
-    # size of the residuals against the noise record
-    freedom = max(sample_count - fit.spent[channel], 1.0)
+    # compare the variance of the residuals with the noise record
+    residual_freedom = max(sample_count - fit.spent[channel], 1.0)
     noise_freedom = problem.freedom[channel]
     has_record = noise_freedom > 0.0
-    variance = _sum_of_squares(series) / freedom
+    mean_square = _sum_of_squares(residual_series) / residual_freedom
     interval = max(float(np.median(record.steps)) for record in records)
     colour = _recorded_colour(problem, problem.channel_names[channel], records, interval)
     is_larger = False
     if has_record:
         p_value = noise_tests.variance_p_value(
-            variance, freedom / colour.times_fewer, noise_freedom / colour.times_fewer
+            mean_square, residual_freedom / colour.times_fewer, noise_freedom / colour.times_fewer
         )
         is_larger = p_value < LEVEL
     if not is_larger and whiteness_p_value(records) > LEVEL:
         return process
-    # factor on the noise, by the number of independent samples
-    rho, chance = noise_tests.autocorrelation(series)
-    uncertainty = np.sqrt(1.0 / sample_count + colour.variance)
-    has_record_colour = abs(rho[0] - colour.correlation) < LIKE_RECORD * uncertainty
+    # noise factor: variance of the residuals times samples per independent sample
+    autocorrelation, white_variance = noise_tests.autocorrelation(residual_series)
+    correlation_deviation = np.sqrt(1.0 / sample_count + colour.variance)
+    has_record_colour = (
+        abs(autocorrelation[0] - colour.correlation) < LIKE_RECORD * correlation_deviation
+    )
     process.is_recorded_colour = bool(not is_larger and has_record_colour)
     if process.is_recorded_colour:
         wide_variance = 1.0
     elif has_record:
-        wide_variance = max(variance, 1.0)
+        wide_variance = max(mean_square, 1.0)
     else:
-        wide_variance = variance
-    process.noise_factor = np.sqrt(wide_variance * noise_tests.times_fewer(rho, chance))
-    # the process beside the noise
-    variance_beside_noise = variance / noise_level - 1.0
-    if process.is_recorded_colour or variance_beside_noise <= 0.0:
+        wide_variance = mean_square
+    process.noise_factor = np.sqrt(
+        wide_variance * noise_tests.times_fewer(autocorrelation, white_variance)
+    )
+    # the process without the noise: white noise adds to the variance of the residuals, but not to
+    # their correlation, so the correlation of the process is larger by the ratio of the variances
+    process_variance = mean_square / noise_level - 1.0
+    if process.is_recorded_colour or process_variance <= 0.0:
         return process
-    ratio = (1.0 + variance_beside_noise) / variance_beside_noise
-    process.amplitude = np.sqrt(variance_beside_noise)
-    process.correlation_time = interval * noise_tests.times_fewer(rho, chance, ratio)
-    process_rho = rho * ratio
-    first_minimum = int(np.argmax(np.diff(process_rho) > 0.0))
-    if process_rho[first_minimum] < SWINGS:
+    process_over_residuals = (1.0 + process_variance) / process_variance
+    process.amplitude = np.sqrt(process_variance)
+    process.correlation_time = interval * noise_tests.times_fewer(
+        autocorrelation, white_variance, process_over_residuals
+    )
+    process_autocorrelation = autocorrelation * process_over_residuals
+    first_minimum = int(np.argmax(np.diff(process_autocorrelation) > 0.0))
+    if process_autocorrelation[first_minimum] < SWINGS:
+        # the first minimum is at half a period; the lags begin at one interval
         process.frequency = 0.5 / ((first_minimum + 1) * interval)
         process.correlation_time *= 2.0  # the mean of a squared cosine is a half
     return process
@@ -153,28 +162,30 @@ def _sum_of_squares(series: Sequence[FloatArray]) -> float:
 
 
 def unrecorded_noise_levels(problem: Problem, fit: CandidateFit) -> FloatArray:
-    """Return the noise variance (channels,) relative to s0^2: 1 where a noise record is there.
+    """Return the noise variance of each channel over s0^2, (channels,); 1 with a noise record.
 
-    Without a record it is estimated from the second differences of the residuals. Those of white
-    noise have six times its variance, and hardly any of what is slow.
+    Without a record the variance is estimated from the second differences of the residuals. Those
+    of white noise have six times its variance, while a slow process contributes hardly anything.
     """
     levels = np.ones(len(problem.channel_names))
     for channel in np.flatnonzero(problem.freedom == 0.0):
         records = residual_records(problem, fit, int(channel))
-        series = [record.values for record in records]
-        differences = [np.diff(values, 2) for values in series]
-        mean_square = _sum_of_squares(series) / max(sum(len(values) for values in series), 1)
+        residual_series = [record.values for record in records]
+        differences = [np.diff(values, 2) for values in residual_series]
+        mean_square = _sum_of_squares(residual_series) / max(
+            sum(len(values) for values in residual_series), 1
+        )
         difference_count = max(sum(len(values) for values in differences), 1)
-        white = _sum_of_squares(differences) / SECOND_DIFFERENCES / difference_count
+        white_variance = _sum_of_squares(differences) / SECOND_DIFFERENCES / difference_count
         if mean_square > 0.0:
-            levels[channel] = min(max(white, LEAST_WHITE * mean_square), mean_square)
+            levels[channel] = min(max(white_variance, LEAST_WHITE * mean_square), mean_square)
         else:  # the channel is in trials at rest only
             levels[channel] = 1.0 / problem.precisions(fit.sums)[channel]
     return levels
 
 
 class _RecordedColour(NamedTuple):
-    """The colour that the noise of a channel has in its residuals, as its record says.
+    """The correlation in time that a channel's noise has in residuals, by its noise record.
 
     Attributes
     ----------
@@ -183,7 +194,7 @@ class _RecordedColour(NamedTuple):
     variance : float
         The variance of this estimate.
     times_fewer : float
-        By how many times the independent samples are fewer than the samples.
+        The number of samples per independent sample.
     """
 
     correlation: float
@@ -194,9 +205,9 @@ class _RecordedColour(NamedTuple):
 def _recorded_colour(
     problem: Problem, name: str, records: Sequence[ResidualRecord], interval: float
 ) -> _RecordedColour:
-    """Return the colour that noise as in a channel's record has in the residuals.
+    """Return the correlation in time that residuals have if they are noise as in the record.
 
-    Where the noise is whitened, that is what the whitening filter leaves of the record.
+    If residuals are whitened, the record is passed through the same whitening filter first.
 
     Parameters
     ----------
@@ -216,24 +227,28 @@ def _recorded_colour(
         return unknown
     if not np.any(record.samples):
         return unknown
-    centred = record.samples - record.samples.mean()
+    centred_record = record.samples - record.samples.mean()
     if abs(record.interval - interval) > NEAR * interval:
         return unknown
     colours = []
     for residuals in records:
-        is_white = len(residuals.steps) == 1
-        values = noise.whiten(centred, record.interval) if is_white else centred
-        rho, chance = noise_tests.autocorrelation([values])
-        if is_white:
-            correlation = float(rho[0])
+        is_whitened = len(residuals.steps) == 1
+        comparable_noise = (
+            noise.whiten(centred_record, record.interval) if is_whitened else centred_record
+        )
+        autocorrelation, white_variance = noise_tests.autocorrelation([comparable_noise])
+        if is_whitened:
+            correlation = float(autocorrelation[0])
             times_fewer = 1.0
         else:
             # correlation of the record at the steps of the residuals
-            lags = np.arange(1 + len(rho))
-            at_steps = np.interp(residuals.steps / record.interval, lags, np.r_[1.0, rho])
+            lags = np.arange(1 + len(autocorrelation))
+            at_steps = np.interp(
+                residuals.steps / record.interval, lags, np.r_[1.0, autocorrelation]
+            )
             correlation = float(np.mean(at_steps))
-            times_fewer = noise_tests.times_fewer(rho, chance)
-        colours.append(_RecordedColour(correlation, 1.0 / len(centred), times_fewer))
+            times_fewer = noise_tests.times_fewer(autocorrelation, white_variance)
+        colours.append(_RecordedColour(correlation, 1.0 / len(centred_record), times_fewer))
     return _RecordedColour(*np.mean(colours, axis=0).tolist())
 
 
@@ -241,9 +256,9 @@ def _recorded_colour(
 
 
 def with_wide_noise(problem: Problem, process: ResidualProcess) -> Problem:
-    """Return the problem under the noise that a residual process makes.
+    """Return the problem under the wider noise of a residual process.
 
-    The same one if it is white.
+    It is the given problem if the process is white noise of the recorded level.
     """
     return problem.widened(process.noise_factor) if process.is_present else problem
 
@@ -251,10 +266,10 @@ def with_wide_noise(problem: Problem, process: ResidualProcess) -> Problem:
 def refit_under_wide_noise(
     problem: Problem, wide_problem: Problem, fit: CandidateFit, *, iterations: int = 60
 ) -> CandidateFit | None:
-    """Return a hypothesis at its maximum under a wider noise.
+    """Return the fit of a hypothesis under a wider noise.
 
-    Evidence and covariance are those under the wider noise. Everything else is stated against the
-    recorded noise, with the residual process that the hypothesis leaves.
+    Its point, evidence and covariance are those under the wider noise. Its residuals are relative
+    to the recorded noise, and its residual process is that of these residuals.
 
     Parameters
     ----------
@@ -270,7 +285,8 @@ def refit_under_wide_noise(
     Returns
     -------
     CandidateFit or None
-        None if the hypothesis cannot be fitted so: evidence under two noises is not compared.
+        None if the hypothesis cannot be fitted under the wider noise. Its evidence under the
+        recorded noise could not be compared with that of others under the wider noise.
     """
     if wide_problem is problem:
         return fit
@@ -293,17 +309,16 @@ def refit_under_wide_noise(
 # ---------------------------------------------------------------- hypotheses compared under it
 
 ROUNDS = 3
-"""Number of times that another hypothesis may turn out to be the best one."""
+"""Largest number of times that the wider noise is taken from another best hypothesis."""
 
 
 def compare_under_wide_noise(search: Search) -> None:
-    """Fit the hypotheses that matter under the noise that the best of them leaves.
+    """Fit the most probable hypotheses under the wider noise of the best one's residuals.
 
-    Compare these from now on.
-
-    The fit without effect is always one of them. Which others matter is decided by their residuals
-    as they are, before anything is fitted again. The search's `wide_problem` and `wide_fits` are
-    set.
+    Sets `wide_problem` and `wide_fits` of the search, so that these fits alone are compared from
+    then on. The fit without effect is always one of them. The others are chosen by their expected
+    score, which is computed from their present residuals. If another hypothesis is the best one
+    under the wider noise, the noise is computed again from its residuals.
     """
     best = search.best()
     chosen = _most_probable_sets(search)
@@ -320,16 +335,22 @@ def compare_under_wide_noise(search: Search) -> None:
 
 
 def _most_probable_sets(search: Search) -> list[CandidateFit]:
-    """Return the best fit of each set of effects, for the most probable sets of each length."""
+    """Return the best fits of the most probable sets of one, two and three effects.
+
+    Each set of effects is represented by its best fit over places. `SEARCH.weighed_sets` has the
+    number of sets of each length.
+    """
     best: dict[tuple[str, ...], CandidateFit] = {}
     for fit in search.compared_fits().values():
-        names = fit.candidate.identifiers
-        if names and (names not in best or search.score(fit) > search.score(best[names])):
-            best[names] = fit
+        identifiers = fit.candidate.identifiers
+        if identifiers and (
+            identifiers not in best or search.score(fit) > search.score(best[identifiers])
+        ):
+            best[identifiers] = fit
     chosen: list[CandidateFit] = []
     for length, count in enumerate(SEARCH.weighed_sets, start=1):
-        of_length = [fit for fit in best.values() if len(fit.candidate.terms) == length]
-        chosen += sorted(of_length, key=lambda fit: -search.score(fit))[:count]
+        fits_of_length = [fit for fit in best.values() if len(fit.candidate.terms) == length]
+        chosen += sorted(fits_of_length, key=lambda fit: -search.score(fit))[:count]
     return chosen
 
 
@@ -347,10 +368,10 @@ def _fits_under(
     chosen : sequence of CandidateFit
         The fits to choose from.
     """
-    expected = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
-    expected.sort(key=lambda entry: entry[1], reverse=True)
-    least = expected[0][1] - SEARCH.weighed_within if expected else 0.0
-    promising = [fit for fit, score in expected[: SEARCH.weighed_fits] if score > least]
+    fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
+    fits_with_scores.sort(key=lambda entry: entry[1], reverse=True)
+    least = fits_with_scores[0][1] - SEARCH.weighed_within if fits_with_scores else 0.0
+    promising = [fit for fit, score in fits_with_scores[: SEARCH.weighed_fits] if score > least]
     wide_fits: dict[CandidateKey, CandidateFit] = {}
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
     for fit in with_progress(
@@ -374,9 +395,9 @@ def _add_wide_fit(
     wide_problem: Problem,
     fit: CandidateFit,
 ) -> None:
-    """Add a hypothesis under a wider noise, if it can be fitted so.
+    """Add the fit of a hypothesis under a wider noise, if it can be fitted under that noise.
 
-    The model without effect is added as it stands if it cannot.
+    The model without effect is always added, at its present point if it cannot be fitted.
     """
     wide_fit = refit_under_wide_noise(search.problem, wide_problem, fit)
     if wide_fit is None and not fit.candidate.terms:
@@ -386,7 +407,10 @@ def _add_wide_fit(
 
 
 def _expected_score(search: Search, wide_problem: Problem, fit: CandidateFit) -> float:
-    """Return the score of a fit under a wider noise if nothing of it changes [nat]."""
+    """Return the score of a fit under a wider noise if its point and prior stay the same [nat].
+
+    The score is ln (evidence times prior). Only the misfit changes with the noise.
+    """
     problem = search.problem
     scaled_residuals = []
     for data, wide_data, residual in zip(
