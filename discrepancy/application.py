@@ -271,29 +271,44 @@ def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | No
 
 
 def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
-    """Return the text of a lumped model's file with the laws and the parameters of a patch."""
+    """Return the file of a lumped model, as text, with the laws and parameters of a patch added.
+
+    Parameters
+    ----------
+    choice : ModelChoice
+        The lumped model, from its own file or shipped with the package.
+    patch : StoredPatch
+        The effects to add as laws, and the calibrated parameters.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read, or the result is not a valid lumped model.
+    """
     file = choice.path or SHIPPED_MODELS / f"{patch.origin.model_file}.toml"
-    content: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
+    model_tables: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
     calibrated = {parameter.name: parameter for parameter in patch.parameters}
-    for table in content.get("parameter", ()):
+    for table in model_tables.get("parameter", ()):
         parameter = calibrated.get(table["name"])
         if parameter is not None:
             table["mean"] = parameter.mean
             table["deviation"] = parameter.deviation
-    laws = list(content.get("law", ()))
+    laws = list(model_tables.get("law", ()))
     for effect in patch.effects:
         for primitive in effect.patch:
             name = effect.identifier
-            earlier = sum(law["name"].startswith(name) for law in laws)
-            if earlier:
-                name = f"{name}_{earlier + 1}"
+            # laws of the same effect are numbered from the second on, so that names stay unique
+            number_of_same_name = sum(law["name"].startswith(name) for law in laws)
+            if number_of_same_name:
+                name = f"{name}_{number_of_same_name + 1}"
             laws.append({"name": name, **primitive.to_mapping()})
-    content["law"] = laws
+    model_tables["law"] = laws
     effects = ", ".join(effect.name for effect in patch.effects)
-    content["name"] = f"{content['name']} with {effects}"
-    LumpedDescription.parse(content, f"{file} with {patch.sentence}")
+    model_tables["name"] = f"{model_tables['name']} with {effects}"
+    # parsed only as a check, which raises if the result is not a valid model
+    LumpedDescription.parse(model_tables, f"{file} with {patch.sentence}")
     comments = f"# {patch.sentence}\n# Laws and parameters: {patch.origin.short_command}\n"
-    return f"{comments}\n{toml_text(content)}"
+    return f"{comments}\n{toml_text(model_tables)}"
 
 
 def pack_patched(

@@ -103,22 +103,27 @@ class LaboratoryColumn:
 def role_by_unit(
     head: str, heads: Sequence[str], units: Sequence[str], roles: Collection[str]
 ) -> str:
-    """Return the role "time" or "force" of a column if the units of its table are clear, else "".
+    """Return the role of a column, "time" or "force", if its unit alone determines it.
+
+    A column is a time if `times_among` finds it among the times of the table; several columns may
+    be. It is the force if it is the only column of the table with a unit of force. The result is an
+    empty text if the unit determines no role.
 
     Parameters
     ----------
     head : str
         Name of the column.
     heads, units : sequence of str
-        Names and units of all columns of the table.
+        Names and units of all columns of the table; a unit is empty if it is not known.
     roles : collection of str
-        Roles that the unit may decide.
+        Roles that a unit may determine besides "time" from `times_among`. Without "force" a column
+        of forces gets no role, because trials of this kind have no input of this name.
     """
     if head in times_among(heads, units):
         return "time"
     roles_of_units = [load_or_time(unit) for unit in units]
-    role = roles_of_units[heads.index(head)]
-    return role if role in roles and roles_of_units.count(role) == 1 else ""
+    role_of_unit = roles_of_units[heads.index(head)]
+    return role_of_unit if role_of_unit in roles and roles_of_units.count(role_of_unit) == 1 else ""
 
 
 def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:

@@ -53,14 +53,17 @@ class Slip(NamedTuple):
 
     @property
     def width(self) -> float:
-        """Factor by which physics may change the ratio besides: the more, the larger the slip."""
+        """Factor by which the ratio may differ from the slip because of physical effects.
+
+        A larger slip is distinct from other slips, and allows for a larger factor.
+        """
         for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBT, 1.35)):
             if self.size >= least_size:
                 return width
         return 1.1
 
     def distance(self, scale: float) -> float:
-        """Return the absolute logarithm of a data scale over the factor of this slip."""
+        """Return |log(scale / factor)|: how far a ratio of data to model is from this slip."""
         return abs(log(abs(scale) / self.factor))
 
     def __str__(self) -> str:
@@ -160,7 +163,9 @@ def _slips_in_trial(
     scales: Mapping[tuple[str, str], float],
     input_slips: Mapping[tuple[str, str], Slip | None],
 ) -> Iterator[DataFault]:
-    """Yield the slip of a trial's input, or those of channels in this trial alone.
+    """Yield the unit slip of a trial's input, or the slips of channels in this trial alone.
+
+    If all its channels have the same ratio of data to model, the input of the trial has the slip.
 
     Parameters
     ----------
@@ -188,13 +193,13 @@ def _slips_in_trial(
     for key in keys:
         channel, _ = key
         slip = _slip_of_channel(campaign, channel, [scales[key]])
-        # a small factor in one trial alone may be physical: lift that leaves the outer wing
+        # a small factor in one trial may be physical, such as lift that shifts from the outer wing
         if slip is not None and slip.size >= SURE_SLIP:
             yield from _channel_faults(campaign, channel, slip, [trial])
 
 
 def _common_slip(slips: Sequence[Slip | None]) -> Slip | None:
-    """Return the slip that all of several scales have; None if they differ or there are none."""
+    """Return the slip that is common to all entries; None if they differ or there are none."""
     if not slips or any(slip != slips[0] for slip in slips):
         return None
     return slips[0]
@@ -212,9 +217,10 @@ def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> 
 
 
 def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
-    """Return the slip between units of a trial's inputs that explains a scale.
+    """Return the slip between units of a trial's inputs that explains a ratio of data to model.
 
-    None if none does.
+    The inputs are what drives a trial of this kind, and the recorded inputs. The result is None if
+    no slip explains the ratio.
     """
     drives = []
     if trial.kind in _DRIVES:
@@ -230,7 +236,19 @@ def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
 def _channel_faults(
     campaign: Campaign, name: str, slip: Slip, trials: Sequence[Trial]
 ) -> Iterator[DataFault]:
-    """Yield the fault of a channel that slips in some trials."""
+    """Yield the fault of a channel whose readings have a wrong unit in some trials.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    name : str
+        Name of the channel.
+    slip : Slip
+        The two units.
+    trials : sequence of Trial
+        The trials that show it.
+    """
     channel = campaign.channels[name]
     first = trials[0]
     column = ""
@@ -245,22 +263,22 @@ def _channel_faults(
     )
     trial_name = first.name if is_in_one_of_several else ""
     fault = DataFault(FaultKind.UNIT_SLIP, sentence, name, trial_name)
-    # gravity in an acceleration is known, so that a single record shows the slip
+    # an accelerometer also shows gravity, whose value is known: this counts as a second record
     witnesses = 1 if channel.quantity is Quantity.ACCELERATION else 0
     yield from _graded(fault, slip, agreeing=len(trials) + witnesses)
 
 
 def _graded(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
-    """Yield a slip as a fault, as a doubt, or not at all.
+    """Yield a slip as a fault, as a doubt, or not at all, by its size and the evidence for it.
 
     Parameters
     ----------
     fault : DataFault
-        The fault, with a sentence that may go on.
+        The fault, whose sentence has no full stop yet.
     slip : Slip
         The slip.
     agreeing : int
-        Number of records that agree on it.
+        Number of records that show the same slip.
     """
     sentence = fault.sentence
     if slip.size >= SURE_SLIP or (slip.size >= DOUBT and agreeing > 1):

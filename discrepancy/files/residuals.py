@@ -153,14 +153,14 @@ def _channel_row(channel: Channel) -> dict[str, Any]:
 
 
 def _channel(row: Mapping[str, Any], samples: FloatArray | None) -> Channel:
-    """Return the channel of a row of the attribute `channels`.
+    """Read a channel from its row of the attribute `channels`; inverse of `_channel_row`.
 
     Parameters
     ----------
     row : mapping
         The row.
     samples : (n,) ndarray or None
-        Its samples at rest.
+        The samples of the channel's noise record [channel's unit]; None if it has none.
     """
     noise = None
     if row["noise"] is not None:
@@ -177,7 +177,15 @@ def _channel(row: Mapping[str, Any], samples: FloatArray | None) -> Channel:
 
 
 def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
-    """Return the group of a trial: its readings, its fit, and its attributes."""
+    """Return a trial as a group of a residual file: readings, prediction, residuals, attributes.
+
+    Parameters
+    ----------
+    fitted_trial : FittedTrial
+        The trial with its prediction and residuals.
+    channels : mapping of str to Channel
+        Channels by name, for the units of the readings.
+    """
     trial = fitted_trial.trial
     by_row_and_channel = ("row", "channel")
     variables: dict[str, Any] = {
@@ -217,7 +225,12 @@ def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.D
 
 
 def _fitted_trial(group: xr.Dataset) -> FittedTrial:
-    """Return the trial of a group with its fit.
+    """Read a trial with its prediction and residuals from its group of a residual file.
+
+    Parameters
+    ----------
+    group : Dataset
+        The group, as `_dataset` writes it.
 
     Raises
     ------
