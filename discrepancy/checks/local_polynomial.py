@@ -72,8 +72,9 @@ class LocalPolynomial:
     def residual(self, values: FloatArray) -> FloatArray:
         """Return the residuals (N,) of a record (N,): each sample minus its prediction.
 
-        All widths are scaled so that white noise gives the same scatter. The first and last
-        samples, which have no full neighbourhood of any width, have the residual zero.
+        For unevenly spaced samples the residuals are scaled so that white noise has the same
+        scatter in all of them. The first and last samples, which have no full neighbourhood of any
+        width, have the residual zero.
         """
         residual = np.zeros(len(values))
         for width, weights in self._weights.items():

@@ -229,7 +229,7 @@ def _suspects(
         events[new[at_event]] = True
         new_suspects = new[~at_event]
         suspects[new_suspects] = True
-        # near the ends the sample has another weight than one in its own residual
+        # for unevenly spaced samples the weight of a sample in its own residual is not one
         correction = residual / polynomial.weight_of_sample(count)
         cleaned[new_suspects] -= correction[new_suspects]
     return suspects, cleaned
@@ -239,8 +239,8 @@ def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float 
     """Return which of the first and last three samples of records are single wrong readings.
 
     `sample_outliers` does not judge these samples, because they lack neighbours on one side. The
-    residual of a model's prediction allows to judge them. A deviation in several channels at once,
-    or in several samples of one end, is not a single wrong reading but a release, an impact, or a
+    residual of a model's prediction makes it possible. A deviation in several channels at once, or
+    in several samples of one end, is not a single wrong reading but a release, an impact, or a
     trigger that came late.
 
     Parameters

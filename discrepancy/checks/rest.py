@@ -87,7 +87,7 @@ def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
 
 
 def _vibration(residual: FloatArray, interval: float, frequency: float) -> str | None:
-    """Return the phrase about a vibration in a noise record at a mode's frequency; None without one.
+    """Return the phrase about a vibration at a mode's frequency in a noise record; None without it.
 
     Parameters
     ----------
