@@ -1,4 +1,4 @@
-"""The way back: what a verdict found, written as a model that has it."""
+"""Application of a verdict: writing the model with the effects that were found."""
 
 import json
 import shlex
@@ -39,9 +39,10 @@ class Applied:
     path : Path
         Its file.
     sentence : str
-        What was applied, and how sure it is.
+        What was applied, and how certain it is.
     command : str
-        Which compares the same data with it; empty for an FMU, which wants a description first.
+        Command that compares the same data with the patched model; empty for an FMU, which needs a
+        description first.
     """
 
     path: Path
@@ -126,7 +127,19 @@ def apply_verdict(
 def _check_destination(
     path: Path, choice: ModelChoice, verdict_file: Path, *, replace: bool
 ) -> None:
-    """Refuse a file of another kind, one that the patched model is made of, and one that exists."""
+    """Refuse a destination that has an unknown format, exists, or is a source of the model.
+
+    Parameters
+    ----------
+    path : Path
+        The destination.
+    choice : ModelChoice
+        The model that is patched.
+    verdict_file : Path
+        The file of the verdict.
+    replace : bool
+        True if an existing file may be replaced.
+    """
     if path.suffix not in ENDINGS:
         raise FileNotWrittenError(
             f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out."
@@ -141,7 +154,7 @@ def _check_destination(
 
 
 def _applied_effects(patch: files.StoredPatch) -> str:
-    """Return the effects of a patch with their places, as the begin of a sentence."""
+    """Return the effects of a patch with their places, as the beginning of a sentence."""
     phrases = []
     for effect in patch.effects:
         phrases.append(f"{effect.name} at {effect.place}" if effect.place else effect.name)
@@ -164,9 +177,9 @@ def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
 
 
 def gives(verdict: Verdict, proof: Proof | None) -> bool:
-    """Return whether a verdict gives something to apply.
+    """Return whether a verdict has effects that can be applied to the model.
 
-    Never effects with which the error grows.
+    Effects that increase the error are never applied.
     """
     if proof is not None and proof.grew:
         return False
@@ -243,9 +256,9 @@ _NOTHING_TO_APPLY = {
 
 
 def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
-    """Return the hypothesis of a verdict, or of a member of its group.
+    """Return the recorded hypothesis with the effects of a verdict, or of a member of its group.
 
-    None if it is not recorded.
+    None if the verdict does not record it.
     """
     if verdict.kind is VerdictKind.GROUP:
         identifiers = {*(member or verdict.group[0]).split(" + ")}
@@ -258,9 +271,9 @@ def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
 
 
 def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | None:
-    """Return the hypothesis of the proof of an unexplained gap, if it lowers the error.
+    """Return the hypothesis that the proof of an unexplained gap tested, if it lowers the error.
 
-    Else None.
+    None if it does not, or if there is no proof.
     """
     if proof is None or not proof.effects or proof.closed is None or proof.closed.value <= 0.0:
         return None

@@ -62,9 +62,9 @@ class ClosedShare:
     """The fraction of the mean square error that a hypothesis removes: 1 - (after / before)^2.
 
     Both errors are computed from the same samples and the same kind of prediction: a simulation of
-    the whole trial, with only its initial state and zeros fitted to it. Channels are pooled in units
-    of their noise, which is the same before and after. For a channel without a noise record, the
-    unit is the rms residual of the model without effects in the fitted trials.
+    the whole trial, with only its initial state and zeros fitted to it. Channels are pooled in
+    units of their noise, which is the same before and after. For a channel without a noise record,
+    the unit is the rms residual of the model without effects in the fitted trials.
 
     Attributes
     ----------

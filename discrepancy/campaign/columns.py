@@ -127,7 +127,7 @@ def role_by_unit(
 
 
 def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
-    """Return what the option `--scale` makes of a column's unit.
+    """Interpret the option `--scale` of a column: a factor from its cells to its readings.
 
     Parameters
     ----------
@@ -272,9 +272,12 @@ def possible_quantities(unit: str, answer: str | None) -> tuple[Quantity, ...]:
 
 
 def sampling_interval(answer: str) -> float:
-    """Return the option `--interval` [s].
+    """Return the sampling interval [s] of the option `--interval`.
 
-    Raise CampaignFileError if it is not a positive number.
+    Raises
+    ------
+    CampaignFileError
+        If the option is not a positive number of seconds.
     """
     amount = AMOUNT.fullmatch(answer)
     if amount is None or amount[2] not in ("", "s") or not 0.0 < float(amount[1]) < np.inf:
@@ -285,7 +288,7 @@ def sampling_interval(answer: str) -> float:
 
 
 def release_in_si(answer: str) -> dict[str, Any]:
-    """Return the option `--release` as the table `release` of a trial: how far a point was held.
+    """Return the table `release` of a trial from the option `--release`, a displacement with unit.
 
     Raises
     ------
@@ -308,9 +311,9 @@ def release_in_si(answer: str) -> dict[str, Any]:
 
 
 def units_read(columns: Iterable[LaboratoryColumn], kinds: Mapping[str, str]) -> dict[str, str]:
-    """Return the unit in which each channel, input and force was read.
+    """Return the unit in which each channel, input and force was read, by its name.
 
-    If there are several, the first.
+    If tables have several units for one, it is that of the first table.
 
     Parameters
     ----------
@@ -343,12 +346,16 @@ def origin_of(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mapping[st
         The options `--scale` by the head of their column.
     """
     phrases = []
-    empty = 0
+    empty_cell_count = 0
     for column in used:
         scale = f" times {scales[column.head]}" if column.head in scales else ""
         phrases.append(f"{column.head!r} [{column.unit}]{scale} is {column.role}")
-        empty += sheet.columns[sheet.heads.index(column.head)].count("")
-    empty_cells = f"; {counted(empty, 'cell')} {is_or_are(empty)} empty" if empty else ""
+        empty_cell_count += sheet.columns[sheet.heads.index(column.head)].count("")
+    empty_cells = (
+        f"; {counted(empty_cell_count, 'cell')} {is_or_are(empty_cell_count)} empty"
+        if empty_cell_count
+        else ""
+    )
     return (
         f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: "
         f"{listing(phrases)}{empty_cells}."

@@ -82,8 +82,8 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
         return
     stated = record.standard_deviation
     contradiction = ""
-    # Only downwards: a fast motion may be rougher than the noise, but nothing is smoother than its
-    # noise.
+    # One-sided: a fast motion may make a record rougher than its noise, but no record is smoother
+    # than its noise.
     least_roughness = _least_roughness(campaign, channel.name)
     recorded_roughness = stated
     if record.samples is not None and len(record.samples) >= LEAST_FOR_COLOUR:
@@ -111,7 +111,10 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
 
 
 def _least_roughness(campaign: Campaign, name: str) -> float:
-    """Return the least roughness of a channel's records in time, at a noise factor of one."""
+    """Return the least roughness of a channel's dynamic records, scaled to a noise factor of one.
+
+    It is infinite if no record is long enough.
+    """
     least = np.inf
     for trial, values, _ in campaign.records(name):
         if trial.is_dynamic and len(values) >= LEAST_FOR_COLOUR:
@@ -123,7 +126,7 @@ def _least_roughness(campaign: Campaign, name: str) -> float:
 
 
 def _dead_faults(campaign: Campaign, name: str) -> Iterator[DataFault]:
-    """Yield a fault for each trial in which a channel shows one value by mistake."""
+    """Yield a fault for each trial in which a channel is constant although it should change."""
     trials = [trial for trial, *_ in campaign.records(name)]
     still = [trial for trial in trials if is_still(trial, name)]
     for trial in still:
@@ -176,11 +179,12 @@ def _clipped_faults(
 
 
 def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:
-    """Return the length of the longest run of readings at an extreme that is clipped; 0 if none is.
+    """Return the length of the longest clipped run of readings at an extreme; 0 if none is clipped.
 
-    A run is clipped if the record would have gone beyond the extreme by more than some quanta of
-    the sensor (`quantum_of`) and six deviations of its scatter. A record with few digits is flat at
-    its turning points, too, but only by a digit.
+    A run is clipped if an extrapolation of the other readings exceeds the extreme by more than some
+    quanta of the sensor (`quantum_of`) and six standard deviations of its scatter. A record of
+    coarse quanta is flat at its turning points, too, but there it would exceed the extreme only by
+    about a quantum.
 
     Parameters
     ----------
