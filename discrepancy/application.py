@@ -65,10 +65,11 @@ def apply_verdict(
     verdict : path
         Folder of a verdict, or its `verdict.json`.
     out : path, optional
-        The file: .json, a patch beside the model's file, which is a model itself wherever one is
-        asked for; .toml, a lumped model whose file says it by `[[law]]`; .fmu, a wing with the
-        effects switched on. By default MODEL_patched in the working folder, .toml where that can
-        say it.
+        The file to write. Its ending chooses the format: .json for a patch that refers to the
+        model's file and can be used wherever a model is expected; .toml for a lumped model with the
+        effects as tables `[[law]]`; .fmu for a wing with the effects switched on. The default is
+        MODEL_patched in the working folder, as .toml if that format can express the effects, else
+        as .json.
     member : str, optional
         Member of a group, one of `Verdict.group`; the first by default.
     replace : bool
@@ -79,7 +80,7 @@ def apply_verdict(
     Returns
     -------
     Applied
-        The file, and what to say about it.
+        The file, a sentence on what was applied, and the command to use it.
 
     Raises
     ------
@@ -333,7 +334,7 @@ def pack_patched(
     replace: bool = False,
     progress: Progress | None = None,
 ) -> list[str]:
-    """Pack the FMU of a wing with a patch and the parameters beside it.
+    """Pack the FMU of a wing with the effects and the calibrated parameters of a patch.
 
     Parameters
     ----------

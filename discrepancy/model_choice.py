@@ -174,7 +174,7 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
     origin : Origin
         Origin of the verdict or patch.
     file : Path
-        Its file; a model's file that is no longer in its place is searched beside it.
+        Its file. If the model's file was moved, it is searched in the folder of this file.
     progress : Progress, optional
         Where the modelling reports.
 

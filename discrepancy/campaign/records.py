@@ -146,7 +146,7 @@ class Trial(TrialKeys):
         True if the file does not state `begins`.
     inputs : tuple of RecordedInput
         Driven trials: what acted; `force` is then the first force or torque among them, or zero.
-        Static trials: what was held in each row beside the force.
+        Static trials: inputs other than the force that were held constant in each row.
     regions : tuple of str
         Names of the damage regions, z1 and z2 first.
     """

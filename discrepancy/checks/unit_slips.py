@@ -76,24 +76,24 @@ class Slip(NamedTuple):
 def slip_between(
     scale: float, quantity: Quantity, stated: str = "", *, drive: bool = False
 ) -> Slip | None:
-    """Return the pair of a quantity's units that explains a factor of data over model best.
+    """Return the two units of a quantity whose confusion best explains a ratio of data to model.
 
     Parameters
     ----------
     scale : float
-        Data over model, of any sign.
+        Ratio of data to model, of any sign.
     quantity : Quantity
         The quantity whose units may have been mixed up.
     stated : str
-        The unit that the file states; if empty, any pair of units counts of which one is SI.
+        The unit that the file states. If it is empty, all pairs with one SI unit are tried.
     drive : bool
-        True if the quantity drives the model: a drive that is too small shows as data that are too
-        large.
+        True if the quantity is an input of the model. An input that is too small makes the data
+        look too large, so that the ratio is inverted.
 
     Returns
     -------
     Slip or None
-        None if no pair of units explains the factor.
+        The two units; None if no pair explains the ratio.
     """
     if abs(log(abs(scale))) < log(LEAST / 1.1):
         return None
@@ -103,13 +103,13 @@ def slip_between(
     units_in_si = {unit: conversion_of(quantity, unit) for unit in sorted(names)}
     units_in_si |= UNITS[quantity].foreign
     distances: dict[Slip, float] = {}
-    for given, given_in_si in units_in_si.items():
+    for assumed, assumed_in_si in units_in_si.items():
         for meant, meant_in_si in units_in_si.items():
-            has_si = 1.0 in (given_in_si, meant_in_si)
-            if given != stated and (stated or not has_si):
+            has_si = 1.0 in (assumed_in_si, meant_in_si)
+            if assumed != stated and (stated or not has_si):
                 continue
-            factor = meant_in_si / given_in_si if drive else given_in_si / meant_in_si
-            slip = Slip(factor, meant, given)
+            factor = meant_in_si / assumed_in_si if drive else assumed_in_si / meant_in_si
+            slip = Slip(factor, meant, assumed)
             if slip.size > LEAST:
                 distances[slip] = slip.distance(scale)
     explaining = [slip for slip, distance in distances.items() if distance < log(slip.width)]
@@ -117,10 +117,11 @@ def slip_between(
 
 
 def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> Iterator[DataFault]:
-    """Yield the unit slips of channels, and of the inputs of trials.
+    """Yield the unit slips of channels and of the inputs of trials.
 
-    A channel that slips between its units in all its trials has a wrong unit itself. If all other
-    channels of a trial slip alike, the input of that trial has a wrong unit.
+    A unit slip is a ratio of data to model that two units of a quantity explain. A channel with the
+    same slip in all its trials has a wrong unit itself. If all other channels of a trial have one
+    slip in common, the input of that trial has a wrong unit.
 
     Parameters
     ----------

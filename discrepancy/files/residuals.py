@@ -1,7 +1,7 @@
 """`residuals.nc`: measured, predicted and residual values of every trial, with units (NetCDF-4).
 
-One group for each trial (`trial_001` ..) with its name as an attribute, and a group `noise` for
-what was recorded of the noise.
+There is one group for each trial (`trial_001` and so on) with its name as an attribute, and a group
+`noise` for the noise records of the channels.
 """
 
 import json
@@ -47,7 +47,7 @@ _DAMAGED = (
     DiscrepancyError,
 )
 _PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
-"""Fields of a channel that the file has as they are."""
+"""Fields of a channel that are written unchanged."""
 _NOTE = "unit of each channel: see the coordinate `unit`"
 _ARRAYS: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text("utf-8")
@@ -58,7 +58,7 @@ _ARRAYS: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(
 def write_residuals(
     path: Path, residuals: ResidualSet, attributes: Mapping[str, str] | None = None
 ) -> Path:
-    """Write a set of residuals, whole or not at all.
+    """Write a set of residuals to a NetCDF file, completely or not at all.
 
     Parameters
     ----------

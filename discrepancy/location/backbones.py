@@ -161,7 +161,7 @@ def _points(
     """Return amplitude, frequency and damping of each mode in a window, with standard errors.
 
     They belong to the centroid of the mode's energy in time, because a mode that decays quickly is
-    seen mainly at the begin of the window.
+    visible mainly at the start of the window.
 
     Parameters
     ----------

@@ -84,7 +84,7 @@ def run_campaign(
     CampaignFileError
         If the folder is not the run of a wing, or is not complete.
     CampaignDataError
-        If nothing was observed, or a steady force acted beside the load factor.
+        If nothing was observed, or a steady force acted in addition to the load factor.
     """
     folder = Path(folder)
     restore_folder(folder)
