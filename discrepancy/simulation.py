@@ -23,7 +23,7 @@ TRIES = 60
 If none is, the effect counts as not detectable in this campaign.
 """
 REFINEMENT = 2
-"""Factor by which the time steps are finer than in the fits, so that their errors differ."""
+"""Factor by which the time steps are finer than in the fits, which thus do not share the errors."""
 
 
 @dataclass(frozen=True)

@@ -105,9 +105,9 @@ def role_by_unit(
 ) -> str:
     """Return the role of a column, "time" or "force", if its unit alone determines it.
 
-    A column is a time if `times_among` finds it among the times of the table; several columns may
-    be. It is the force if it is the only column of the table with a unit of force. The result is an
-    empty text if the unit determines no role.
+    A column is a time if `times_among` finds it among the times of the table, of which there may be
+    several. Otherwise its unit determines a role only if no other column of the table has a unit of
+    the same role, and if `roles` allows it. The result is an empty text if it determines none.
 
     Parameters
     ----------
@@ -116,8 +116,8 @@ def role_by_unit(
     heads, units : sequence of str
         Names and units of all columns of the table; a unit is empty if it is not known.
     roles : collection of str
-        Roles that a unit may determine besides "time" from `times_among`. Without "force" a column
-        of forces gets no role, because trials of this kind have no input of this name.
+        Roles that a unit may determine. It lacks "force" for trials that do not read a column
+        `force`, in which a column in newtons may be a channel.
     """
     if head in times_among(heads, units):
         return "time"

@@ -290,7 +290,8 @@ def line_near(
     below = spectrum[max(1, centre - excluded - 9) : max(1, centre - excluded + 1)]
     above = spectrum[centre + excluded : centre + excluded + 10]
     neighbours = np.r_[below, above]
-    # a sine fitted to noise has two of the n ordinates, thus this sum of squares on average
+    # By Parseval's theorem a sine has the sum of squares of two ordinates, at plus and minus its
+    # frequency, over n. This is that of a sine fitted to noise alone.
     noise_power = neighbours.mean() * 2.0 / len(samples)
 
     # F test at a Bonferroni level: the strongest of several independent frequencies was chosen

@@ -71,7 +71,7 @@ def mode_shares(
 ) -> FloatArray:
     """Return the fraction (M,) of the excess variance in the frequency band of each mode.
 
-    The excess is what the residuals' sum of squares exceeds that of white noise by.
+    The excess is the sum of squares of the residuals minus its expectation for white noise.
 
     Parameters
     ----------

@@ -302,7 +302,7 @@ def quadratic_moments(
     If the residuals have the covariance A, the sum has the mean tr A and the variance 2 tr A^2. A
     multiple of a chi-squared variable with the same two moments has (tr A)^2 / tr A^2 degrees of
     freedom (Satterthwaite 1946). Here A = I - S S^T with the sensitivities S; see the text of the
-    module. Residuals without sensitivities are taken as uncorrelated.
+    module. Without sensitivities tr A^2 is replaced by tr A, which is exact if A is a projection.
 
     Parameters
     ----------
@@ -325,7 +325,7 @@ def quadratic_moments(
     for expected_variance, sensitivity in items:
         trace += float(expected_variance.sum())
         if sensitivity is None:
-            # as if A were a projection, for which A^2 = A and tr A^2 = tr A
+            # A^2 = A for a projection, such as I - S S^T of a linear fit without priors
             trace_of_square += float(expected_variance.sum())
             continue
         # A^2 = I -+ 2 S S^T + (S S^T)^2, thus tr A^2 = n -+ 2 tr S S^T + tr (S^T S)^2. The last
