@@ -144,7 +144,7 @@ def lag_products(rows: FloatArray, lags: int) -> FloatArray:
 
 
 def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return the autocorrelation of several records together, and its variance for white noise.
+    """Estimate one autocorrelation from several records, and its variance for white noise.
 
     Parameters
     ----------

@@ -116,9 +116,12 @@ def conversion_of(quantity: Quantity, unit: str) -> float:
 
 
 def _conversion_of(quantity: Quantity, unit: str) -> float:
-    """Return what one of a unit is in the SI unit of a quantity.
+    """Return the factor from a unit to the SI unit of a quantity.
 
-    Raise a bare ValueError otherwise.
+    Raises
+    ------
+    ValueError
+        If the quantity is not measured in that unit; the error has no message.
     """
     if quantity is Quantity.TEMPERATURE:
         if LOGGER_NAMES.get(unit, unit) not in NEVER_CONVERTED:

@@ -95,7 +95,7 @@ def load_catalogue(
 
 
 def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
-    """Return the effect of an identifier; raise `CatalogueError` with the known ones otherwise."""
+    """Return the effect with an identifier; raise `CatalogueError` if there is none."""
     known = {effect.identifier: effect for effect in effects}
     if identifier not in known:
         raise CatalogueError(

@@ -29,12 +29,13 @@ _NOISE_FACTOR = 2.0
 
 
 def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
-    """Return the faults that a campaign shows by itself, by channel and trial.
+    """Return the faults of a campaign's data that can be found without a model.
 
-    A limit of what can be concluded is reported for a channel without a noise record, or whose
-    record contradicts repeats (F test at 0.1 %) or itself (by a factor of two), or moves. A fault
-    of the data (`DataFault.fatal`) is reported for a dead, clipped, held or copied channel, and for
-    more than 3 % of outliers in a record in time.
+    Some faults only limit what can be concluded: a channel without a noise record, or a noise
+    record that contains a motion, or that contradicts repeats (F test at 0.1 %) or the roughness of
+    the readings (by a factor of two). Others make the data wrong (`DataFault.fatal`): a channel
+    that is constant (dead), clipped, stuck for a time (held) or a copy of another one, and more
+    than 3 % of outliers in a record in time.
     """
     faults: list[DataFault] = []
     for name, channel in campaign.channels.items():
@@ -68,7 +69,7 @@ def _outlier_faults(campaign: Campaign) -> Iterator[DataFault]:
 
 
 def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
-    """Yield a limit if a channel has no noise record, or one that its readings contradict."""
+    """Yield a fault if a channel has no noise record, or if its readings contradict the record."""
     record = channel.noise
     if record is None:
         sentence = (

@@ -103,7 +103,7 @@ def read_verdict_file(path: Path) -> StoredVerdict:
 
 
 def _drop_old_definitions(content: dict[str, Any]) -> None:
-    """Remove from an older file what has another definition now: fractions and chi-squared."""
+    """Remove entries of an older file whose definition has changed: fractions and chi-squared."""
     verdict = content["verdict"]
     proof = content["proof"]
     verdict.pop("explained", None)

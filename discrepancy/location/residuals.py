@@ -164,7 +164,7 @@ class ResidualSet:
         return self._where(held_out=True)
 
     def _where(self, *, held_out: bool) -> "ResidualSet | None":
-        """Return only the held-out trials, or only the fitted ones; None if there are none."""
+        """Return the set of the held-out trials, or of the fitted ones; None if there are none."""
         trials = tuple(fitted for fitted in self.trials if fitted.trial.held_out is held_out)
         return replace(self, trials=trials) if trials else None
 

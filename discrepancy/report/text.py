@@ -142,7 +142,10 @@ def force_sentence(force: ForceAtPort) -> str:
 
 
 def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
-    """Return what a law leaves of a missing force in fitted and held-out trials."""
+    """Return how much of a missing force remains with its law, for fitted and held-out trials.
+
+    Only kinds of trials in which the law could be tested are returned, with their names.
+    """
     if force is None:
         return []
     tested = []

@@ -211,7 +211,9 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
 def _plot_window(
     record: RingDownRecord, zero: FloatArray, begin: float, columns: int
 ) -> PlotWindow:
-    """Return the samples of a record after the begin of the window.
+    """Return the part of a record from the begin of the window on, averaged over plot columns.
+
+    The slow zero is subtracted, and the times are made even and start at zero.
 
     Parameters
     ----------
