@@ -1,4 +1,4 @@
-"""The way back: what a verdict found, written as a model that has it."""
+"""Application of a verdict: writing the model with the effects that were found."""
 
 import json
 import shlex
@@ -39,9 +39,10 @@ class Applied:
     path : Path
         Its file.
     sentence : str
-        What was applied, and how sure it is.
+        What was applied, and how certain it is.
     command : str
-        Which compares the same data with it; empty for an FMU, which wants a description first.
+        Command that compares the same data with the patched model; empty for an FMU, which needs a
+        description first.
     """
 
     path: Path
@@ -64,10 +65,11 @@ def apply_verdict(
     verdict : path
         Folder of a verdict, or its `verdict.json`.
     out : path, optional
-        The file: .json, a patch beside the model's file, which is a model itself wherever one is
-        asked for; .toml, a lumped model whose file says it by `[[law]]`; .fmu, a wing with the
-        effects switched on. By default MODEL_patched in the working folder, .toml where that can
-        say it.
+        The file to write. Its ending chooses the format: .json for a patch that refers to the
+        model's file and can be used wherever a model is expected; .toml for a lumped model with the
+        effects as tables `[[law]]`; .fmu for a wing with the effects switched on. The default is
+        MODEL_patched in the working folder, as .toml if that format can express the effects, else
+        as .json.
     member : str, optional
         Member of a group, one of `Verdict.group`; the first by default.
     replace : bool
@@ -78,7 +80,7 @@ def apply_verdict(
     Returns
     -------
     Applied
-        The file, and what to say about it.
+        The file, a sentence on what was applied, and the command to use it.
 
     Raises
     ------
@@ -126,7 +128,19 @@ def apply_verdict(
 def _check_destination(
     path: Path, choice: ModelChoice, verdict_file: Path, *, replace: bool
 ) -> None:
-    """Refuse a file of another kind, one that the patched model is made of, and one that exists."""
+    """Refuse a destination that has an unknown format, exists, or is a source of the model.
+
+    Parameters
+    ----------
+    path : Path
+        The destination.
+    choice : ModelChoice
+        The model that is patched.
+    verdict_file : Path
+        The file of the verdict.
+    replace : bool
+        True if an existing file may be replaced.
+    """
     if path.suffix not in ENDINGS:
         raise FileNotWrittenError(
             f"{path} must end in one of {', '.join(ENDINGS)}: choose another --out."
@@ -141,7 +155,7 @@ def _check_destination(
 
 
 def _applied_effects(patch: files.StoredPatch) -> str:
-    """Return the effects of a patch with their places, as the begin of a sentence."""
+    """Return the effects of a patch with their places, as the beginning of a sentence."""
     phrases = []
     for effect in patch.effects:
         phrases.append(f"{effect.name} at {effect.place}" if effect.place else effect.name)
@@ -164,9 +178,9 @@ def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
 
 
 def gives(verdict: Verdict, proof: Proof | None) -> bool:
-    """Return whether a verdict gives something to apply.
+    """Return whether a verdict has effects that can be applied to the model.
 
-    Never effects with which the error grows.
+    Effects that increase the error are never applied.
     """
     if proof is not None and proof.grew:
         return False
@@ -243,9 +257,9 @@ _NOTHING_TO_APPLY = {
 
 
 def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
-    """Return the hypothesis of a verdict, or of a member of its group.
+    """Return the recorded hypothesis with the effects of a verdict, or of a member of its group.
 
-    None if it is not recorded.
+    None if the verdict does not record it.
     """
     if verdict.kind is VerdictKind.GROUP:
         identifiers = {*(member or verdict.group[0]).split(" + ")}
@@ -258,9 +272,9 @@ def _hypothesis(verdict: Verdict, member: str | None) -> Hypothesis | None:
 
 
 def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | None:
-    """Return the hypothesis of the proof of an unexplained gap, if it lowers the error.
+    """Return the hypothesis that the proof of an unexplained gap tested, if it lowers the error.
 
-    Else None.
+    None if it does not, or if there is no proof.
     """
     if proof is None or not proof.effects or proof.closed is None or proof.closed.value <= 0.0:
         return None
@@ -271,29 +285,44 @@ def _proved_hypothesis(verdict: Verdict, proof: Proof | None) -> Hypothesis | No
 
 
 def _lumped_text(choice: ModelChoice, patch: files.StoredPatch) -> str:
-    """Return the text of a lumped model's file with the laws and the parameters of a patch."""
+    """Return the file of a lumped model, as text, with the laws and parameters of a patch added.
+
+    Parameters
+    ----------
+    choice : ModelChoice
+        The lumped model, from its own file or shipped with the package.
+    patch : StoredPatch
+        The effects to add as laws, and the calibrated parameters.
+
+    Raises
+    ------
+    ModelError
+        If the file cannot be read, or the result is not a valid lumped model.
+    """
     file = choice.path or SHIPPED_MODELS / f"{patch.origin.model_file}.toml"
-    content: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
+    model_tables: dict[str, Any] = read_toml(file, ModelError, what="lumped model")
     calibrated = {parameter.name: parameter for parameter in patch.parameters}
-    for table in content.get("parameter", ()):
+    for table in model_tables.get("parameter", ()):
         parameter = calibrated.get(table["name"])
         if parameter is not None:
             table["mean"] = parameter.mean
             table["deviation"] = parameter.deviation
-    laws = list(content.get("law", ()))
+    laws = list(model_tables.get("law", ()))
     for effect in patch.effects:
         for primitive in effect.patch:
             name = effect.identifier
-            earlier = sum(law["name"].startswith(name) for law in laws)
-            if earlier:
-                name = f"{name}_{earlier + 1}"
+            # laws of the same effect are numbered from the second on, so that names stay unique
+            number_of_same_name = sum(law["name"].startswith(name) for law in laws)
+            if number_of_same_name:
+                name = f"{name}_{number_of_same_name + 1}"
             laws.append({"name": name, **primitive.to_mapping()})
-    content["law"] = laws
+    model_tables["law"] = laws
     effects = ", ".join(effect.name for effect in patch.effects)
-    content["name"] = f"{content['name']} with {effects}"
-    LumpedDescription.parse(content, f"{file} with {patch.sentence}")
+    model_tables["name"] = f"{model_tables['name']} with {effects}"
+    # parsed only as a check, which raises if the result is not a valid model
+    LumpedDescription.parse(model_tables, f"{file} with {patch.sentence}")
     comments = f"# {patch.sentence}\n# Laws and parameters: {patch.origin.short_command}\n"
-    return f"{comments}\n{toml_text(content)}"
+    return f"{comments}\n{toml_text(model_tables)}"
 
 
 def pack_patched(
@@ -305,7 +334,7 @@ def pack_patched(
     replace: bool = False,
     progress: Progress | None = None,
 ) -> list[str]:
-    """Pack the FMU of a wing with a patch and the parameters beside it.
+    """Pack the FMU of a wing with the effects and the calibrated parameters of a patch.
 
     Parameters
     ----------

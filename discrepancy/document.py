@@ -1,7 +1,8 @@
-"""How records stand in JSON: numbers that JSON lacks, and patches by their primitives.
+"""Reading and writing records such as a verdict as JSON documents.
 
-A number that is not a number is null, an infinite one "Infinity" or "-Infinity", because JSON has
-neither. The records themselves (`verdict`) say what a file holds; pydantic checks it against them.
+JSON has no values for nan and infinity: nan is written as null, infinity as "Infinity" or
+"-Infinity". A patch is written as the list of its primitives. The content of a file is defined by
+the record classes (`discrepancy.verdict`), against which pydantic checks it.
 """
 
 import json
@@ -117,17 +118,17 @@ class Origin:
     Attributes
     ----------
     campaign, model : str
-        Names for people.
+        Names of the campaign and the model, for messages and pages.
     data_hash, model_hash : str
         SHA-256 of the campaign's files and of the model.
     command : str
-        The command that repeats it in any folder: its paths are absolute.
+        The command that repeats the investigation in any folder, with absolute paths.
     provenance : Provenance
         Seed, versions, hashes of the sources.
     model_file : str or None
-        Absolute path of the model's file, or of the mission whose twin's model it is; the name of a
-        shipped model, empty for the shipped wing. None: not known, as of files before it was
-        recorded.
+        Absolute path of the model's file, or of the folder of a mission whose twin used the model;
+        for a shipped model its name, empty for the shipped wing. None in files of versions that did
+        not record it.
     """
 
     campaign: str
@@ -140,7 +141,7 @@ class Origin:
 
     @property
     def short_command(self) -> str:
-        """The command with the names of files alone, for pages that are handed on."""
+        """The command with file names in place of absolute paths, for pages that are shared."""
         words = shlex.split(self.command)
         return shlex.join(Path(word).name if Path(word).is_absolute() else word for word in words)
 
@@ -165,7 +166,7 @@ def shipped_schema(name: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """Return records as plain data for JSON; nan is null, infinity is "Infinity"."""
+    """Return a record as plain data for JSON, with nan as None and infinity as "Infinity"."""
 
     def not_finite(number: float) -> str | None:
         if isnan(number):
@@ -176,7 +177,9 @@ def plain(value: Any) -> Any:
 
 
 def write_document(path: Path, schema: str, record: object) -> Path:
-    """Check a document, a record with an `origin`, and write it whole or not at all.
+    """Write a record with an `origin` as a JSON document, after a check that it can be read again.
+
+    The file is written completely or not at all.
 
     Parameters
     ----------
@@ -212,7 +215,7 @@ def read_document(
     upgrade: Callable[[dict[str, Any]], None] | None = None,
     **absent: Any,
 ) -> _Record:
-    """Return the record of a document.
+    """Read a JSON document as a record, also one of an older schema.
 
     Parameters
     ----------
@@ -268,7 +271,13 @@ class _InvalidDocumentError(ValueError):
 
 
 def _record_of(kind: type[_Record], content: dict[str, Any]) -> _Record:
-    """Return the record of plain data; refuse data that lack something or have something more."""
+    """Return plain data as a record of a class.
+
+    Raises
+    ------
+    _InvalidDocumentError
+        If the data lack an entry, have an unknown one, or one of another type.
+    """
     try:
         return TypeAdapter(kind).validate_json(json.dumps(content), strict=True, extra="forbid")
     except ValidationError as cause:

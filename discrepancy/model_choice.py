@@ -43,27 +43,27 @@ class ModelChoice:
     Attributes
     ----------
     model : Model
-        Ready to be asked.
+        The model, ready for simulation.
     kind : ModelKind
-        What it is.
+        Where it comes from.
     label : str
-        What the command line names it by, without its folder; empty for the shipped wing.
+        Name of its file or folder, without the path; empty for the shipped wing.
     source_hash : str
         SHA-256 of all that it was read from: its file, with the prior for a wing without
         calibration, with FMU and binding for the description of an FMU, with the patch of a run's
         twin.
     design : WingDesign or None
-        Of a wing.
+        Design of a wing; None for another model.
     path : Path or None
-        Of its file; None for what is shipped.
+        Path of its file; None for a shipped model.
     design_hash : str
-        SHA-256 of the design or structure that it was made of; empty where that is not known.
+        SHA-256 of the design or structure that it was built from; empty if that is not known.
     file : str
-        As `Origin.model_file`.
+        File or name of the model, as in `Origin.model_file`.
     built_in : StoredPatch or None
-        The patch that was built into the model of `kind`.
+        Patch that is already applied to the model; None without one.
     beneath : tuple of str
-        As `file`, of what a patched model rests on.
+        Files or names of the models that a patched model is based on.
     """
 
     model: Model
@@ -105,7 +105,7 @@ def choose_model(name: str | Path | None, progress: Progress | None = None) -> M
 def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     """Return the model of a file or a folder, or the shipped one of this name.
 
-    Without its `file`.
+    The entry `file` of the result is not set yet.
     """
     if path.is_dir():
         return choice_of_run(path)
@@ -167,14 +167,14 @@ def load_model(name: str | Path | None = None, progress: Progress | None = None)
 
 
 def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> ModelChoice:
-    """Return the model that a verdict or a patch rests on.
+    """Return the model that a verdict or a patch was made for, after a check that it is unchanged.
 
     Parameters
     ----------
     origin : Origin
         Origin of the verdict or patch.
     file : Path
-        Its file; a model's file that is no longer in its place is searched beside it.
+        Its file. If the model's file was moved, it is searched in the folder of this file.
     progress : Progress, optional
         Where the modelling reports.
 
@@ -208,7 +208,7 @@ def model_of(origin: Origin, file: Path, progress: Progress | None = None) -> Mo
 
 
 def choice_of_run(folder: Path) -> ModelChoice:
-    """Return the model in which the twin of a run folder believed, with its patch if it had one.
+    """Return the model that the twin of a run folder used, with its patch if it had one.
 
     Raises
     ------
@@ -225,7 +225,7 @@ def choice_of_run(folder: Path) -> ModelChoice:
 
 
 def _patched(path: Path, progress: Progress | None) -> ModelChoice:
-    """Return the model of a patch file: that on which the patch rests, with its effects."""
+    """Return the model of a patch file: the model that the patch was made for, with its effects."""
     stored = read_patch(path)
     base = model_of(stored.origin, path, progress)
     calibrated = {
@@ -259,7 +259,7 @@ def _structure(path: Path, progress: Progress | None) -> ModelChoice:
 def _fmu(path: Path) -> ModelChoice:
     """Return the model of an FMU's description.
 
-    Its hash is that of description, FMU and binding.
+    Its `source_hash` covers the description, the FMU and the binding.
     """
     model = FmuModel.load(path)
     fmu_file = path.parent / model.description.fmu
@@ -278,9 +278,16 @@ def _fmu(path: Path) -> ModelChoice:
 
 
 def _wing(model: WingModel, kind: ModelKind, path: Path | None) -> ModelChoice:
-    """Return the model of a wing, from its calibration or design.
+    """Return the choice of a wing model, from its calibration, its design or the shipped design.
 
-    Without a file the shipped design.
+    Parameters
+    ----------
+    model : WingModel
+        The model.
+    kind : ModelKind
+        Whether it is from a calibration or a design.
+    path : Path or None
+        File of the calibration or design; None for the shipped design.
     """
     if path is not None and kind is ModelKind.CALIBRATION:
         source_hash = hash_file(path)

@@ -21,21 +21,21 @@ class Scores:
     log_score : float
         Mean predictive log density of a sample, standardised by its noise.
     coverage_50, coverage_90 : float
-        Share of samples within the central predictive intervals.
+        Fraction of the samples within the central predictive intervals of 50 % and 90 %.
     whiteness : float
-        p-value of the Ljung-Box test, the least over dynamic channels (Holm); nan without dynamic
-        trials.
+        Least p-value of the Ljung-Box test over the channels of dynamic trials (Holm); nan without
+        dynamic trials.
     sample_count : int
-        Used samples.
+        Number of used samples.
     chi_square_expected, chi_square_deviation : float
-        Mean and standard deviation of `chi_square_per_sample` if the model is right, from what the
-        fit absorbs or leaves open and the degrees of freedom of the noise records; nan without a
-        noise record.
+        Mean and standard deviation of `chi_square_per_sample` if the model is right. They allow for
+        what the fit absorbs or leaves uncertain, and for the degrees of freedom of the noise
+        records; nan without a noise record.
     pit : tuple of float
-        Shares of the probability integral transforms in ten equal bins; 0.1 each if predictions are
-        right.
+        Fractions of the probability integral transforms in ten equal bins; 0.1 each if predictions
+        are right.
     pit_p_value : float
-        Of their uniformity, with the effective number of samples; nan with fewer than ten.
+        p-value of their uniformity, for the effective number of samples; nan if that is below ten.
     """
 
     rms: Mapping[str, Number]
@@ -52,29 +52,31 @@ class Scores:
 
 
 LEAST_GROWTH = 0.02
-"""Share below zero from which on an error has grown whatever its interval: by a hundredth of its
-size."""
+"""An error has grown for certain if the closed fraction is below minus this value.
+
+1 - (after / before)^2 = -0.02 if the error is larger by a hundredth."""
 
 
 @dataclass(frozen=True)
 class ClosedShare:
     """The fraction of the mean square error that a hypothesis removes: 1 - (after / before)^2.
 
-    Both errors are of the same samples and of the same kind of prediction: a simulation of the
-    whole trial, with no more than its own beginning and zeros fitted to it. Channels are pooled in
-    units of their noise, which is the same before and after; where no noise is recorded, of what
-    the model as it was leaves of the channel in fitted trials.
+    Both errors are computed from the same samples and the same kind of prediction: a simulation of
+    the whole trial, with only its initial state and zeros fitted to it. Channels are pooled in
+    units of their noise, which is the same before and after. For a channel without a noise record,
+    the unit is the rms residual of the model without effects in the fitted trials.
 
     Attributes
     ----------
     value : float
-        The share, negative where the error grew.
+        The fraction; negative if the error grew.
     low, high : float
-        Its 90 % interval by a bootstrap of blocks of the records; nan with fewer than five blocks.
+        90 % interval of the fraction by a bootstrap of blocks of the records; nan with fewer than
+        five blocks.
     trials : str
-        "held-out", or "fitted" where none was held out.
+        "held-out", or "fitted" if no trial was held out.
     trial_count : int
-        How many.
+        Number of trials.
     """
 
     value: Number
@@ -85,7 +87,10 @@ class ClosedShare:
 
     @property
     def grew(self) -> bool:
-        """Whether the error is larger with the hypothesis than without it."""
+        """Whether the error is larger with the hypothesis than without it.
+
+        Either it is clearly larger, or the whole interval says so.
+        """
         return self.value < -LEAST_GROWTH or self.high < 0.0
 
 
@@ -96,17 +101,18 @@ class Proof:
     Attributes
     ----------
     held_out_before, held_out_after : Scores or None
-        None without a held-out trial.
+        Scores on held-out trials without and with the hypothesis; None if no trial is held out.
     fitted_before, fitted_after : Scores
-        Of the fitted trials.
+        The same on fitted trials.
     closed : ClosedShare or None
-        Of the mean square error; None with the reason in `closed_reason`.
+        Fraction of the mean square error that the hypothesis removes; None with the reason in
+        `closed_reason`.
     log_score_gain, log_score_gain_error : float
-        Of the mean predictive log density per held-out sample [nat], and its standard error.
+        Gain of the mean predictive log density per held-out sample [nat], and its standard error.
     remaining : str
         What is still not explained, in one sentence.
     closed_reason : str
-        Why there is no share.
+        Why the fraction cannot be given; empty if it can.
     effects : tuple of str
         The hypothesis: its effects with their places, as `effect_label` gives them.
     """

@@ -1,4 +1,4 @@
-"""What the search for effects is set to: one record, each number with its reason.
+"""Settings of the search for effects in one record, each number with its reason.
 
 Gates have levels of their own (`gates`, `consistency_gate`): they judge what the search found.
 """
@@ -15,20 +15,20 @@ class SearchSettings:
     prior_none: float = 0.5
     """Probability that nothing is missing: a name has to be earned."""
     set_shares: tuple[float, ...] = (0.97, 0.029, 0.001)
-    """How the rest is shared among sets of one, two and three effects.
+    """Fractions of the remaining probability for sets of one, two and three effects.
 
-    Longer ones are not looked for.
+    Larger sets are not searched.
     """
 
     # ---------------------------------------------------------------- what is named
     sure: float = 0.95
-    """Probability that a name needs."""
+    """Least probability of a named set of effects."""
     bayes_factor: float = 3.0
-    """ln Bayes factor against 'none' that a name needs."""
+    """Least log Bayes factor of a named set against 'none'."""
     unsure: float = 0.5
     """Probability of 'none' below which the data leave open whether something is missing."""
     largest_group: int = 6
-    """Members of a group; more of them say nothing."""
+    """Most members of a group; a larger group would say nothing."""
 
     # ---------------------------------------------------------------- screening: what is worth a
     # fit
@@ -38,92 +38,97 @@ class SearchSettings:
         (-1.3, 0.0, 1.3),
         (-1.2, 0.0, 1.2),
     )
-    """Grid of the scaled parameters that are not a mere scale, by their number from none on."""
+    """Grid of the scaled parameters other than magnitudes, by the number of such parameters."""
     levels_of_many: tuple[float, ...] = (-1.0, 1.0)
-    """The same from four on: the grid grows with the power of their number."""
+    """The same grid for four or more of them: its size grows exponentially with their number."""
     largest_start: float = 2.5
-    """Fits do not begin at larger magnitudes: far off, scales mean little."""
+    """Largest scaled magnitude at which fits begin; farther out, scales mean little."""
     linear: float = 0.05
-    """Signed magnitudes are tried at one prior deviation and at this share of it: what moves
-    phases (clock, drift) leaves the range of first order before its shared part is taken up by
-    the nuisances."""
+    """Signed magnitudes are tried at one prior deviation and at this fraction of it.
+
+    An effect that shifts phases (clock, drift) is nonlinear at one deviation, before nuisances can
+    compensate for the part that they share with it."""
     first_order: float = 25.0
-    """Squared change of all readings [sigma^2] to which effects are shrunk to see their
-    direction."""
+    """Squared change of all readings [noise variances] to which an effect is reduced, so that its
+    direction can be computed to first order."""
     padded: int = 4
-    """Zero padding of spectra: lines lie between the frequencies of a record."""
+    """Factor of zero padding of spectra, because lines lie between the frequencies of a record."""
     peaks: int = 3
     """Peaks of a spectrum that are tried."""
     starts: int = 2
-    """Starts of the fit of each effect close to the truth."""
+    """Starts of the fit of each effect, if the model is close to the data."""
     far_starts: int = 2
-    """The same far from it, of the best on a grid."""
+    """The same if the model is far from the data; the starts are the best points of a grid."""
     far_levels: tuple[int, ...] = (1, 25, 5, 5, 3)
-    """Levels of each parameter on it, by their number from none on: friction that ends motions
-    has an optimum for every size, and the right one is that narrow."""
+    """Levels of each parameter on that grid, by the number of parameters.
+
+    The grid is fine, because friction that ends motions has many local optima over its size, and
+    the right one is narrow."""
     few_places: int = 3
-    """Effects with more places than this are those of single channels, which are linear in their
-    size."""
+    """Effects with more places than this concern single channels, and are linear in their size."""
     worth_fitting: float = 2.0
     """Screened gain below which an effect is not fitted at all: it could not win a name."""
     worth_adding: float = 4.0
-    """The same for one more effect, whose prior is smaller."""
+    """The same for a further effect in a set, whose prior probability is smaller."""
     pairs_fitted: int = 8
-    """Pairs that are fitted of all that are screened."""
+    """Most pairs of effects that are fitted, of all that are screened."""
 
     # ---------------------------------------------------------------- rough fits
     rough_steps: int = 8
-    """Steps of fits that begin where a screen leads."""
+    """Iterations of a rough fit, which begins at the result of a screen."""
     out_of_reach: float = 36.0
-    """They end where they have no prospect to come within this of the best: three times `close`."""
+    """A rough fit ends early if it cannot come within this log evidence of the best: 3 `close`."""
 
     none_steps: int = 20
-    """Steps of the fit without effect: far from the truth its valley has no end that is worth
+    """Most iterations of the fit without effects.
+
+    If the model is far from the data, the minimum lies in a long valley and is not worth
     reaching."""
 
     # ---------------------------------------------------------------- exact fits
     close: float = 12.0
-    """Candidates within this log evidence of the best are fitted exactly: few steps err by less."""
+    """Candidates this close to the best log evidence are fitted exactly; rough fits err by less."""
     close_share: float = 0.5
-    """The same as a share of what the best gained: far from the truth few steps rank only
-    roughly."""
+    """The same as a fraction of the best gain, because rough fits of a poor model err more."""
     exact_fits: int = 4
-    """Candidates of a scan that are fitted exactly at most."""
+    """Most candidates of a scan that are fitted exactly."""
     gained_again: float = 5.0
-    """A candidate is fitted anew if a rough fit found it better than its exact one by this."""
+    """A candidate is fitted again if a rough fit is better than its exact fit by this."""
     hopeless: float = 6.0
     """Single effects this far below 'none' are not fitted exactly."""
     hopeless_longer: float = 2.0
-    """Sets with one more effect this far below the set without it are not."""
+    """Sets this far below the set with one effect fewer are not fitted exactly."""
     rivals: float = 30.0
-    """Effects that fit within this log evidence of the best one have families that may overtake
-    it."""
+    """Families of effects within this log evidence of the best are fitted: they may overtake it."""
 
     # ---------------------------------------------------------------- far from the truth
     far: float = 1.5
-    """Chi-square per sample above which a fit is far from the truth."""
+    """Chi-squared per sample above which a model counts as far from the data."""
     strained: float = 4.0
-    """Prior deviations beyond which a shared unknown says the same."""
+    """Prior deviations of a shared unknown above which the model counts as far, too."""
     far_fits: int = 6
-    """Sets along the missing force that are fitted to the readings."""
+    """Most sets, chosen by their fit to the missing force, that are fitted to the readings."""
 
     # ---------------------------------------------------------------- named by the missing force
     followed: float = 25.0
-    """Sets of effects within this log evidence of the best one, along the missing force, are
-    fitted."""
+    """Sets within this log evidence of the best, in fits to the missing force, are fitted."""
     least_end: float = 0.25
-    """Lower end of the share of the missing force that a name in part needs."""
+    """Least lower end of the fraction of the missing force that a partly named set explains."""
     contenders: float = 12.0
-    """Those within this are compared by the share of the missing force that they are."""
+    """Sets within this log evidence are compared by the fraction of the missing force that they
+    explain."""
     slim: float = 0.01
-    """Share of the missing force below which a further effect or a shape of its own is no part
-    of a name; three times it where they were fitted, as any freedom gains there."""
+    """Least fraction of the missing force that a further effect or a free shape must add.
+
+    In the trials that it was fitted to it must add three times as much, because any freedom gains
+    there."""
     nearly_all: float = 0.9
-    """Share of the missing force from which on laws are named without an error of readings
-    beside them."""
+    """Least explained fraction of the missing force for laws to be named without an additional
+    error of the readings."""
     force_rival: float = 10.0
-    """Log evidence within which another effect is no worse along the missing force, whose motion
-    is taken as known: unless trials that were not fitted tell them apart."""
+    """Another effect within this log evidence, in a fit to the missing force, counts as equal.
+
+    That fit takes the motion as known. Trials that were not fitted may distinguish the two."""
 
     # ---------------------------------------------------------------- begun from another size
     restart_sizes: tuple[float, ...] = (
@@ -143,53 +148,54 @@ class SearchSettings:
         1.8,
         2.0,
     )
-    """Sizes, over that which follows the missing force, from which the leading effect is fitted
-    again where no fit leaves noise alone: friction that ends a motion has optima an eighth to a
-    quarter of it apart."""
-    restarts: int = 6
-    """Such fits, from the sizes at which least is left.
+    """Start sizes of repeated fits of the leading effect, over its size by the missing force.
 
-    The first that leaves noise alone is the last.
+    They are used if no fit leaves only noise. Friction that ends a motion has local optima that
+    are an eighth to a quarter of its size apart."""
+    restarts: int = 6
+    """Most such fits, from the sizes with the smallest residuals.
+
+    They end with the first that leaves only noise.
     """
 
     # ---------------------------------------------------------------- weighed with a remainder
     weighed_sets: tuple[int, ...] = (8, 4, 2)
-    """Sets of one, two and three effects that may be fitted under the wider noise of what is
-    left."""
+    """Most sets of one, two and three effects that are fitted together with a remainder."""
     weighed_fits: int = 7
-    """Of these, how many are at most."""
+    """Most of these sets that are fitted in all."""
     weighed_within: float = 60.0
-    """Log evidence below the best one from which on they are not: such a fit moves by less."""
+    """Sets farther below the best log evidence are not fitted: such a fit changes it by less."""
     least_share: float = 0.5
-    """Share that the interval of a name in part must reach.
+    """Fraction of the gap that the interval of a partly named set must reach.
 
-    Its lower end too where readings are compared.
+    If readings are compared, also the lower end of the interval must reach it.
     """
     widened: float = 2.0
-    """How many times wider the priors of calibrated parameters and gains count for a name in
-    part: they take up what is left."""
+    """Factor by which priors of calibrated parameters and gains count as wider for a partly named
+    set, because these explain part of the remainder."""
     told_by_data: float = 0.8
-    """Prior deviations below which a shape is known from the data, so that a verdict tells it."""
+    """Largest posterior deviation of a shape, in prior deviations, that a verdict reports."""
     sliver: float = 0.004
-    """Share of the gap below which one more effect has to earn its place against a remainder."""
+    """Fraction of the gap below which a further effect must be better than a remainder."""
     sliver_gain: float = 10.0
-    """By how much evidence and prior of a set with such an effect must be above those of the set
-    without it: it was chosen among all that may stand there."""
+    """Least gain of log evidence plus log prior by such an effect over the set without it.
+
+    It is high because the effect was chosen among many."""
     stand_in_range: float = 3.0
-    """Prior deviations beyond which a calibrated parameter is told as far off."""
+    """Distance from the prior mean, in deviations, of a calibrated parameter that is reported."""
 
     # ---------------------------------------------------------------- what is judged is computed
     # finely
     solver_share: float = 0.1
-    """Largest share of the noise that the time steps may cost (rms over a channel of a trial)."""
+    """Largest error by the time steps, over the noise (rms over a channel of a trial)."""
     finest: int = 8
-    """How many times smaller than the model's own the time steps may become for it."""
+    """Largest factor by which the time steps are reduced for this, from the model's own steps."""
     refitted: int = 3
-    """Candidates that are fitted again with smaller steps."""
+    """Number of candidates that are fitted again with smaller steps."""
 
     @property
     def largest_set(self) -> int:
-        """Effects of the largest set that is looked for."""
+        """Number of effects in the largest set that is searched."""
         return len(self.set_shares)
 
 

@@ -1,10 +1,10 @@
 """Simulation-based calibration of the workflow itself, on the geometry of a user's own campaign.
 
-Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. In a
-third of them nothing is hidden; in the others an effect drawn from its prior, where this campaign
-can detect it (d^2 >= 25, the limit of `discrepancy.judgement.separability`). Each is investigated
-as the real one is, and verdicts are compared with what was hidden. Motion is simulated with half
-the time step of the naming side.
+Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. A
+third of them contains no effect. The others contain a hidden effect that is drawn from its prior,
+at a size that this campaign can detect (d^2 >= 25, see `discrepancy.judgement.separability`).
+Each campaign is investigated like the real one, and its verdict is compared with the hidden effect.
+Motion is simulated with half the time step of the fits.
 """
 
 import json
@@ -33,13 +33,13 @@ from reporting.files import atomic_write_text
 SELF_CALIBRATION_NAME = "self_calibration.json"
 SCHEMA = "uav-twin self calibration 1"
 NULL_SHARE = 3
-"""One campaign in so many hides nothing."""
+"""Every so many campaigns one contains no effect."""
 NOTHING = "nothing"
 OTHER = {kind: kind.value for kind in VerdictKind if kind is not VerdictKind.NAMED}
 OTHER[VerdictKind.FAMILY] = "family only"
 """Columns of the confusion matrix besides the names."""
 OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
-"""Of verdicts that say less than a name, where they hold what was hidden."""
+"""Outcomes of verdicts that say less than a name, if they contain the hidden effect."""
 
 
 @dataclass(frozen=True)
@@ -64,21 +64,21 @@ class CalibrationCase:
     Attributes
     ----------
     hidden : str
-        Identifier of the effect, "nothing" where there is none.
+        Identifier of the hidden effect; "nothing" if there is none.
     place : str
-        Where it acts.
+        Place where the effect acts.
     distance : float
-        d^2 from the model without it [sigma^2].
+        Squared distance d^2 of the readings with and without the effect [noise variances].
     kind : VerdictKind
-        Of the verdict.
+        Kind of the verdict.
     named : tuple of str
-        Identifiers that were named; members where the verdict is a group, the nearest where it is a
-        family.
+        Identifiers of the effects in the verdict: the named ones, the members of a group, or the
+        nearest member of a family.
     outcome : str
-        "right", "wrong", "in part", "group", "family", "unexplained", "below detectability" or
-        "data error".
+        "right", "wrong", "missed", "in part", "group", "family", "unexplained", "below
+        detectability" or "data error"; see `outcome_of`.
     covered : tuple of Covered
-        Parameters of the effect, where it was named.
+        Parameters of the effect with their intervals, if it was named correctly.
     """
 
     hidden: str
@@ -92,7 +92,7 @@ class CalibrationCase:
 
 @dataclass(frozen=True)
 class Proportion:
-    """A share of cases with its 90 % Wilson interval."""
+    """A fraction of cases with its 90 % Wilson interval."""
 
     count: int
     total: int
@@ -101,22 +101,22 @@ class Proportion:
 
     @property
     def value(self) -> float:
-        """The share; nan without cases."""
+        """The fraction; nan without cases."""
         return self.count / self.total if self.total else float("nan")
 
 
 @dataclass(frozen=True)
 class SelfCalibration:
-    """What came out of all simulated campaigns.
+    """Results of all simulated campaigns.
 
     Attributes
     ----------
     cases : tuple of CalibrationCase
-        In the order of their simulation.
+        The campaigns in the order of their simulation.
     not_detectable : tuple of str
-        Effects that can be tested here, but were in no draw of their prior detectable.
+        Identifiers of testable effects of which no draw of the prior was detectable.
     seed : int
-        Of the `SeedSequence`.
+        Seed of the `SeedSequence`.
     """
 
     cases: tuple[CalibrationCase, ...]
@@ -124,7 +124,7 @@ class SelfCalibration:
     seed: int
 
     def share(self, outcome: str, *, null: bool = False) -> Proportion:
-        """Return how often an outcome came, among campaigns with an effect or those without one.
+        """Return the fraction of an outcome among campaigns with a hidden effect, or without one.
 
         Parameters
         ----------
@@ -137,7 +137,7 @@ class SelfCalibration:
         return wilson(sum(case.outcome == outcome for case in cases), len(cases))
 
     def coverage(self) -> Proportion:
-        """Return how many 90 % intervals of named effects hold the true value."""
+        """Return the fraction of 90 % intervals of named effects that contain the true value."""
         are_inside = [covered.inside for case in self.cases for covered in case.covered]
         return wilson(sum(are_inside), len(are_inside))
 
@@ -147,9 +147,9 @@ class SelfCalibration:
         Returns
         -------
         rows : list of str
-            What was hidden; nothing comes first.
+            Hidden effects; "nothing" comes first.
         columns : list of str
-            Verdicts: nothing missing, then names, then other verdicts.
+            Verdicts: "nothing missing", then names, then other verdicts.
         counts : (R, C) ndarray of int
             Numbers of campaigns.
         """
@@ -176,7 +176,7 @@ def _column(case: CalibrationCase) -> str:
 
 
 def wilson(count: int, total: int) -> Proportion:
-    """Return a share with its 90 % interval after Wilson 1927; from 0 to 1 without cases."""
+    """Return a fraction with its 90 % interval (Wilson 1927); from 0 to 1 without cases."""
     if total == 0:
         return Proportion(0, 0, 0.0, 1.0)
     interval = binomtest(count, total).proportion_ci(0.9, method="wilson")
@@ -196,7 +196,7 @@ def self_calibrate(
     workers: int = 2,
     advance: Callable[[], object] | None = None,
 ) -> SelfCalibration:
-    """Return what the workflow says of simulated campaigns of one geometry, with known effects.
+    """Test the workflow on simulated campaigns with known effects, and return its verdicts.
 
     Parameters
     ----------
@@ -207,7 +207,7 @@ def self_calibrate(
     effects : sequence of Effect
         The catalogue; effects that cannot be tested here are not hidden.
     count : int
-        Number of campaigns; every third hides nothing, the effects alternate in the others.
+        Number of campaigns. Every third contains no effect; the effects alternate in the others.
     seed : int
         Seed; the result depends on it, and not on the number of workers.
     workers : int
@@ -245,9 +245,10 @@ def _hidden_effects(
     count: int,
     generator: np.random.Generator,
 ) -> tuple[list[Hidden | None], list[str]]:
-    """Return the effects that are hidden in campaigns, and those of which no draw was detectable.
+    """Draw the effects that are hidden in the campaigns.
 
-    Effects alternate in random order; every `NULL_SHARE`-th campaign hides none.
+    All testable effects are used in a random order before one is used again. Every `NULL_SHARE`-th
+    campaign has no effect.
 
     Parameters
     ----------
@@ -259,6 +260,13 @@ def _hidden_effects(
         Number of campaigns.
     generator : Generator
         Source of the order, of places and of sizes.
+
+    Returns
+    -------
+    hidden : list of Hidden or None
+        The effect of each campaign; None for none.
+    not_detectable : list of str
+        Identifiers of the effects of which no draw was detectable.
     """
     screen = simulator.screen()
     queue: list[Effect] = []
@@ -286,7 +294,7 @@ def _investigated(
     hidden: Hidden | None,
     seed: np.random.SeedSequence,
 ) -> CalibrationCase:
-    """Return what the workflow says of one simulated campaign.
+    """Simulate a campaign, investigate it, and compare the verdict with the hidden effect.
 
     Parameters
     ----------
@@ -301,7 +309,7 @@ def _investigated(
     """
     try:
         campaign = simulator.simulate(hidden, np.random.default_rng(seed))
-    except ModelError:  # at the edge of what the structure carries: with other nuisances it goes
+    except ModelError:  # the structure could not carry the effect with these nuisances: draw others
         campaign = simulator.simulate(hidden, np.random.default_rng(seed.spawn(1)[0]))
     verdict = investigate(campaign, simulator.model, effects, thorough=False).verdict
     identifier, place, distance = NOTHING, "", 0.0
@@ -334,10 +342,11 @@ def _investigated(
 def outcome_of(
     hidden: str, kind: VerdictKind, named: tuple[str, ...], group: tuple[str, ...]
 ) -> str:
-    """Return how a verdict compares with what was hidden.
+    """Return the outcome of a verdict, given the hidden effect.
 
-    A group that holds the effect, and a family whose nearest member it is, are honest but less than
-    the name. A group or a family without it is wrong, and so is any name if nothing was hidden.
+    A group that contains the effect, and a family whose nearest member it is, are correct but say
+    less than the name; they have outcomes of their own. A group or a family without the effect is
+    wrong, and so is any name if there is no effect.
 
     Parameters
     ----------
@@ -363,7 +372,7 @@ def outcome_of(
 def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin: Origin) -> Path:
     """Write `self_calibration.json`: every case, the proportions and the confusion matrix.
 
-    The file is written whole or not at all.
+    The file is written completely or not at all.
 
     Raises
     ------
@@ -388,9 +397,14 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
 
 
 def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str, Any]:
-    """Return the proportions of all outcomes as plain data.
+    """Return the proportions of all outcomes as plain data, by outcome.
 
-    `null`: of campaigns that hide nothing.
+    Parameters
+    ----------
+    self_calibration : SelfCalibration
+        The cases.
+    null : bool
+        True for campaigns without an effect, False for those with one.
     """
     table = {}
     for outcome in outcomes(self_calibration, null=null):

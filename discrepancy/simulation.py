@@ -18,17 +18,28 @@ from discrepancy.judgement.separability import DETECTED, as_predicted, has_free_
 from discrepancy.system.interface import Model
 
 TRIES = 60
-"""Draws of an effect's prior until one is detectable.
+"""Most draws of an effect's prior until one is detectable.
 
-Without success the effect is not detectable here.
+If none is, the effect counts as not detectable in this campaign.
 """
 REFINEMENT = 2
-"""Finer time steps than on the naming side."""
+"""Factor by which the time steps are finer than in the fits, which thus do not share the errors."""
 
 
 @dataclass(frozen=True)
 class Hidden:
-    """An effect to hide: the term, its scaled parameters, its d^2."""
+    """An effect to hide in a simulated campaign.
+
+    Attributes
+    ----------
+    term : EffectTerm
+        The effect and its place.
+    normal : (K,) ndarray
+        Standard normal variables of its parameters.
+    distance : float
+        Squared change d^2 of all readings by the effect that nuisances cannot explain, in units of
+        the noise variance.
+    """
 
     term: EffectTerm
     normal: FloatArray
@@ -36,15 +47,15 @@ class Hidden:
 
 
 class Simulator:
-    """Draws campaigns of the geometry of a real one.
+    """Simulates campaigns with the trials, channels and noise of a real one.
 
     Parameters
     ----------
     campaign : Campaign
-        The real one; its values count only where a nuisance has no prior (a free zero, a motion
-        that began before the record): these stay as the fit without effect has them.
+        The real campaign. Its readings are used only for nuisances without a prior (a free zero, a
+        motion that began before the record), which keep their values of a fit without effects.
     model : Model
-        The model as it is.
+        The model without a patch.
     """
 
     def __init__(self, campaign: Campaign, model: Model) -> None:
@@ -60,7 +71,10 @@ class Simulator:
         self.nuisances = fit(self.problem, Candidate(), start, local_only=True).point
 
     def screen(self) -> Screen:
-        """Return the screen that measures the distance d^2 of an effect, on the predicted data."""
+        """Return the screen that measures the distance d^2 of an effect.
+
+        It is linearised about a fit to the predictions of the model as data.
+        """
         predicted = as_predicted(self.campaign, self.model, self.setting)
         problem = Problem(predicted, self.model, self.setting)
         return Screen(problem, fit(problem, Candidate(), problem.start(Candidate()), iterations=1))
@@ -68,7 +82,7 @@ class Simulator:
     def draw_effect(
         self, effect: Effect, screen: Screen, generator: np.random.Generator
     ) -> Hidden | None:
-        """Return a draw of an effect's prior that is detectable; None if several draws were not.
+        """Draw an effect's place and parameters until it is detectable; None after `TRIES` draws.
 
         Parameters
         ----------
@@ -85,7 +99,7 @@ class Simulator:
             normal = generator.standard_normal(len(term.parameters))
             try:
                 distance = screen.change(term, normal).squared_size
-            except DiscrepancyError:  # more than the structure can carry
+            except DiscrepancyError:  # the structure cannot carry an effect of this size
                 continue
             if distance >= DETECTED:
                 return Hidden(term, normal, distance)
@@ -137,7 +151,11 @@ class Simulator:
         return replace(self.campaign, name=name, trials=tuple(trials))
 
     def _noise_ratio(self, name: str, generator: np.random.Generator) -> float:
-        """Return a draw of a channel's true noise deviation over that of its record."""
+        """Draw the ratio of a channel's true noise deviation to that of its noise record.
+
+        A record with n degrees of freedom estimates the variance by chi-squared over n times the
+        true one.
+        """
         freedom = self.problem.noise[name].degrees_of_freedom
         if isinf(freedom) or freedom <= 0.0:
             return 1.0
@@ -145,20 +163,43 @@ class Simulator:
 
 
 def _drawn(fitted: FloatArray, precision: FloatArray, generator: np.random.Generator) -> FloatArray:
-    """Return draws (K,) of the priors of scaled unknowns.
+    """Draw scaled unknowns (K,) from their priors; those without a prior keep their fitted values.
 
-    Fitted values of those without a prior.
+    Parameters
+    ----------
+    fitted : (K,) ndarray
+        Fitted values, in prior standard deviations.
+    precision : (K,) ndarray
+        Prior precision of each unknown; zero without a prior.
+    generator : Generator
+        Source of the draws.
     """
     draws = generator.standard_normal(len(fitted))
     return np.where(precision > 0.0, draws, fitted)
 
 
 def _noise(model: NoiseModel, trial: Trial, generator: np.random.Generator) -> FloatArray:
-    """Return noise (N,) of one channel in a trial [channel's unit], coloured as its record is."""
+    """Draw noise (N,) of one channel in a trial, with the autocorrelation of its noise record.
+
+    Parameters
+    ----------
+    model : NoiseModel
+        Noise of the channel.
+    trial : Trial
+        The trial of N rows.
+    generator : Generator
+        Source of the draws.
+
+    Returns
+    -------
+    (N,) ndarray
+        Noise [channel's unit].
+    """
     count = len(trial.time)
     if not trial.is_dynamic or not model.applies(trial.interval):
         return np.asarray(model.static_deviation * generator.standard_normal(count))
-    lead_in = 20 * len(model.autoregression)  # until the start is forgotten
+    # samples before the record, after which the filter has forgotten its zero initial state
+    lead_in = 20 * len(model.autoregression)
     white = model.standard_deviation * generator.standard_normal(lead_in + count)
     coloured = lfilter([1.0], np.r_[1.0, -model.autoregression], white)
     return np.asarray(coloured[lead_in:])

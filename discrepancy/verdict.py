@@ -43,19 +43,19 @@ class GapWindow:
     Attributes
     ----------
     trial : str
-        Whose record.
+        Name of the trial.
     channels : tuple of str
-        Those that show it.
+        Names of the channels that show the gap.
     begin, end : Moment or None
-        Since when, until when; None where it is there from the first sample on, or to the last.
+        Begin and end of the window; None if it begins with the first sample, or ends with the last.
     first, last : float
         Times of the first and the last sample of the record [s].
     size : float
-        Root mean square residual in it over the noise, of the channel with the largest. Where no
-        noise is recorded, over what the model as it was leaves in fitted trials, before and with
-        the effect.
+        Root mean square residual in the window over the noise, of the channel with the largest. For
+        a channel without a noise record, the residuals of the model without effects in the fitted
+        trials replace the noise, also if `with_effect` is true.
     with_effect : bool
-        Whether it is left by the best hypothesis; else by the model as it was.
+        True if the gap remains with the best hypothesis; False for the model without effects.
     """
 
     trial: str
@@ -94,7 +94,15 @@ class NamedEffect:
 
 
 def effect_label(identifier: str, place: str, *, free_shape: bool = False) -> str:
-    """Return an effect with its place, "coulomb_friction@slide", and a mark of a free shape."""
+    """Return the label of an effect at a place, such as "coulomb_friction@slide".
+
+    Parameters
+    ----------
+    identifier, place : str
+        Identifier of the effect and name of its place.
+    free_shape : bool
+        True to mark the effect as one of its family with a free shape.
+    """
     return f"{identifier}{FREE_SHAPE if free_shape else ''}@{place}"
 
 
@@ -115,15 +123,15 @@ class Hypothesis:
     Attributes
     ----------
     effects : tuple of NamedEffect
-        Empty for 'none'.
+        Effects of the hypothesis; empty for 'none', the model as it is.
     log_evidence : float
-        ln p(data | hypothesis), Laplace.
+        ln p(data | hypothesis) by Laplace's approximation [nat].
     probability : float
         Posterior probability among the hypotheses compared.
     chi_square, degrees_of_freedom : float
-        Of the fitted trials against the noise records.
+        Chi-squared of the fitted trials against the noise records, and its degrees of freedom.
     parameters : tuple of CalibratedParameter
-        Of the model, beside these effects.
+        Calibrated parameters of the model, fitted together with these effects.
     """
 
     effects: tuple[NamedEffect, ...]
@@ -155,13 +163,13 @@ class Gate:
     Attributes
     ----------
     name : str
-        Which.
+        Name of the gate.
     passed : bool or None
-        None: it could not be applied, `reason` says why.
+        True if the hypothesis passed; None if the gate could not be applied.
     statistic, limit : float
-        What was compared.
+        Statistic, and the limit that it was compared with.
     reason : str
-        One sentence.
+        The outcome, or why the gate could not be applied, in one sentence.
     """
 
     name: str
@@ -178,13 +186,13 @@ class RemainderEstimate:
     Attributes
     ----------
     channel : str
-        Which.
+        Name of the channel.
     size : float
-        Its standard deviation over that of the channel's noise.
+        Standard deviation of the remainder over that of the channel's noise.
     time : float
-        Time over which it forgets [s].
+        Correlation time of the remainder [s].
     frequency : float
-        At which it swings [Hz]; nought if it does not.
+        Frequency at which the remainder oscillates [Hz]; 0 if it does not.
     """
 
     channel: str
@@ -200,12 +208,12 @@ class ForceLeft:
     Attributes
     ----------
     left, whole : float
-        Root mean squares of the force beside the law and of the force without any effect, in its
-        unit.
+        Root mean square of the missing force that remains with the law, and of the missing force
+        without any effect [unit of the force].
     trials : int
-        How many.
+        Number of trials.
     tested : bool
-        Whether the law has a force there that could be seen.
+        Whether the law has a force in these trials that is large enough to be detected.
     """
 
     left: Number
@@ -232,29 +240,31 @@ class ForceAtPort:
     Attributes
     ----------
     port : str
-        Its name.
+        Name of the port.
     unit : str
-        Of the force: "N", "N m", or "N or N m" where the model does not say whether the port turns;
-        at a port of a state that of its flow.
+        Unit of the force: "N", "N m", or "N or N m" if the model does not say whether the port
+        translates or rotates. At a port of a state it is the unit of the flow.
     rms, displacement, speed : float
-        Root mean squares of the force, and of how far and how fast the port moves [m or rad, and
-        its rate]; of a port of a state of its integral, and of the state.
+        Root mean squares of the force, and of displacement and speed of the port [m or rad, and per
+        second]. At a port of a state, `displacement` is that of the state's integral, and `speed`
+        that of the state.
     largest : ForceMoment
-        Where the force is largest.
+        The moment at which the force is largest.
     evidence : mapping of str to float
-        By port: of a missing force there over none [nat].
+        Log evidence of a missing force at a port over that of none [nat], by the name of the port.
     correlation_time : float
-        Of the force [s].
+        Correlation time of the force [s].
     orders : mapping of str to float
-        Share of the force's variance that its mean at like displacement, velocity, amplitude or
-        time is.
+        Fraction of the force's variance that is explained by its mean at equal displacement,
+        velocity, amplitude or time, by the name of that variable.
     ordered_by : tuple of str
-        Those that order it, as well as the best one does; empty where none does.
+        Variables that explain the force about as well as the best one; empty if none explains it.
     law : str
-        What was drawn through it, with their places where laws act at several ports; empty:
-        nothing.
+        Law that was fitted to the force, with places if laws act at several ports; empty if none
+        was.
     fitted, held_out : ForceLeft or None
-        What the law leaves of the force, of those at all ports where laws act at several.
+        What remains of the force with the law, in fitted and in held-out trials; if laws act at
+        several ports, of the forces at all of them.
     """
 
     port: str
@@ -293,16 +303,16 @@ class MovedUnknown:
     Attributes
     ----------
     name : str
-        Of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT in
-        TRIAL".
+        Name of the parameter, or "gain of CHANNEL", "zero of CHANNEL in TRIAL", "constant of INPUT
+        in TRIAL".
     stated, deviation : float
-        What is stated of it, and its standard deviation [`unit`].
+        Stated value and its standard deviation [`unit`].
     value : float
-        What the fit without any effect makes of it.
+        Value in the fit without any effect [`unit`].
     deviations : float
-        By how many standard deviations it is moved.
+        Distance of the two in standard deviations.
     unit : str
-        SI; gains are errors of the gain [1].
+        Unit in SI; for a gain it is "1", and the values are relative errors of the gain.
     """
 
     name: str
@@ -339,52 +349,53 @@ class Verdict:
     Attributes
     ----------
     kind : VerdictKind
-        What is concluded.
+        Kind of the conclusion.
     sentence : str
-        It in one sentence.
+        The conclusion in one sentence.
     probability : float
-        Among the hypotheses compared: of the named set with all that hold it, of the group
-        together, of 'none' (nothing missing), of the candidates with 'none' (below detectability).
-        Of a family: of it and its members; where only the shape gate found it, of its member. Of an
-        unexplained gap nothing.
+        Posterior probability of the conclusion among the hypotheses compared: of all sets that
+        contain the named one, of all members of the group, of 'none' (nothing missing), or of the
+        candidates together with 'none' (below detectability). For a family it is that of the family
+        and its members, or that of the member if only the shape gate found the family. It is nan
+        for an unexplained gap.
     log_bayes_factor : float
-        ln of evidence of the best hypothesis over that of 'none'.
+        Log evidence of the best hypothesis over that of 'none' [nat].
     effects : tuple of NamedEffect
-        The set that is named; members of the group where a group is; the shape's nearest where a
-        family is.
+        The named set of effects; for a group its members; for a family the member of the nearest
+        shape.
     group : tuple of str
-        Identifiers that these data cannot separate.
+        Identifiers of effects that these data cannot separate.
     family : str
-        Where the verdict is a family.
+        Name of the family, if the verdict is a family; else empty.
     gates : tuple of Gate
-        Absolute fit and shape.
+        Outcomes of the gates of absolute fit and shape.
     hypotheses : tuple of Hypothesis
-        Compared, most probable first.
+        Hypotheses that were compared, the most probable first.
     inclusion : mapping of str to float
         Probability that an effect is in the set, by identifier.
     next_experiments : tuple of Experiment
-        Best first; empty where nothing is open.
+        Proposed experiments, the best first; empty if no question is open.
     remarks : tuple of str
-        Limits and data errors, one sentence each.
+        Limits of the conclusion and faults of the data, one sentence each.
     resembles : tuple of str
-        What an unexplained rest looks like; never a name.
+        Effects that an unexplained remainder resembles; these are not names.
     remainders : tuple of RemainderEstimate
-        Of the best hypothesis.
+        Remainders of the channels in the best hypothesis.
     not_fitted : tuple of NotFitted
-        Effects of the catalogue that were not.
+        Effects of the catalogue that were not fitted.
     windows : tuple of GapWindow
-        Since when and until when there is a gap in each record: of the model as it was, and of what
-        the best hypothesis leaves.
+        Windows in time with a gap in each record, for the model without effects and for the best
+        hypothesis.
     parameters : tuple of CalibratedParameter
-        Of the model, in the hypothesis that stands for the verdict.
+        Parameters of the model in the hypothesis that stands for the verdict.
     force : ForceAtPort or None
-        That is missing; None where none is, or none can be seen.
+        The missing force; None if no force is missing, or none can be determined.
     unfitted : tuple of UnfittedRecord
-        Records that the hypothesis of the verdict leaves more of than their own variance: it is not
-        fitted.
+        Records whose residuals in the hypothesis of the verdict have a larger variance than the
+        readings themselves.
     moved : tuple of MovedUnknown
-        Parameters, gains and zeros that the model without any effect moves by more than two of
-        their stated deviations, the farthest first.
+        Parameters, gains and zeros that the fit without any effect moves by more than two of their
+        stated standard deviations, the farthest first.
     """
 
     kind: VerdictKind

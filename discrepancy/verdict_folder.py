@@ -1,6 +1,6 @@
-"""The folder that an investigation leaves: verdict, patch, residuals, figures, report.
+"""The folder with the results of an investigation: verdict, patch, residuals, figures, report.
 
-Whole or not.
+It is written completely or not at all.
 """
 
 from dataclasses import replace
@@ -27,15 +27,22 @@ FIGURES = "figures"
 
 
 def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
-    """Look at the place before the work begins.
+    """Check that the folder of a verdict can be written, before the work begins.
 
-    A verdict that a killed process had moved aside comes back.
+    A verdict that a killed process had moved aside is restored first.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder that is to be written.
+    replace_it : bool
+        True if a verdict in it may be replaced.
 
     Raises
     ------
     FileNotWrittenError
-        If it is no folder, holds something else than a verdict, or a verdict that is not to be
-        replaced.
+        If the path is not a folder, or if the folder contains other files than a verdict, or a
+        verdict that must not be replaced.
     """
     restore_folder(folder)
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
@@ -59,29 +66,32 @@ def check_verdict_folder(folder: Path, *, replace_it: bool) -> None:
 def write_verdict_folder(
     folder: Path, content: ReportInput, *, replace_it: bool = False, report: bool = True
 ) -> Path:
-    """Write everything beside the folder first, and move it into place when it is complete.
+    """Write the results of an investigation into a folder.
+
+    All files are first written into a temporary folder next to it, which is renamed when it is
+    complete.
 
     Parameters
     ----------
     folder : Path
-        Where; an empty folder is as good as none.
+        The folder to write; it may exist if it is empty.
     content : ReportInput
-        What is written.
+        The investigation and its origin.
     replace_it : bool
-        Put it in the place of an existing folder of a verdict. Anything else is never replaced.
+        True to replace a verdict in the folder. Other files are never replaced.
     report : bool
-        Draw the page and its figures.
+        True to write the report page and its figures.
 
     Returns
     -------
     Path
-        Of the report, or of the folder where there is none.
+        Path of the report, or of the folder if no report is written.
 
     Raises
     ------
     FileNotWrittenError
-        As `check_verdict_folder`, or if the disk is full or the place not writable; the folder is
-        as it was.
+        For the causes of `check_verdict_folder`, or if the disk is full or not writable. The folder
+        is then unchanged.
     """
     check_verdict_folder(folder, replace_it=replace_it)
     with whole_folder(folder) as fresh:
@@ -118,7 +128,13 @@ def _write(folder: Path, content: ReportInput, *, report: bool) -> None:
 
 
 def _with_patch_files(folder: Path, content: ReportInput) -> ReportInput:
-    """Write patch and FMU of a verdict that has them, and return the input with their entries."""
+    """Write the patch and the FMU of a verdict, if it has them.
+
+    Returns
+    -------
+    ReportInput
+        The content with the intervals of the patch and the remark on the FMU added.
+    """
     investigation = content.investigation
     problem = investigation.problem
     fit = investigation.fit

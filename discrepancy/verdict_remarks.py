@@ -14,14 +14,15 @@ from discrepancy.verdict import NotFitted
 from reporting.words import listing
 
 IMPLAUSIBLE = 4.0
-"""Prior deviations from which on a parameter or a gain is remarked on."""
+"""Least distance from the prior mean, in prior deviations, of a parameter that is remarked on."""
 
 
 def strained(problem: Problem, fit: CandidateFit) -> list[str]:
-    """Return a remark on each calibrated parameter and gain that a fit takes far from its prior.
+    """Return a remark on each calibrated parameter and gain that a fit moves far from its prior.
 
-    What an implausible nuisance explains leaves no residual. The absolute gate judges all gains
-    together, and all parameters.
+    A gap that an implausible value of such a nuisance explains leaves no residual, so that only
+    this remark shows it. The gate of absolute fit judges all gains together and all parameters
+    together, not each of them.
     """
     names = [f"The parameter {parameter.name!r}" for parameter in problem.model.parameters]
     names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]
@@ -40,7 +41,7 @@ def strained(problem: Problem, fit: CandidateFit) -> list[str]:
 def without_port(setting: Setting, effects: Sequence[Effect]) -> list[str]:
     """Return the remark on effects that were not tested because the model has no port.
 
-    Else nothing.
+    The list is empty if there is no such effect.
     """
     names = [effect.name for effect in effects if NO_PORT in (effect.unavailable(setting) or "")]
     if not names:

@@ -1,4 +1,4 @@
-"""What an interrupted search has found: `verdict_so_far.json` in the folder of the verdict."""
+"""Results of an interrupted search: `verdict_so_far.json` in the folder of the verdict."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ class VerdictSoFar:
     Attributes
     ----------
     remark : str
-        What these figures are not.
+        Limits of these figures, which are not those of a finished search.
     hypotheses : tuple of Hypothesis
         As in verdict.json, the most probable first; one without effects is the model as it is.
     origin : Origin
@@ -58,9 +58,9 @@ class SearchInProgress:
         self.search = search
 
     def hypotheses(self) -> tuple[Hypothesis, ...]:
-        """Return what the latest search has fitted, the most probable first.
+        """Return the hypotheses that the latest search has fitted, the most probable first.
 
-        Nothing before it has begun.
+        At most `MOST_HYPOTHESES` are returned, and none before a search has begun.
         """
         if self.search is None:
             return ()
@@ -72,9 +72,9 @@ class SearchInProgress:
 
 
 def write_so_far(folder: Path, hypotheses: Sequence[Hypothesis], origin: Origin) -> Path | None:
-    """Write what was found into the folder of the verdict, which is made.
+    """Write the hypotheses of an interrupted search to `verdict_so_far.json`.
 
-    None where nothing was found yet.
+    The folder is created if necessary. Without hypotheses nothing is written and None is returned.
 
     Raises
     ------

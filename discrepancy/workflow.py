@@ -57,29 +57,31 @@ CLOSED_KINDS = (VerdictKind.NOTHING_MISSING, VerdictKind.NAMED, VerdictKind.DATA
 
 @dataclass(frozen=True)
 class Investigation:
-    """All that came out.
+    """Results of an investigation.
 
     Attributes
     ----------
     campaign : Campaign
-        As used: outliers marked, held-out trials chosen.
+        The campaign as it was used, with outliers marked and held-out trials chosen.
     model : Model
-        The model as it was.
+        The model without effects.
     faults : tuple of DataFault
-        What is wrong with the data.
+        Faults of the data.
     verdict : Verdict
         The conclusion.
     location : Location or None
-        Where model and data disagree, before anything is added.
+        Where model and data disagree before an effect is added.
     missing : MissingForce or None
-        The force that the model lacks at a port; None where there is none, or none can be seen.
+        The force that the model lacks at a port; None if no force is missing, or none can be
+        determined.
     proof : Proof or None
-        Where an effect was named, or is the most probable one.
+        Proof of the effects that are named or most probable; None without effects.
     before, after : ResidualSet or None
-        Residuals without and with it, over the same noise; None where faults of the data stopped
-        the work.
+        Residuals without and with these effects, over the same noise; None if faults of the data
+        stopped the work.
     problem, search, fit : Problem, Search, CandidateFit or None
-        What the naming side worked with; `fit` stands for the verdict.
+        The problem that was solved, the search for effects, and the fit that stands for the
+        verdict.
     seconds : dict of str to float
         Wall time by stage.
     """
@@ -112,15 +114,15 @@ def investigate(
     progress: Progress | None = None,
     on_search: OnSearch = ignore_search,
 ) -> Investigation:
-    """Return what a model lacks beside measured data: the verdict, its evidence and its proof.
+    """Find what a model lacks in comparison with measured data, and prove it on held-out trials.
 
     Parameters
     ----------
     campaign : Campaign or path
         Measured data: a campaign, its folder, or the folder of a mission whose flight is meant.
     model : Model or path, optional
-        The model that is to explain them, as `load_model` takes it: that of the mission's twin if
-        left out beside a mission, else the shipped wing.
+        The model that is compared with the data, as `load_model` takes it. The default is the model
+        of the twin if `campaign` is a mission, else the shipped wing.
     effects : sequence of Effect, optional
         The catalogue; by default the shipped one with the user's installed entries.
     seed : int
@@ -244,7 +246,7 @@ def _remarks(
     search: Search,
     fit: CandidateFit,
 ) -> list[str]:
-    """Return the remarks that belong to a verdict, beside those on its residuals."""
+    """Return the remarks on a verdict, without those on its residuals."""
     remarks = [*problem.campaign.remarks]
     remarks += strained(problem, fit)
     remarks += without_port(problem.setting, catalogue)
@@ -313,9 +315,10 @@ def checked(
 
 
 def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
-    """Return the problem of a campaign and a model, without wrong readings at the ends of records.
+    """Return the problem of a campaign and a model, with wrong readings at record ends left out.
 
-    The model need not fit; `outliers.wrong_ends` states the rule.
+    The model need not describe the data well; `outliers.wrong_ends` states the rule. Each such
+    reading is reported by a remark.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     from_start = fit_to(problem, Candidate(), problem.start(Candidate()))
@@ -330,7 +333,8 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             trial = trials[data.trial.name]
             if not trial.is_dynamic:
                 continue
-            # residuals are in standard deviations of the noise, where it is known
+            # Residuals are in units of the noise, whose deviation is thus 1. Without a noise record
+            # it counts as not known, which is 0 here.
             has_noise = [campaign.channels[name].noise is not None for name in trial.channels]
             noise = np.array(has_noise, dtype=float)
             is_wrong = wrong_ends(residual, data.weight > 0.0, noise)
@@ -367,7 +371,8 @@ def patch_draws(
 ) -> list[list[ModelPatch]]:
     """Return the patches of each effect of a fit at draws of its posterior.
 
-    Draws are those of the fit if it has some, and Gaussian ones otherwise.
+    They are drawn from the posterior draws of the fit if it has some, else from the Gaussian
+    approximation.
 
     Parameters
     ----------
@@ -379,12 +384,19 @@ def patch_draws(
         Seed of the draws.
     count : int
         Number of draws.
+
+    Returns
+    -------
+    list of list of ModelPatch
+        For each effect, its patch at each draw.
     """
     generator = np.random.default_rng(seed)
     if fit.draws is not None:
         draws = generator.choice(fit.draws, count)
     else:
         size = fit.candidate.size
+        # covariance = L L^T, so that L times a standard normal vector has this covariance; the
+        # diagonal is raised slightly, in case the matrix is singular to rounding
         factor = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))
         draws = fit.point.effect + generator.standard_normal((count, size)) @ factor.T
     patches_of_draws = [fit.candidate.patches(problem.setting, draw) for draw in draws]

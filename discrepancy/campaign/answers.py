@@ -38,7 +38,10 @@ class Questionnaire:
         self.assumptions: dict[tuple[str, str], dict[str, str]] = {}
 
     def stated(self, option: str, subject: str) -> str | None:
-        """Return the answer about just this subject, without asking; None if there is none."""
+        """Return the answer about exactly this subject; None if there is none.
+
+        The question is not noted as open.
+        """
         return self.answers.get(option, {}).get(subject)
 
     def ask(self, option: str, subject: str, expected: str, choices: Collection[str] = ()) -> str:

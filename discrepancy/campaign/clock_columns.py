@@ -21,8 +21,8 @@ class TableClock(NamedTuple):
 def own_clocks(columns: Sequence[LaboratoryColumn]) -> tuple[TableClock, ...]:
     """Return the clocks of a table with several columns of times, and the columns that each stamps.
 
-    Names decide, as in `acc2` and `time2`, or positions: each column of times stands before the
-    columns that it stamps, or each stands after them.
+    Either the names show it, as in `acc2` and `time2`, or the positions: every column of times
+    comes before the columns that it stamps, or every one comes after them.
 
     Parameters
     ----------

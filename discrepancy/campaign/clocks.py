@@ -1,8 +1,10 @@
 """Tables with several columns of times, put on one clock.
 
-A campaign's trial has one column of times. Its stamps are those of all clocks: each reading stays
-at its own time, and where a channel has none its cell is empty. Only what must be known at each
-stamp, a load or a temperature, is filled in, by what the campaign says it does between its samples.
+A laboratory's table may have several clocks: columns of times, each for some of the other columns.
+A trial of a campaign has only one. Its times are the times of all clocks together. Each reading
+stays at its own time, and a channel's cell is empty at the times of other clocks. Only a load or a
+temperature must be known at all times. It is interpolated as the campaign states for the course
+between its samples (`hold`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -57,7 +59,7 @@ class _ClockTimes:
 def on_one_clock(
     clocks: Sequence[TableClock], kind: str, decimal: str, holds: Mapping[str, str | None]
 ) -> OneClock:
-    """Return the columns of a table in SI, with the stamps of all its clocks as one clock.
+    """Merge the clocks of a table into one, and return its columns in SI.
 
     Parameters
     ----------
@@ -156,13 +158,16 @@ def _file(clocks: Sequence[TableClock]) -> str:
 
 
 def _must_be_known_throughout(column: LaboratoryColumn, kind: str) -> bool:
-    """Return whether a trial needs a value of a column at each stamp: a load or a temperature."""
+    """Return whether a trial needs a column's value at each time: a load or a temperature."""
     is_force = column.role == "force" and kind == TrialKind.FORCED
     return is_force or INPUT in column.role or column.role == "temperature"
 
 
 def _hold(column: LaboratoryColumn, holds: Mapping[str, str | None]) -> Hold:
-    """Return the course of a load between its samples; motions are smooth."""
+    """Return the course of a load between its samples: smooth for a motion, else as stated.
+
+    It is linear if it is not stated.
+    """
     if column.quantity is not None and column.quantity.moving:
         return Hold.SMOOTH
     return Hold(holds.get(column.head) or Hold.LINEAR)
@@ -209,7 +214,10 @@ def _lines(
 def _rest_samples_in_order(
     clocks: Sequence[TableClock], times: Sequence[_ClockTimes], decimal: str
 ) -> OneClock:
-    """Return samples at rest of several clocks side by side: only their interval matters.
+    """Return samples at rest of several clocks in the order of their samples.
+
+    The k-th samples of all clocks share a row, although their times differ. Only the sampling
+    interval of a noise record matters.
 
     Raises
     ------
@@ -246,7 +254,7 @@ def _rest_samples_in_order(
 
 
 def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
-    """Return the times of a clock; those that are even to their printed digits lie on an even grid.
+    """Return the times of a clock, evenly spaced if they are so up to the rounding in print.
 
     Raises
     ------
@@ -277,9 +285,10 @@ def _clock_times(clock: TableClock, decimal: str) -> _ClockTimes:
 
 
 def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[int]]]:
-    """Return the times of all clocks in one order.
+    """Merge the times of all clocks into one increasing sequence.
 
-    Times of two clocks that differ by less than a thousandth of the shortest interval become one.
+    Times of two clocks that differ by less than a thousandth of the shortest median interval are
+    taken as equal.
 
     Parameters
     ----------
@@ -289,9 +298,9 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
     Returns
     -------
     seconds : (N,) ndarray
-        The common times [s].
+        Times of all clocks [s], increasing.
     positions : list of list of int
-        Positions of the times of each clock among them.
+        For each clock, the indices of its times in `seconds`.
     """
     steps = [
         float(np.median(np.diff(own_times.seconds)))
@@ -299,30 +308,32 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
         if len(own_times.seconds) > 1
     ]
     tolerance = EVEN * min(steps, default=0.0)
-    moments = np.concatenate([own_times.seconds for own_times in times])
+    all_times = np.concatenate([own_times.seconds for own_times in times])
     counts = [len(own_times.seconds) for own_times in times]
     clock_numbers = np.repeat(np.arange(len(times)), counts)
-    order = np.lexsort((clock_numbers, moments))
+    order = np.lexsort((clock_numbers, all_times))
 
     positions: list[list[int]] = [[] for _ in times]
     seconds: list[float] = []
-    clocks_at_last: set[int] = set()  # clocks that have the last of the common times
-    for moment, clock in zip(moments[order].tolist(), clock_numbers[order].tolist(), strict=True):
-        is_new = not seconds or moment - seconds[-1] > tolerance
-        if is_new or clock in clocks_at_last:
-            seconds.append(moment)
-            clocks_at_last = set()
-        clocks_at_last.add(clock)
-        positions[clock].append(len(seconds) - 1)
+    clocks_at_last_time: set[int] = set()  # clocks that have the last of the common times
+    for time, clock_number in zip(
+        all_times[order].tolist(), clock_numbers[order].tolist(), strict=True
+    ):
+        is_new = not seconds or time - seconds[-1] > tolerance
+        if is_new or clock_number in clocks_at_last_time:
+            seconds.append(time)
+            clocks_at_last_time = set()
+        clocks_at_last_time.add(clock_number)
+        positions[clock_number].append(len(seconds) - 1)
     return np.array(seconds), positions
 
 
 def _fill_between_samples(
     cells: list[str], seconds: FloatArray, positions: Sequence[int], hold: Hold
 ) -> None:
-    """Write the values of a load between its samples into its empty cells.
+    """Interpolate a load between its samples into its empty cells.
 
-    A load with an empty sample, or with a single one, stays as it is.
+    A load with an empty cell at one of its own samples, or with a single sample, is not changed.
 
     Parameters
     ----------
@@ -331,9 +342,9 @@ def _fill_between_samples(
     seconds : (N,) ndarray
         Times of all cells [s].
     positions : sequence of int
-        Positions of the load's own samples.
+        Indices of the load's own samples among the cells.
     hold : Hold
-        Course between the samples.
+        Course between the samples, by which the load is interpolated.
     """
     if len(positions) < 2 or not all(cells[position] for position in positions):
         return
@@ -353,7 +364,7 @@ def _fill_between_samples(
 
 
 def _who_is_stamped(clocks: Sequence[TableClock]) -> str:
-    """Return which columns have which column of times, as the begin of a remark."""
+    """Return the beginning of a remark: which columns are stamped by which column of times."""
     phrases = []
     for clock in clocks:
         heads = listing(repr(column.head) for column in clock.columns)

@@ -37,7 +37,7 @@ OutputQuantity = Callable[[str], Quantity | None]
 
 
 class ColumnReader:
-    """Finds out what the columns of tables are, and asks the user where that is not clear.
+    """Determines role, unit and quantity of columns, and asks the user if they are not clear.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class ColumnReader:
     def _channel_or_input(self, sheet: Sheet, head: str, role: str, unit: str) -> LaboratoryColumn:
         """Return a column that is a channel or an input.
 
-        Without a quantity while that is not known.
+        Its quantity is None while it is not known.
         """
         quantity = self._quantity(head, role, unit)
         if quantity is None:

@@ -103,26 +103,31 @@ class LaboratoryColumn:
 def role_by_unit(
     head: str, heads: Sequence[str], units: Sequence[str], roles: Collection[str]
 ) -> str:
-    """Return the role "time" or "force" of a column if the units of its table are clear, else "".
+    """Return the role of a column, "time" or "force", if its unit alone determines it.
+
+    A column is a time if `times_among` finds it among the times of the table, of which there may be
+    several. Otherwise its unit determines a role only if no other column of the table has a unit of
+    the same role, and if `roles` allows it. The result is an empty text if it determines none.
 
     Parameters
     ----------
     head : str
         Name of the column.
     heads, units : sequence of str
-        Names and units of all columns of the table.
+        Names and units of all columns of the table; a unit is empty if it is not known.
     roles : collection of str
-        Roles that the unit may decide.
+        Roles that a unit may determine. It lacks "force" for trials that do not read a column
+        `force`, in which a column in newtons may be a channel.
     """
     if head in times_among(heads, units):
         return "time"
     roles_of_units = [load_or_time(unit) for unit in units]
-    role = roles_of_units[heads.index(head)]
-    return role if role in roles and roles_of_units.count(role) == 1 else ""
+    role_of_unit = roles_of_units[heads.index(head)]
+    return role_of_unit if role_of_unit in roles and roles_of_units.count(role_of_unit) == 1 else ""
 
 
 def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
-    """Return what the option `--scale` makes of a column's unit.
+    """Interpret the option `--scale` of a column: a factor from its cells to its readings.
 
     Parameters
     ----------
@@ -267,9 +272,12 @@ def possible_quantities(unit: str, answer: str | None) -> tuple[Quantity, ...]:
 
 
 def sampling_interval(answer: str) -> float:
-    """Return the option `--interval` [s].
+    """Return the sampling interval [s] of the option `--interval`.
 
-    Raise CampaignFileError if it is not a positive number.
+    Raises
+    ------
+    CampaignFileError
+        If the option is not a positive number of seconds.
     """
     amount = AMOUNT.fullmatch(answer)
     if amount is None or amount[2] not in ("", "s") or not 0.0 < float(amount[1]) < np.inf:
@@ -280,7 +288,7 @@ def sampling_interval(answer: str) -> float:
 
 
 def release_in_si(answer: str) -> dict[str, Any]:
-    """Return the option `--release` as the table `release` of a trial: how far a point was held.
+    """Return the table `release` of a trial from the option `--release`, a displacement with unit.
 
     Raises
     ------
@@ -303,9 +311,9 @@ def release_in_si(answer: str) -> dict[str, Any]:
 
 
 def units_read(columns: Iterable[LaboratoryColumn], kinds: Mapping[str, str]) -> dict[str, str]:
-    """Return the unit in which each channel, input and force was read.
+    """Return the unit in which each channel, input and force was read, by its name.
 
-    If there are several, the first.
+    If tables have several units for one, it is that of the first table.
 
     Parameters
     ----------
@@ -338,12 +346,16 @@ def origin_of(sheet: Sheet, used: Sequence[LaboratoryColumn], scales: Mapping[st
         The options `--scale` by the head of their column.
     """
     phrases = []
-    empty = 0
+    empty_cell_count = 0
     for column in used:
         scale = f" times {scales[column.head]}" if column.head in scales else ""
         phrases.append(f"{column.head!r} [{column.unit}]{scale} is {column.role}")
-        empty += sheet.columns[sheet.heads.index(column.head)].count("")
-    empty_cells = f"; {counted(empty, 'cell')} {is_or_are(empty)} empty" if empty else ""
+        empty_cell_count += sheet.columns[sheet.heads.index(column.head)].count("")
+    empty_cells = (
+        f"; {counted(empty_cell_count, 'cell')} {is_or_are(empty_cell_count)} empty"
+        if empty_cell_count
+        else ""
+    )
     return (
         f"Imported from {sheet.name} (SHA-256 {sheet.digest}), {sheet.remark}: "
         f"{listing(phrases)}{empty_cells}."

@@ -62,8 +62,9 @@ def load_or_time(unit: str) -> str:
 def times_among(heads: Sequence[str], units: Sequence[str]) -> tuple[str, ...]:
     """Return the heads of the columns of times of a table.
 
-    There may be one, or several with similar names such as `time1` and `time2`. If several have no
-    word in common the result is empty: one may be a delay, or another clock of the same rows.
+    There may be one, or several with a common word in their names, such as `time1` and `time2`. If
+    several have no word in common the result is empty, because one of them may be a delay, or
+    another clock of the same rows.
 
     Parameters
     ----------

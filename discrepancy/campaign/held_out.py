@@ -10,9 +10,9 @@ from discrepancy.campaign.records import Campaign, Trial, TrialKind
 SHARE = 0.25
 """Fraction of the trials of a kind that is held out."""
 LEAST_TRIALS = 3
-"""Fewest trials of a kind of which one can be spared."""
+"""Fewest trials of a kind from which one may be held out."""
 LEAST_LEVELS = 6
-"""Fewest load levels of a trial of which some can be spared."""
+"""Fewest load levels of a trial from which some may be held out."""
 
 
 def choose_held_out(campaign: Campaign) -> Campaign:
@@ -25,7 +25,7 @@ def choose_held_out(campaign: Campaign) -> Campaign:
        the extreme levels come first, from the middle outwards, because a model is to be proved
        between levels and not beyond them; of equal levels the later trial comes first. A trial is
        held out only if its channels, its run and its load place still occur in the trials that
-       remain.
+       remain for the fit.
     2. If that holds out no static or flight trial, every third interior load level of each such
        trial with at least six levels is held out as a trial of its own. The load must rise or fall
        throughout, because a load cycle has to stay whole.
@@ -71,7 +71,10 @@ def _remark(trials: Sequence[Trial]) -> str:
 
 
 def _spared_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[str]) -> set[str]:
-    """Return the names of the trials of one kind that can be held out.
+    """Choose the trials of one kind to hold out, and return their names.
+
+    At most a quarter are chosen, in the order of `_order_of_candidates`, and only trials whose
+    channels, run and load place still occur in trials that remain for the fit.
 
     Parameters
     ----------
@@ -102,7 +105,10 @@ def _spared_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[st
 
 
 def _order_of_candidates(trials: Sequence[Trial]) -> list[int]:
-    """Return the indices of trials in the order in which they are tried as held out."""
+    """Return the indices of trials in the order in which they are considered for holding out.
+
+    Levels between the extremes come first, from the middle outwards; of equal ones, later trials.
+    """
     levels = np.array([trial.level for trial in trials])
     lowest = levels.min()
     highest = levels.max()
@@ -110,7 +116,7 @@ def _order_of_candidates(trials: Sequence[Trial]) -> list[int]:
     is_inside = (levels > lowest) & (levels < highest)
 
     def priority(index: int) -> tuple[bool, float, int]:
-        # inside the range first, then by distance from its middle, then the later trial
+        # sorted ascending: False (inside the range) comes before True, a later trial has a lower -i
         return not is_inside[index], float(abs(levels[index] - middle)), -index
 
     return sorted(range(len(trials)), key=priority)
@@ -145,20 +151,20 @@ def _stays_covered(
 
 
 def _split_by_levels(trial: Trial, names: Set[str]) -> tuple[Trial, Trial] | None:
-    """Return a trial in two: without every third interior load level, and those levels held out.
+    """Split a trial into a fitted trial and a held-out trial of every third interior load level.
 
     Parameters
     ----------
     trial : Trial
         A static or flight trial.
     names : set of str
-        Names that the trial of the held-out levels must not have.
+        Names of the existing trials, which the new held-out trial must not have.
 
     Returns
     -------
     (Trial, Trial) or None
-        The trial to fit and the trial held out; None with too few levels, or with a load that
-        turns.
+        The trial to fit and the trial held out. None if the trial has fewer than `LEAST_LEVELS`
+        load levels, or if its load does not only rise or only fall: a load cycle has to stay whole.
     """
     load = trial.load
     steps = np.diff(load)
@@ -166,6 +172,7 @@ def _split_by_levels(trial: Trial, names: Set[str]) -> tuple[Trial, Trial] | Non
     is_monotonic = np.all(steps >= 0.0) or np.all(steps <= 0.0)
     if len(levels) < LEAST_LEVELS or not is_monotonic:
         return None
+    # from the third level on; the lowest and the highest stay in the fit and bound its range
     is_held_out = np.isin(load, levels[2:-1:3])
     name = f"{trial.name}, levels held out"
     while name in names:

@@ -40,10 +40,10 @@ _NOT_TITLE = re.compile(r".*\.xls[mx]#|\.[^.]*$")
 
 
 class LaboratoryImport:
-    """What is known of a laboratory's files, from the files and from the answers of a user.
+    """The import of a laboratory's files: what the files and the user's answers say about them.
 
-    Whoever writes a campaign from such files first makes this, answers its open questions
-    (`with_answer`), and then takes the `campaign`.
+    To make a campaign from such files, create this object, answer its open `questions` by
+    `with_answer`, which returns a new object, and then call `campaign`.
 
     Parameters
     ----------
@@ -122,7 +122,17 @@ class LaboratoryImport:
         return self._deviations.assumed
 
     def with_answer(self, option: str, subject: str, answer: str) -> "LaboratoryImport":
-        """Return what is known once a question about a column or file is answered."""
+        """Return the import with one more answer.
+
+        Parameters
+        ----------
+        option : str
+            Option that is answered, without dashes.
+        subject : str
+            Column or file that the answer is about.
+        answer : str
+            The answer.
+        """
         of_option = {**self.answers.get(option, {}), subject: answer}
         return LaboratoryImport(self.sheets, {**self.answers, option: of_option}, self._quantity_of)
 
@@ -217,9 +227,9 @@ class LaboratoryImport:
     # ---------------------------------------------------------------- loads
 
     def _is_sampled_load(self, column: LaboratoryColumn) -> bool:
-        """Return whether a column is a load whose course between samples matters.
+        """Return whether a column is a load whose course between samples must be stated.
 
-        Motions are smooth.
+        Motions are always smooth.
         """
         if self.kinds[column.sheet.name] == TrialKind.FORCED:
             return column.role == "force"
@@ -266,7 +276,7 @@ class LaboratoryImport:
         tables = {sheet.name: self._text_table(sheet) for sheet in self.sheets}
         origin = hash_record([sheet.digest for sheet in self.sheets])
         section = parse_campaign(content, listing(tables))
-        # the remarks of reading are left out: whoever reads the written campaign makes them anew
+        # remarks of the reader are left out, because reading the written campaign makes them again
         return replace(assemble(section, tables, origin), remarks=section.remarks)
 
     def _column_tables(self, *, are_inputs: bool) -> list[dict[str, Any]]:
@@ -294,7 +304,7 @@ class LaboratoryImport:
         return [*tables.values()]
 
     def _further_keys(self, column: LaboratoryColumn) -> dict[str, Any]:
-        """Return what the table of a channel or input states beside its name, quantity and unit."""
+        """Return the keys of a channel's or input's table other than name, quantity and unit."""
         keys: dict[str, Any] = {}
         if column.is_channel:
             keys["output"] = column.role
@@ -307,7 +317,7 @@ class LaboratoryImport:
     def units(self) -> dict[str, str]:
         """Return the unit in which each channel, input and force was read.
 
-        If several, the first.
+        If files have several units for one, it is that of the first file.
         """
         return units_read(self.columns, self.kinds)
 

@@ -41,10 +41,10 @@ class MatlabTable(NamedTuple):
 
 
 def read_matlab(path: Path) -> MatlabTable:
-    """Return the table in a MATLAB file of version 4 to 7.3.
+    """Read the table in a MATLAB file of version 4 to 7.3.
 
-    Its columns are vectors, the columns of matrices with at most 32 of them, and the same in the
-    fields of a struct. They have one length, or several if each length has a column of times.
+    Its columns are the vectors, the columns of matrices with at most 32 columns, and the same in
+    the fields of structs. All have one length, or several if each length has a column of times.
 
     Raises
     ------
@@ -171,10 +171,10 @@ def _columns(name: str, value: object) -> dict[str, np.ndarray]:
 
 
 def _columns_of_fitting_lengths(columns: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns that can stand in one table.
+    """Return the columns that belong in one table, by their lengths.
 
-    These are the columns of the length that holds most numbers. If columns of times have several
-    lengths, the columns of these lengths are in the table, too.
+    These are the columns of the length that contains most numbers in all. If columns of times have
+    several lengths, the columns of all these lengths belong to the table as well.
     """
     lengths = Counter(len(column) for column in columns.values())
     main_length = max(lengths, key=lambda length: (length * lengths[length], length))

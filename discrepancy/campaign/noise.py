@@ -53,7 +53,8 @@ class NoiseModel:
     static_deviation : float
         s0 of a single reading [channel's unit].
     degrees_of_freedom : float
-        n0; infinite where s0 is exact, zero where nothing is known.
+        n0, the degrees of freedom of the estimate s0; infinite if s0 is exact, zero if s0 is only a
+        stand-in because the channel has no noise record.
     autoregression : (p,) ndarray
         Coefficients a of e_t = x_t - sum_k a_k x_(t-k); empty for white noise.
     interval : float or None
@@ -70,20 +71,20 @@ class NoiseModel:
     lines: tuple[float, ...] = ()
 
     def whiten(self, columns: FloatArray, interval: float | None) -> FloatArray:
-        """Return columns of a dynamic record filtered so that this noise becomes white.
+        """Filter records so that noise with this autocorrelation becomes white noise.
 
         Parameters
         ----------
         columns : (..., N) ndarray
-            Residuals or derivatives, samples along the last axis.
+            Residuals of a dynamic trial, or their derivatives; samples along the last axis.
         interval : float or None
-            Their sampling interval [s]; at another one than that of the noise record nothing is
-            filtered.
+            Sampling interval of the records [s]; None if they are unevenly sampled. If it differs
+            from the interval of the noise record, the records are returned unchanged.
 
         Returns
         -------
         (..., N) ndarray
-            The filtered columns.
+            The filtered records.
         """
         if not self.applies(interval):
             return columns
@@ -98,12 +99,15 @@ class NoiseModel:
     def _start_up_weights(self) -> tuple[FloatArray, ...]:
         """Weights (t + 1,) of samples 0 .. t that whiten sample t, for t below the order p.
 
-        The first p samples have fewer than p predecessors. The Levinson-Durbin recursion backwards
-        gives their best predictors from the autoregression.
+        The first p samples have fewer than p predecessors. Their best linear predictors come from
+        the Levinson-Durbin recursion, run from order p down to order 0. Each weight vector ends
+        with the sample itself, and is scaled so that the prediction error has the variance of the
+        innovation at order p.
         """
         weights: list[FloatArray] = []
         coefficients = self.autoregression
-        variance_ratio = 1.0  # of the innovation at full order to that of the prediction
+        # variance of the innovation at order p over that of the prediction error at this order
+        variance_ratio = 1.0
         while coefficients.size:
             reflection = coefficients[-1]
             variance_ratio *= 1.0 - reflection**2
@@ -114,9 +118,14 @@ class NoiseModel:
         return tuple(reversed(weights))
 
     def applies(self, interval: float | None) -> bool:
-        """Return whether the autoregression holds at a sampling interval [s].
+        """Return whether the autoregression can filter records of a sampling interval.
 
-        None: uneven samples.
+        An autoregression holds only at the interval of the record that it was fitted to.
+
+        Parameters
+        ----------
+        interval : float or None
+            Sampling interval of the records [s]; None if they are unevenly sampled.
         """
         if not self.autoregression.size or self.interval is None or interval is None:
             return False
@@ -129,7 +138,10 @@ class NoiseModel:
 
 
 def record_at_rest(channel: Channel) -> FloatArray | None:
-    """Return the samples at rest (n,) of a channel less their mean; None if too few for a test."""
+    """Return the noise record (n,) of a channel with its mean removed [channel's unit].
+
+    The result is None if the channel has no samples of noise, or fewer than `SHORTEST_SERIES`.
+    """
     record = channel.noise
     if record is None or record.samples is None or len(record.samples) < SHORTEST_SERIES:
         return None
@@ -139,7 +151,8 @@ def record_at_rest(channel: Channel) -> FloatArray | None:
 def whiteness_is_tested(channel: Channel) -> bool:
     """Return whether the residuals of a channel must be white for a fit to be consistent.
 
-    They must be if the noise record is white itself and holds no line, or is too short to say so.
+    They must be if the noise record passes the same tests of whiteness itself, or if there is no
+    record long enough to be tested. Residuals of a sensor with coloured noise cannot be white.
     The location of a discrepancy and the gate of absolute fit use this rule.
     """
     series = record_at_rest(channel)
@@ -156,14 +169,24 @@ def aliased(frequency: float, interval: float) -> float:
 
 
 def noise_model(channel: Channel, fallback: float) -> NoiseModel:
-    """Return the noise of a channel by its record: deviation, lines and correlation in time.
+    """Estimate the noise of a channel from its noise record.
+
+    Spectral lines at mains frequencies are removed from the record first. If what remains is
+    correlated in time, an autoregression is fitted to it; its innovation is the white noise.
 
     Parameters
     ----------
     channel : Channel
         The channel, with or without a noise record.
     fallback : float
-        Standard deviation if nothing is known [channel's unit]; only ratios to it matter then.
+        Standard deviation to use if the channel has no noise record [channel's unit]. The model
+        then has zero degrees of freedom, which marks this value as a stand-in.
+
+    Returns
+    -------
+    NoiseModel
+        Standard deviation, degrees of freedom, mains lines and autoregression. A record without
+        samples, or with fewer than `LEAST_FOR_COLOUR`, gives white noise of its standard deviation.
     """
     record = channel.noise
     if record is None:
@@ -189,7 +212,7 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
         interval=interval,
         lines=lines,
     )
-    if ljung_box(residual)[1] > WHITE_LEVEL:
+    if ljung_box(residual)[1] > WHITE_LEVEL:  # the second value is the p-value of whiteness
         return white
     coefficients, innovation_variance = autoregression(residual)
     return replace(
@@ -201,7 +224,9 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
 
 
 def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tuple[float, ...]]:
-    """Return a noise record without the lines of the mains that stand out of it.
+    """Remove spectral lines at mains frequencies from a noise record.
+
+    A line is removed only if it is significant; see `line_near`.
 
     Parameters
     ----------
@@ -213,14 +238,14 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
     Returns
     -------
     residual : (n,) ndarray
-        The record less these lines.
+        The record minus these lines.
     frequencies : tuple of float
-        Nominal frequencies of the mains that were found [Hz].
+        Nominal mains frequencies of the lines that were removed [Hz].
     """
     frequencies: list[float] = []
     residual = samples
     for frequency in MAINS:
-        # the mains wander, which a long record resolves
+        # the mains frequency wanders by up to this much, and a long record resolves it
         half_width = MAINS_DEVIATION * frequency
         line = line_near(residual, interval, aliased(frequency, interval), half_width)
         if line is not None:
@@ -232,7 +257,10 @@ def without_lines(samples: FloatArray, interval: float) -> tuple[FloatArray, tup
 def line_near(
     samples: FloatArray, interval: float, frequency: float, half_width: float
 ) -> FloatArray | None:
-    """Return the spectral line near a frequency if it stands out of a record, else None.
+    """Return the strongest spectral line near a frequency, or None if it is not significant.
+
+    The power of the line is compared with that of the spectrum around it by an F test. None also if
+    the frequency is within two resolutions of zero or of the Nyquist frequency.
 
     Parameters
     ----------
@@ -255,16 +283,18 @@ def line_near(
         return None
     line = _strongest_line(samples, interval, frequency - half_width, frequency + half_width)
 
-    # power of the neighbouring ordinates: coloured noise must not pass for a line
+    # power of the neighbouring ordinates, because coloured noise must not pass for a line
     spectrum = np.abs(np.fft.rfft(samples - line)) ** 2
     centre = round(frequency / resolution)
     excluded = 3 + ceil(half_width / resolution)
     below = spectrum[max(1, centre - excluded - 9) : max(1, centre - excluded + 1)]
     above = spectrum[centre + excluded : centre + excluded + 10]
     neighbours = np.r_[below, above]
-    noise_power = neighbours.mean() * 2.0 / len(samples)  # that a line of noise alone would have
+    # By Parseval's theorem a sine has the sum of squares of two ordinates, at plus and minus its
+    # frequency, over n. This is that of a sine fitted to noise alone.
+    noise_power = neighbours.mean() * 2.0 / len(samples)
 
-    # F test, at a level that allows for the number of independent frequencies in the band
+    # F test at a Bonferroni level: the strongest of several independent frequencies was chosen
     independent_frequencies = 1.0 + 2.0 * half_width / resolution
     critical_ratio = f_distribution.isf(
         LINE_LEVEL / independent_frequencies, 2, 2 * len(neighbours)
@@ -274,7 +304,22 @@ def line_near(
 
 
 def _strongest_line(samples: FloatArray, interval: float, low: float, high: float) -> FloatArray:
-    """Return the sine (n,) of most power between two frequencies [Hz], fitted by least squares."""
+    """Fit the sine of largest power between two frequencies to a record by least squares.
+
+    Parameters
+    ----------
+    samples : (n,) ndarray
+        The record, mean removed.
+    interval : float
+        Its sampling interval [s].
+    low, high : float
+        Ends of the band of frequencies that is searched [Hz].
+
+    Returns
+    -------
+    (n,) ndarray
+        The sine at the times of the samples.
+    """
     step = 1.0 / (LINE_STEPS * len(samples) * interval)
     low = max(low, step)
     # frequency of most power, by a zoomed Fourier transform
@@ -289,7 +334,10 @@ def _strongest_line(samples: FloatArray, interval: float, low: float, high: floa
 
 
 def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
-    """Return the autoregression of a series whose order has the least BIC, by Yule and Walker.
+    """Fit an autoregression to a series, with the order of the least BIC.
+
+    The coefficients solve the Yule-Walker equations of each order. BIC is the Bayesian information
+    criterion (Schwarz 1978), n log(variance) + p log(n) for the order p.
 
     Parameters
     ----------
@@ -318,5 +366,6 @@ def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
         if criterion < least_criterion:
             least_criterion = criterion
             best_coefficients = coefficients
+            # unbiased: the coefficients and the mean take order + 1 degrees of freedom
             best_variance = variance * count / (count - order - 1.0)
     return best_coefficients, best_variance

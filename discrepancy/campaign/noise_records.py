@@ -51,8 +51,8 @@ def pre_trigger_record(
         )
     mean = float(np.mean(samples))
     deviation = float(np.std(samples, ddof=1))
-    # samples whose mean is zero to rounding stay as they are, to be the same when written and read
-    # again
+    # A mean that is only a rounding error is not subtracted, so that a record that was written to a
+    # file and read again stays the same.
     if abs(mean) > 1e-12 * deviation:
         samples = samples - mean
         deviation = float(np.std(samples, ddof=1))
@@ -67,22 +67,23 @@ def pre_trigger_record(
 
 
 def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | None:
-    """Return the noise of a channel pooled from repeated static or flight trials.
+    """Estimate the noise of a channel from repeated static or flight trials.
 
-    Trials repeat each other if kind, run, load place, noise factor, number of rows and every row's
-    force, load factor, inputs, temperature and health agree. Deviations are taken from the mean of
-    each row over the repeats. If the channel's zero is free in each trial (`offset_deviation` above
-    zero), the mean deviation of each trial is removed too. R repeats of N rows then have (R - 1) N,
-    or (R - 1) (N - 1), degrees of freedom; sums of squares and degrees of freedom add up over
-    groups of repeats.
+    Two trials are repeats if their kind, run, load place, noise factor and number of rows agree,
+    and in every row force, load factor, inputs, temperature and health. Residuals are taken from
+    the mean of each row over the repeats, so that R repeats of N rows have (R - 1) N degrees of
+    freedom. If the zero of the channel may differ from trial to trial (`offset_deviation` above
+    zero), the mean residual of each trial is subtracted too, which leaves (R - 1) (N - 1). Sums of
+    squares and degrees of freedom are added over all groups of repeats.
 
     Returns
     -------
     NoiseRecord or None
-        None without repeats, or with fewer than three degrees of freedom.
+        The noise record; None if there are no repeats, fewer than three degrees of freedom, or no
+        scatter at all.
     """
     sum_of_squares = 0.0
-    degrees = 0
+    degrees_of_freedom = 0
     for repeats in repeated_readings(trials, channel.name):
         used_rows = repeats.used.all(axis=0)
         readings = repeats.values[:, used_rows] / repeats.trials[0].noise_factor
@@ -92,12 +93,12 @@ def repeat_record(channel: Channel, trials: Sequence[Trial]) -> NoiseRecord | No
             residual = residual - residual.mean(axis=1, keepdims=True)
             free_rows -= 1
         sum_of_squares += float(np.sum(residual**2))
-        degrees += (len(repeats.trials) - 1) * max(free_rows, 0)
-    if degrees < _LEAST_DEGREES or sum_of_squares == 0.0:
+        degrees_of_freedom += (len(repeats.trials) - 1) * max(free_rows, 0)
+    if degrees_of_freedom < _LEAST_DEGREES or sum_of_squares == 0.0:
         return None
     return NoiseRecord(
-        standard_deviation=float(np.sqrt(sum_of_squares / degrees)),
-        degrees_of_freedom=float(degrees),
+        standard_deviation=float(np.sqrt(sum_of_squares / degrees_of_freedom)),
+        degrees_of_freedom=float(degrees_of_freedom),
         source="repeats",
     )
 
@@ -121,7 +122,7 @@ class RepeatedReadings(NamedTuple):
 
 
 def repeated_readings(trials: Sequence[Trial], channel: str) -> Iterator[RepeatedReadings]:
-    """Yield the readings of a channel in each group of trials that repeat each other."""
+    """Yield the readings of a channel in each group of static or flight trials that are repeats."""
     groups: list[list[Trial]] = []
     for trial in trials:
         if trial.is_dynamic or channel not in trial.channels:
@@ -162,7 +163,7 @@ def _is_repeat(first: Trial, second: Trial) -> bool:
 
 
 def _acting_histories(trial: Trial) -> dict[str, FloatArray]:
-    """Return all that acts on the structure in a trial: values (N,) of its rows by name."""
+    """Return the loads, inputs and damage that act in a trial: values (N,) of its rows by name."""
     histories = {
         "force": trial.force,
         "load_factor": trial.load_factor,

@@ -26,10 +26,10 @@ LEAST_DRAWS = 8_000
 def variance_p_value(
     mean_square: float, freedom: float, noise_freedom: float, *, small: bool = False
 ) -> float:
-    """Return the probability that noise alone has a mean square this large, or this small.
+    """Return the p-value of a mean square of residuals, if they contain noise alone.
 
-    The mean square is relative to the variance of the noise record. It has an F distribution, or a
-    chi-squared distribution divided by its freedom if the variance of the noise is exact.
+    The mean square over the estimated variance of the noise has an F distribution. If the variance
+    is known exactly, the sum of squares has a chi-squared distribution.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def variance_p_value(
     noise_freedom : float
         Degrees of freedom of the noise record; infinite if its variance is exact.
     small : bool
-        Return the probability of a smaller mean square instead of a larger one.
+        True for the probability of a smaller mean square; by default it is that of a larger one.
     """
     if np.isinf(noise_freedom):
         distribution = chdtr if small else chdtrc
@@ -52,11 +52,13 @@ def variance_p_value(
 def pooled_variance_p_value(
     p_values: FloatArray, freedom: FloatArray, noise_freedom: FloatArray
 ) -> float:
-    """Return one p-value of several channels' mean squares, against a gap that raises them all.
+    """Combine the p-values of several channels' mean squares into one.
 
-    It is Stouffer's sum of normal scores. A score's weight is the size of such a gap in standard
-    deviations of the mean square, whose variance is 2 / freedom + 2 / noise_freedom. The result is
-    exact, while the sum of the squares themselves has a heavy tail if a noise record is short.
+    Each p-value becomes a standard normal score, and the scores are added with weights (Stouffer's
+    method). A model error that raises the mean squares of all channels alike raises a score by its
+    size over the standard deviation of the mean square, whose variance is
+    2 / freedom + 2 / noise_freedom; this gives the weights. The combined p-value is exact, while a
+    sum of the squares themselves would have a heavy tail if a noise record is short.
 
     Parameters
     ----------
@@ -73,26 +75,28 @@ def pooled_variance_p_value(
 
 
 def ljung_box(series: FloatArray, used: BoolArray | None = None) -> tuple[float, float]:
-    """Return the Ljung-Box statistic Q of a series, and its p-value if the series is white.
+    """Test whether a series of residuals is white by the statistic of Ljung and Box.
 
-    Ljung and Box 1978, Biometrika 65, eq. (1.3): Q = n (n + 2) sum_k rho_k^2 / (n - k) over min(20,
-    n / 5) lags, for a known mean of zero. Beyond its 99 % point chi^2 is exceeded up to four times
-    too often at n = 64, so the p-value is that of a gamma distribution with the mean, variance and
-    skewness of Q at this n. A model that was fitted to the series makes the test stricter, never
-    laxer.
+    With the autocorrelations rho_k, Q = n (n + 2) sum_k rho_k^2 / (n - k) over min(20, n / 5) lags
+    (Ljung and Box 1978, Biometrika 65, eq. (1.3)); the mean is known to be zero. Chi-squared is too
+    light in its tail for Q: at n = 64 its 99 % point is exceeded up to four times too often. The
+    p-value is therefore that of a gamma distribution with the mean, variance and skewness of Q at
+    this n. A model that was fitted to the series makes the test stricter, never laxer.
 
     Parameters
     ----------
     series : (N,) ndarray
-        Residuals.
+        Residuals, with a mean of zero.
     used : (N,) ndarray of bool, optional
-        False for samples that are left out. Then n is the number of the others, and n - k is
-        replaced by the number of their pairs at lag k, which keeps the mean of Q exact.
+        False for samples that are left out. Then n is the number of used samples, and n - k is
+        replaced by the number of pairs of used samples at lag k, which keeps the mean of Q exact.
 
     Returns
     -------
-    statistic, p_value : float
-        Q, and the probability of a larger one.
+    statistic : float
+        Q.
+    p_value : float
+        Probability of a larger Q if the series is white.
     """
     if used is None:
         count = series.size
@@ -117,7 +121,9 @@ def ljung_box(series: FloatArray, used: BoolArray | None = None) -> tuple[float,
 
 
 def lag_products(rows: FloatArray, lags: int) -> FloatArray:
-    """Return the sums of products of samples at lags 0 .. `lags`, by Fourier transform.
+    """Return the sums of lagged products of samples, the unnormalised autocovariance.
+
+    They are computed by the fast Fourier transform (Wiener-Khinchin).
 
     Parameters
     ----------
@@ -138,7 +144,7 @@ def lag_products(rows: FloatArray, lags: int) -> FloatArray:
 
 
 def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Return the autocorrelation of several records together, and its variance for white noise.
+    """Estimate one autocorrelation from several records, and its variance for white noise.
 
     Parameters
     ----------
@@ -148,35 +154,43 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     Returns
     -------
     rho : (K,) ndarray
-        Autocorrelation at lags 1 .. K.
+        Autocorrelation at lags 1 .. K, with K a quarter of the longest record.
     chance : (K,) ndarray
         Variance of `rho` if the records are white.
     """
     longest = max(len(record) for record in series)
     lags = max(int(LOOKED_AT * longest), 2)
     products = np.zeros(lags + 1)
-    pairs = np.zeros(lags + 1)
+    pair_counts = np.zeros(lags + 1)
     for record in series:
         record_products = lag_products(record, min(lags, len(record) - 1))[0]
-        size = len(record_products)
-        products[:size] += record_products
-        pairs[:size] += len(record) - np.arange(size)
+        lag_count = len(record_products)
+        products[:lag_count] += record_products
+        pair_counts[:lag_count] += len(record) - np.arange(lag_count)
     rho = products[1:] / max(products[0], 1e-300)
-    return rho, pairs[1:] / pairs[0] ** 2
+    # for white noise: (number of pairs) sigma^4 over (sum of squares = n sigma^2)^2
+    return rho, pair_counts[1:] / pair_counts[0] ** 2
 
 
 def times_fewer(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> float:
-    """Return the factor by which autocorrelation lowers the number of independent samples.
+    """Return the number of samples over the effective number of independent ones.
 
-    The squares of the autocorrelation that chance explains are taken off; a correlated series has
-    more of them than a white one (Bartlett 1946, Suppl. J. R. Stat. Soc. 8, 27-41).
+    For a variance estimate this factor is 1 + 2 sum_k rho_k^2. Estimated autocorrelations are not
+    zero even for white noise, so the expected sum of their squares by chance is subtracted. That
+    sum is larger for a correlated series (Bartlett 1946, Suppl. J. R. Stat. Soc. 8, 27-41).
 
     Parameters
     ----------
     rho, chance : (K,) ndarray
         Autocorrelation and its variance for white noise, from `autocorrelation`.
     ratio : float
-        Correlation of the part of the samples that is meant, over that of the whole.
+        Factor on the autocorrelation `rho`, if the correlation of the samples in question is
+        weaker or stronger than that of the whole series.
+
+    Returns
+    -------
+    float
+        The factor, at least 1.
     """
     squares = float(np.sum(rho**2))
     squares_by_chance = float(np.sum(chance))
@@ -203,7 +217,17 @@ def _portmanteau(rows: FloatArray, count: int, pairs: FloatArray) -> FloatArray:
 
 @cache
 def _portmanteau_moments(count: int, lags: int) -> tuple[float, float, float]:
-    """Return mean, standard deviation and skewness of Q for white noise, by simulation."""
+    """Return mean, standard deviation and skewness of the Ljung-Box Q for white noise.
+
+    They are found by a simulation with a fixed seed.
+
+    Parameters
+    ----------
+    count : int
+        Number n of samples of the series.
+    lags : int
+        Number of lags in the statistic.
+    """
     generator = np.random.default_rng(20260101)
     draws_at_once = max(20, 400_000 // count)
     batches = ceil(LEAST_DRAWS / draws_at_once)
@@ -228,11 +252,19 @@ def periodogram(series: FloatArray) -> FloatArray:
 
 
 def cumulative_periodogram(series: FloatArray) -> tuple[float, float]:
-    """Return the largest departure of the cumulative periodogram from a line, and its p-value.
+    """Test whether a series (n,) is white by its cumulative periodogram.
 
-    Under Gaussian white noise the normalised sums are order statistics of M - 1 uniform variables,
-    so that Kolmogorov's distribution holds exactly (Bartlett 1955; Durbin 1969, Biometrika 56,
-    1-15).
+    For Gaussian white noise the cumulative sums of the M ordinates, divided by the total, are
+    distributed as the order statistics of M - 1 uniform variables. Kolmogorov's distribution of
+    their largest departure from a straight line thus holds exactly (Bartlett 1955; Durbin 1969,
+    Biometrika 56, 1-15).
+
+    Returns
+    -------
+    statistic : float
+        Largest departure.
+    p_value : float
+        Probability of a larger one for white noise.
     """
     ordinates = periodogram(series)
     total = float(ordinates.sum())
@@ -244,19 +276,19 @@ def cumulative_periodogram(series: FloatArray) -> tuple[float, float]:
 
 
 def fisher_g(series: FloatArray) -> tuple[float, float, int]:
-    """Return Fisher's test for a line in a series.
+    """Test a series (n,) for a spectral line by Fisher's g (1929, Proc. R. Soc. A 125, 54-59).
 
-    Fisher 1929, Proc. R. Soc. A 125, 54-59. The first term of his sum is used, M (1 - g)^(M - 1),
-    passed through 1 - exp(-.): it is exact to first order where p is small and never above one.
+    Of the sum for the p-value only the first term t = M (1 - g)^(M - 1) is used, for M ordinates,
+    as 1 - exp(-t). This is exact to first order for small p-values, and never above one.
 
     Returns
     -------
     g : float
-        Largest ordinate over the sum of all.
+        Largest ordinate of the periodogram over the sum of all.
     p_value : float
-        Probability of a larger one for white noise.
+        Probability of a larger g for white noise.
     index : int
-        Its index j; the frequency is j / n.
+        Index j of the largest ordinate; the frequency is j / n per sample.
     """
     ordinates = periodogram(series)
     total = float(ordinates.sum())
@@ -269,9 +301,10 @@ def fisher_g(series: FloatArray) -> tuple[float, float, int]:
 
 
 def combine(p_values: Sequence[float]) -> float:
-    """Return one p-value of several: twice the lesser of Fisher's and Bonferroni's.
+    """Combine independent p-values into one: twice the lesser of Fisher's and Bonferroni's.
 
-    Fisher's sum detects many small departures, the least p-value a single large one.
+    Fisher's sum -2 sum log p detects many small departures, and Bonferroni's least p-value a single
+    large one. The factor two allows for the choice between them.
     """
     values = np.clip(np.asarray(p_values, dtype=float), 1e-300, 1.0)
     if values.size == 1:

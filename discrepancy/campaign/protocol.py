@@ -95,12 +95,13 @@ class Release:
     deviation : float
         Prior standard deviation of the displacement, as a fraction of it [1].
     at_rest : bool
-        True: the first sample is at the release, from the static shape under the holding force, and
-        higher modes start as that shape says, within `deviation`; False: the record starts later,
-        and displacement and velocity of each of `mode_count` modes are free.
+        True if the first sample is at the release: the structure starts at rest from its static
+        shape under the holding force, which also determines the higher modes, within `deviation`.
+        False if the record starts later: displacement and velocity of each of `mode_count` modes
+        are then unknown.
     mode_count : int
-        Modes whose initial state is free, at least 1: the first entry is the amplitude, within
-        `deviation`.
+        Number of modes with an unknown initial state, at least 1. The first unknown is the
+        amplitude, within `deviation`.
     time_zero_deviation : float
         Prior standard deviation of the time between release and first sample [s].
     unit : str

@@ -158,12 +158,12 @@ def _remarks_on_unused_columns(
 
 
 def placed_events(events: Iterable[Event], trials: tuple[Trial, ...], source: str) -> list[Event]:
-    """Return events with the names of all trials in which they happened.
+    """Complete events by the names of all trials in which they happened, and check them.
 
     Parameters
     ----------
     events : iterable of Event
-        Events of a file, with one trial, several, or none, which means all records in time.
+        Events of a file. An event without trials happened in all trials that are records in time.
     trials : tuple of Trial
         Trials of the campaign.
     source : str
@@ -255,10 +255,7 @@ def _check_occurrences(events: Sequence[Event], trial: str, source: str) -> None
 
 
 def _read_table(folder: Path, name: str) -> TextTable:
-    """Return a table of a campaign's folder.
-
-    Messages about its content name it without the folder.
-    """
+    """Read a table of a campaign's folder; messages name the table without the folder."""
     if not (folder / name).exists():
         tables = ", ".join(sorted(path.name for path in folder.glob("*.csv"))) or "none"
         raise CampaignFileError(
@@ -278,12 +275,24 @@ def _channels(
 ) -> dict[str, Channel]:
     """Return the channels by name, with their noise records.
 
-    A remark tells of noise from repeats.
+    The noise of a channel comes from its samples at rest, else from the key `noise` of the channel,
+    else from repeated trials, with a remark.
+
+    Parameters
+    ----------
+    section : CampaignSection
+        Content of `campaign.toml`.
+    tables : mapping of str to TextTable
+        Tables by name.
+    trials : tuple of Trial
+        The trials, among which repeats are searched.
+    remarks : list of str
+        Remarks of the reader, to which that on noise from repeats is added.
     """
     samples_at_rest = _samples_at_rest(section, tables)
     channels = {}
     for channel in section.channel:
-        # repeats come last: they contain what differs from trial to trial, which may be an effect
+        # repeats come last, because they also contain differences between trials, such as an effect
         noise = samples_at_rest.get(channel.name) or channel.noise
         if noise is None:
             noise = repeat_record(channel, trials)
@@ -300,14 +309,14 @@ def _channels(
 def _samples_at_rest(
     section: schema.CampaignSection, tables: Mapping[str, TextTable]
 ) -> dict[str, NoiseRecord]:
-    """Return the noise records from the table of samples at rest, by channel.
+    """Return the noise records from the table of samples at rest, by the name of the channel.
 
     Raises
     ------
     CampaignFileError
         If the table has no column of a channel.
     CampaignDataError
-        If a record has gaps; a shorter one has empty cells at its end only.
+        If a record has a gap. Empty cells are allowed only at its end, where it is shorter.
     """
     if section.noise is None:
         return {}
@@ -366,7 +375,7 @@ _ASSUMED = ' (assumed: say `begins`, "settled", "still" or "unknown")'
 
 
 def _remarks_on_begins(trials: tuple[Trial, ...]) -> list[str]:
-    """Return a remark on each way in which trials begin, as stated or assumed."""
+    """Return a remark on each state in which trials begin, stated by the file or assumed."""
     groups: dict[tuple[Start, bool], list[str]] = {}
     for trial in trials:
         is_loaded_at_first = trial.kind is TrialKind.FORCED and trial.force[0] != 0.0

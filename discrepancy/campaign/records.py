@@ -146,7 +146,7 @@ class Trial(TrialKeys):
         True if the file does not state `begins`.
     inputs : tuple of RecordedInput
         Driven trials: what acted; `force` is then the first force or torque among them, or zero.
-        Static trials: what was held in each row beside the force.
+        Static trials: inputs other than the force that were held constant in each row.
     regions : tuple of str
         Names of the damage regions, z1 and z2 first.
     """
@@ -216,9 +216,9 @@ class Trial(TrialKeys):
         return replace(self, inputs=inputs, **{**fields, **changes})
 
     def noise_deviation(self, channel: Channel) -> float:
-        """Return the standard deviation of a channel's noise here [its unit].
+        """Return the standard deviation of a channel's noise in this trial [channel's unit].
 
-        0 if it is not known.
+        It is 0 if the channel has no noise record.
         """
         if channel.noise is None:
             return 0.0
@@ -233,12 +233,12 @@ class Trial(TrialKeys):
 
     @property
     def load(self) -> FloatArray:
-        """What was applied (N,): the load factor in flight, else the force [N]."""
+        """Load of each row (N,): the load factor in flight [1], else the force [N]."""
         return self.load_factor if self.kind is TrialKind.FLIGHT else self.force
 
     @property
     def level(self) -> float:
-        """Release displacement, or the largest load."""
+        """Magnitude of the release displacement, or of the largest load."""
         if self.release is not None:
             return abs(self.release.displacement)
         return float(np.max(np.abs(self.load)))
@@ -255,9 +255,9 @@ class Trial(TrialKeys):
 
     @cached_property
     def whitened_at(self) -> float | None:
-        """Interval [s] at which noise of a dynamic trial can be whitened.
+        """Sampling interval [s] of a dynamic trial for a filter that makes its noise white.
 
-        None at too uneven stamps.
+        None for a trial that is not dynamic, or whose samples are too unevenly spaced for a filter.
         """
         return self.interval if self.is_dynamic and nearly_even(self.time) else None
 
@@ -283,8 +283,8 @@ class Campaign:
     remarks : tuple of str
         Sentences on what the reader noticed and did, such as samples that were left out, and why.
     loggers : mapping of str to tuple of str
-        Channels and inputs ("force": of forced trials) that share a clock, by logger; empty: one
-        has all.
+        Channels and inputs that share a clock, by the name of their logger; "force" is the force of
+        forced trials. Empty if one logger recorded everything.
     events : tuple of Event
         Events in the order of the file; those of one name follow each other in a trial, or are in
         different trials.
@@ -309,10 +309,12 @@ class Campaign:
     def accepted(self, channel: str = "", trial: str = "") -> frozenset[str]:
         """Return the faults of data that the campaign accepts in a channel of a trial.
 
+        These are the faults that the keys `accept` of the campaign, the channel and the trial name.
+
         Parameters
         ----------
         channel, trial : str
-            Their names; an empty name leaves out what is accepted in a channel, or in a trial.
+            Names of the channel and the trial; with an empty name its key does not count.
         """
         faults = set(self.accept)
         if channel in self.channels:
@@ -384,7 +386,7 @@ class Campaign:
 
     @property
     def sizes(self) -> dict[str, float]:
-        """The scales of its loads and times, which effects use for their own scales.
+        """Largest loads and times of the campaign, by which parameters of effects are scaled.
 
         ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],
         ``duration`` the longest record of a motion [s], ``campaign_time`` the time from the first

@@ -40,7 +40,7 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     cells : sequence of str
         The same times as printed in the file.
     user, file : str
-        Whose times they are, and the file, for messages.
+        Name of the trial or record that the times belong to, and name of the file, for messages.
 
     Returns
     -------
@@ -66,12 +66,12 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
 
 
 def time_goes_back(file: str, user: str, cells: Sequence[str], index: int) -> str:
-    """Return the message that a time does not increase.
+    """Return the message that the times of a record do not increase.
 
     Parameters
     ----------
     file, user : str
-        The file, and whose times they are.
+        Name of the file, and name of the trial or record that the times belong to.
     cells : sequence of str
         Times as printed [s].
     index : int
@@ -85,11 +85,13 @@ def time_goes_back(file: str, user: str, cells: Sequence[str], index: int) -> st
 
 
 def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
-    """Return times on an even grid if printing with few decimals explains why they are not even.
+    """Undo the rounding of printed times: return them evenly spaced if rounding explains the rest.
 
-    Half a unit of the last decimal is allowed for each time, in addition to `EVEN`. The grid is the
-    least squares one, through zero if the times begin there. Times that are even to 1e-9 stay as
-    they are.
+    Times that were printed with few decimals are not evenly spaced even if the samples were. They
+    are replaced by the evenly spaced grid of least squares if each may be off by half a unit of the
+    last printed decimal, in addition to the tolerance `EVEN`. The grid passes through zero if the
+    first time is zero. Times that are even to 1e-9 of the interval, and times that rounding does
+    not explain, are returned as they are.
 
     Parameters
     ----------
@@ -97,11 +99,15 @@ def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
         Times in any unit.
     cells : sequence of str
         The same times as printed.
+
+    Returns
+    -------
+    (N,) ndarray
+        The times, in the same unit.
     """
-    # trailing zeros may be dropped in print, so the cell with most decimals says how many there are
-    rounding_of_a_step = min(
-        _last_digit(cell) for cell in cells
-    )  # half a digit at each of its ends
+    # trailing zeros may be dropped in print, so the cell with most decimals shows the last decimal
+    # a step between two times is wrong by up to one unit of it: half a unit at each end
+    rounding_of_a_step = min(_last_digit(cell) for cell in cells)
     interval = (time[-1] - time[0]) / (len(time) - 1)
     if not _EXACT < unevenness(time) <= EVEN + rounding_of_a_step / interval:
         return time
@@ -109,8 +115,10 @@ def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
         index = np.arange(len(time)) - 0.0
         origin = 0.0
     else:
+        # centred, so that the origin and the slope of the straight line are independent
         index = np.arange(len(time)) - 0.5 * (len(time) - 1)
         origin = time.mean()
+    # straight line of least squares through the origin: slope = index . (time - origin) / index^2
     return np.asarray(origin + index * (index @ (time - origin)) / (index @ index))
 
 
@@ -141,13 +149,11 @@ def nearly_even(time: FloatArray) -> bool:
 
 
 def quantum_of(values: FloatArray) -> float:
-    """Return the quantum of a sensor: the step between two of its readings (N,).
-
-    0 if all are equal.
+    """Return the quantum of a sensor: the smallest step between two of its readings (N,).
 
     It is the step of the lattice on which the readings repeat (`lattice_step`). If they do not
     repeat, it is the least difference between readings that rounding of printed decimals does not
-    explain.
+    explain. It is 0 if all readings are equal.
     """
     step = lattice_step(values)
     if step is not None:
@@ -156,11 +162,13 @@ def quantum_of(values: FloatArray) -> float:
 
 
 def lattice_step(values: FloatArray) -> float | None:
-    """Return the step of the lattice on which the readings (N,) of a quantised sensor stand still.
+    """Return the step between the output levels of a quantised sensor, if its readings show them.
 
-    An encoder of 4096 steps, printed with six decimals, has steps of 0.001534 and 0.001533: the
-    quantum is the step and not their difference. Resampled by straight lines it also shows readings
-    between its steps, but does not repeat them.
+    The levels are the values that two neighbouring readings share; they must be evenly spaced (a
+    lattice). For example, the readings of an encoder of 4096 steps, printed with six decimals,
+    differ by 0.001534 or 0.001533: the quantum is this step, and not the difference of the two. If
+    such readings are resampled by linear interpolation, values between the levels occur too, but
+    they do not repeat.
 
     Parameters
     ----------
@@ -170,7 +178,7 @@ def lattice_step(values: FloatArray) -> float | None:
     Returns
     -------
     float or None
-        The step; None where neighbouring readings repeat at fewer than `LEAST_LEVELS` values, or at
+        The step; None if neighbouring readings repeat at fewer than `LEAST_LEVELS` values, or at
         values that are not evenly spaced.
     """
     repeats = np.diff(values) == 0.0
@@ -178,6 +186,7 @@ def lattice_step(values: FloatArray) -> float | None:
     if len(levels) < LEAST_LEVELS:
         return None
     distances = np.diff(levels)
+    # a low quantile, because levels that do not repeat leave distances of several steps
     step = float(np.quantile(distances, 0.25))
     off_lattice = np.abs(distances / step - np.round(distances / step))
     on_lattice = np.mean((off_lattice < OFF_LATTICE) & (distances > (1.0 - OFF_LATTICE) * step))
@@ -185,51 +194,73 @@ def lattice_step(values: FloatArray) -> float | None:
 
 
 def least_beyond_rounding(differences: FloatArray) -> float:
-    """Return the least positive difference (M,) that the rounding of decimals does not explain.
+    """Return the smallest positive difference that the rounding of printed decimals does not cause.
 
-    Rounding leaves many differences, far below all others: the first jump of the sorted differences
-    by more than `ROUNDING_GAP` ends them, if at least `LEAST_ROUNDED` lie below it. 0 if none is
-    positive.
+    Rounding causes many differences that are far smaller than the true ones. They end at the first
+    gap in the sorted differences that exceeds the factor `ROUNDING_GAP`, if at least
+    `LEAST_ROUNDED` differences lie below this gap; otherwise no difference counts as rounding.
+
+    Parameters
+    ----------
+    differences : (M,) ndarray
+        Differences between readings, of any sign.
+
+    Returns
+    -------
+    float
+        The smallest true difference; 0 if no difference is positive.
     """
     ordered = np.sort(differences[differences > 0.0])
     if not ordered.size:
         return 0.0
     jumps = np.flatnonzero(ordered[1:] > ROUNDING_GAP * ordered[:-1]) + 1
     jumps_above_rounding = jumps[jumps >= LEAST_ROUNDED]
-    first = jumps_above_rounding[0] if jumps_above_rounding.size else 0
-    return float(ordered[first])
+    first_true_difference = jumps_above_rounding[0] if jumps_above_rounding.size else 0
+    return float(ordered[first_true_difference])
 
 
 def spacing_sentence(times: Mapping[str, FloatArray]) -> str | None:
-    """Return the remark on unevenly spaced samples; None if all trials are evenly sampled.
+    """Return the remark for the user on trials whose samples are not evenly spaced.
+
+    It states the range of the intervals, and the widest gap if that exceeds 1.5 times the median
+    interval.
 
     Parameters
     ----------
     times : mapping of str to (N,) ndarray
-        Times [s] by the name of the trial.
+        Times of the samples [s] by the name of the trial.
+
+    Returns
+    -------
+    str or None
+        The remark; None if all trials are evenly sampled.
     """
-    uneven = {name: time for name, time in times.items() if not is_even(time)}
-    if not uneven:
+    uneven_times = {name: time for name, time in times.items() if not is_even(time)}
+    if not uneven_times:
         return None
-    steps = np.concatenate([np.diff(time) for time in uneven.values()])
-    usual = float(np.median(steps))
-    plural = "s" if len(uneven) > 1 else ""
-    names = ", ".join(map(repr, uneven))
+    steps = np.concatenate([np.diff(time) for time in uneven_times.values()])
+    usual_step = float(np.median(steps))
+    plural = "s" if len(uneven_times) > 1 else ""
+    names = ", ".join(map(repr, uneven_times))
     sentence = (
         f"The samples of the trial{plural} {names} are not evenly spaced (steps of "
-        f"{steps.min():.4g} to {steps.max():.4g} s, usually {usual:.4g} s): they are taken as "
+        f"{steps.min():.4g} to {steps.max():.4g} s, usually {usual_step:.4g} s): they are taken as "
         "stamped, and spectra are approximate."
     )
-    if steps.max() > 1.5 * usual:
-        widest_steps = {name: float(np.diff(time).max()) for name, time in uneven.items()}
-        name = max(widest_steps, key=lambda trial: widest_steps[trial])
-        begin = float(uneven[name][int(np.argmax(np.diff(uneven[name])))])
-        sentence += f" The widest gap, {steps.max():.4g} s, begins at {begin:.6g} s of {name!r}."
+    if steps.max() > 1.5 * usual_step:
+        widest_step_of_trial = {
+            name: float(np.diff(time).max()) for name, time in uneven_times.items()
+        }
+        name = max(widest_step_of_trial, key=lambda trial: widest_step_of_trial[trial])
+        begin_of_gap = float(uneven_times[name][int(np.argmax(np.diff(uneven_times[name])))])
+        sentence += (
+            f" The widest gap, {steps.max():.4g} s, begins at {begin_of_gap:.6g} s of {name!r}."
+        )
     return sentence
 
 
 def _last_digit(cell: str) -> float:
-    """Return the value of one unit of the last printed decimal."""
+    """Return the value of one unit of the last decimal of a number in print: 0.01 for "1.25"."""
     mantissa, _, exponent = cell.strip().lower().partition("e")
     decimals = len(mantissa.partition(".")[2])
     return 10.0 ** (int(exponent or 0) - decimals)

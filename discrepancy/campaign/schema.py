@@ -32,7 +32,7 @@ INPUT_COLUMNS = (
 )
 """Columns of the tables that are not channels."""
 FORCE_UNIT = "N"
-"""Unit of the column `force` where the file says no other."""
+"""Unit of the column `force` if the file does not state another."""
 OF_REGION = "health."
 """Prefix of the columns with the losses of a damage region, before the region's name."""
 
@@ -52,7 +52,7 @@ class NoiseFileSection(Section):
 
 
 def _unit_in_si(recorded: records.InTables) -> float:
-    """Return what one of the unit of a channel or input is in SI."""
+    """Return the factor from the unit of a channel or input to SI."""
     try:
         return conversion_of(recorded.quantity, recorded.unit)
     except ValueError as cause:
@@ -83,7 +83,7 @@ def _channel_in_si(channel: records.Channel) -> records.Channel:
 def _dump_channel_in_unit(
     channel: records.Channel, dump: pydantic.SerializerFunctionWrapHandler
 ) -> object:
-    """Return what a file says of a channel, with its standard deviations in its unit."""
+    """Return the content of a channel's table in a file, with standard deviations in its unit."""
     return dump(_with_scaled_deviations(channel, 1.0 / _unit_in_si(channel)))
 
 
@@ -92,16 +92,18 @@ ChannelInFile = Annotated[
     pydantic.AfterValidator(_channel_in_si),
     pydantic.WrapSerializer(_dump_channel_in_unit),
 ]
-"""Its deviations are in its unit there."""
+"""A channel in a file, where its standard deviations are in its own unit instead of SI."""
 
 
 def _input_in_si(recorded: records.RecordedInput) -> records.RecordedInput:
-    """Return an input of a file with its offset's deviation in SI, and a motion as smooth.
+    """Return an input of a file with the deviation of its offset in SI.
+
+    A motion is smooth between its samples, unless it is a reference that a controller follows.
 
     Raises
     ------
     ValueError
-        If its column is reserved, or a motion goes in steps or corners.
+        If its column is reserved, or the file states another course than smooth for a motion.
     """
     deviation = _unit_in_si(recorded) * recorded.offset_deviation
     column = recorded.table_column
@@ -157,7 +159,7 @@ class TrialSection(records.TrialKeys):
     @pydantic.model_validator(mode="before")
     @classmethod
     def _ringdowns_have_releases(cls, content: object) -> object:
-        """Let a ring-down's release be among all that is missing."""
+        """Add an empty `release` to a ring-down without one, so that its keys are reported."""
         if isinstance(content, dict) and content.get("kind") == records.TrialKind.RINGDOWN:
             return {"release": {}, **content}
         return content
@@ -198,7 +200,7 @@ class TrialSection(records.TrialKeys):
 
 
 def _first_repeated(names: Iterable[str]) -> str | None:
-    """Return the name that comes more than once, of several the first in the alphabet."""
+    """Return a name that occurs more than once, the first in the alphabet; None without one."""
     repeated = [name for name, count in Counter(names).items() if count > 1]
     return min(repeated, default=None)
 
@@ -230,9 +232,9 @@ class CampaignSection(Section):
         return (*self.channel, *self.input)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield each rule that several tables of the file may break together, and its sentence.
+        """Yield the rules on several tables of the file together, each with its message.
 
-        The first entry of a fault is true if the rule is broken.
+        The first entry of a fault is true if the file breaks the rule.
         """
         for table in ("channel", "input", "trial"):
             repeated = _first_repeated(section.name for section in getattr(self, table))
@@ -290,7 +292,7 @@ class CampaignSection(Section):
                 )
 
     def _logger_faults(self) -> Iterator[Fault]:
-        """Yield what is wrong with the names on `loggers`."""
+        """Yield the rules on the key `loggers`: each channel and input must be on one logger."""
         if not self.loggers:
             return
         inputs = {recorded.name for recorded in self.input}

@@ -16,9 +16,9 @@ from discrepancy.campaign.units import conversion_of
 from reporting.words import listing
 
 ASSUMED_ZERO = "1%"
-"""Standard deviation of a zero, of the largest reading, if nobody states it."""
+"""Standard deviation of a zero if the user does not state it, relative to the largest reading."""
 ASSUMED_GAIN = "2%"
-"""Standard deviation of a gain if nobody states it."""
+"""Relative standard deviation of a gain if the user does not state it."""
 
 
 class SensorDeviations:
@@ -80,7 +80,7 @@ class SensorDeviations:
     def _largest_reading(self, head: str) -> float:
         """Return the largest absolute reading of a column in all trials [SI].
 
-        0 if not readable yet.
+        It is 0 while the unit or decimal mark is not known.
         """
         largest = 0.0
         for column in self.columns:

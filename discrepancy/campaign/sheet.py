@@ -49,7 +49,7 @@ OTHER_FORMATS = {
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
 _LOOKED_AT = 500
-"""Lines by which the separator is chosen."""
+"""Number of first lines by which the separator is chosen."""
 
 
 @dataclass(frozen=True)
@@ -59,20 +59,21 @@ class Sheet:
     Attributes
     ----------
     name, digest : str
-        Name of the file (an Excel workbook's with that of its sheet, if it was said), and its
+        Name of the file (for an Excel workbook with that of the sheet, if it was stated), and its
         SHA-256.
     heads, units : tuple of str
-        Of the columns that hold numbers; an empty text where no unit is said.
+        Heads and units of the columns with numbers; a unit is empty if the file does not state it.
     columns : tuple of tuple of str
-        Cells as they came; clock times are seconds since the first row.
+        Cells of each column as in the file; clock times are converted to seconds since the first
+        row.
     lines : tuple of int
-        Line or row of the file that each row stands in.
+        Number of the line or row of the file for each row of the table.
     decimal : str or None
-        Mark of decimals; None where numbers can be read in two ways.
+        Decimal mark; None if numbers can be read in two ways.
     unclear : str
-        Such a number and its line.
+        A number that can be read in two ways, and its line; empty if there is none.
     remark : str
-        How the table was found: lines, what stands between cells, what was passed over.
+        How the table was found: its lines, the separator of cells, and what was left out.
     """
 
     name: str
@@ -209,11 +210,11 @@ def _remark_on_texts(title: str, numbers: int, texts: int) -> str:
 
 
 def _numbered(heads: Sequence[str]) -> list[str]:
-    """Return heads that differ: a second one of the same name ends with a 2, and so on."""
+    """Make heads unique: the second one of a name gets the number 2, and so on."""
     numbered = []
     for index, head in enumerate(heads):
-        earlier = heads[:index].count(head)
-        numbered.append(f"{head} {earlier + 1}" if earlier else head)
+        number_of_same_name = heads[:index].count(head)
+        numbered.append(f"{head} {number_of_same_name + 1}" if number_of_same_name else head)
     return numbered
 
 
@@ -244,7 +245,11 @@ def _text_rows(path: Path) -> tuple[Rows, str]:
     lines = read_text(path, CampaignFileError, otherwise="latin-1").splitlines()
 
     def merit(separator: str) -> tuple[bool, bool, int]:
-        """Return whether there is a table, whether its heads are words, and numbers - texts."""
+        """Return how good a table a separator gives; a larger tuple is better.
+
+        The entries are whether a table is found, whether its heads are words, and the number of
+        cells with numbers minus that of cells with texts.
+        """
         rows = _split_rows(lines[:_LOOKED_AT], separator, path.name)
         numbers_minus_texts = 0
         for _, row in rows:

@@ -17,9 +17,10 @@ Rows = list[tuple[int, list[str]]]
 
 
 def _is_single_column(rows: Rows) -> bool:
-    """Return whether rows of one cell each are a single column: titles, and numbers below them.
+    """Return whether rows with one cell each are a single column of numbers below a title.
 
-    Cells that look like several cells with another separator between them are not a column.
+    Most cells from the first number on must be numbers. The rows are not a column if their cells
+    contain blanks or another separator, and thus probably several numbers.
     """
     if any(any(row[1:]) for _, row in rows):
         return False
@@ -43,7 +44,10 @@ def _rows_of_longer_clocks(
     units: Sequence[str],
     places_of_values: Sequence[set[int]],
 ) -> list[int]:
-    """Return the rows right below a table in which only a longer one of its clocks goes on.
+    """Return the indices of rows below a table that belong to the longer of its clocks.
+
+    A table may have several columns of times, each with columns of its own and its own length. The
+    shorter columns end earlier, so that the first core column may be empty in the last rows.
 
     Parameters
     ----------
@@ -54,7 +58,7 @@ def _rows_of_longer_clocks(
     head, units : sequence of str
         Heads and units of the table.
     places_of_values : sequence of set of int
-        Places of numbers and times in all rows, the table's own included.
+        Indices of the cells with numbers or times in each row of the file.
     """
     names = []
     units_of_names = []
@@ -162,9 +166,9 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
 
 
 def _core_columns(rows: Rows, places_of_values: Sequence[set[int]]) -> list[int]:
-    """Return the columns that have a number in at least half of the rows with several numbers.
+    """Return the indices of the columns with a number in at least half of the rows of numbers.
 
-    If the file is a single column, rows with one number count.
+    Rows with a single number are not counted, unless the file is a single column.
     """
     rows_of_values = [values for values in places_of_values if len(values) > 1]
     if not rows_of_values and _is_single_column(rows):

@@ -29,7 +29,7 @@ from reporting.table_file import TextTable
 from reporting.words import counted, is_or_are
 
 LATE = 1.5
-"""Intervals after a release from rest within which its first sample is."""
+"""Latest time of the first sample after a release from rest, in sampling intervals."""
 _REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
 
 
@@ -39,7 +39,7 @@ def read_trial(
     campaign: schema.CampaignSection,
     remarks: list[str],
 ) -> Trial:
-    """Return a trial of a description and its table.
+    """Read a trial from its section of `campaign.toml` and its table.
 
     Parameters
     ----------
@@ -104,7 +104,11 @@ def _force(
     campaign: schema.CampaignSection,
     inputs: Sequence[RecordedInput],
 ) -> FloatArray:
-    """Return the force of a trial (N,) [N], or the first force or torque among its inputs."""
+    """Return the force of a trial in each row (N,) [N].
+
+    It is the column `force` of a static or forced trial, else the first force or torque [N m] among
+    the inputs, else zero.
+    """
     # a static trial with other inputs needs no force
     has_other_loads = section.kind is TrialKind.STATIC and inputs and "force" not in table.columns
     if section.kind in (TrialKind.STATIC, TrialKind.FORCED) and not has_other_loads:
@@ -167,9 +171,16 @@ def _check_release_time(release: Release, time: FloatArray, file: str, user: str
 def _times_of_rows_at_rest(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> tuple[FloatArray, float]:
-    """Return times (N,) and start of a static or flight trial [s].
+    """Return the times (N,) of a static or flight trial's rows and its start [s].
 
-    Refuse a row that comes twice.
+    Without a column `time` all rows have the time of the start.
+
+    Raises
+    ------
+    CampaignFileError
+        If two rows are equal and lie on the same branch of the load cycle.
+    CampaignDataError
+        If the times decrease.
     """
     start = section.start or 0.0
     names_of_loads = dict.fromkeys(
@@ -190,19 +201,20 @@ def _times_of_rows_at_rest(
 
 
 def _load_branches(table: TextTable, loads: Sequence[str], user: str) -> IntArray:
-    """Return the number (N,) of the branch of its load cycle on which each row lies.
+    """Return the number (N,) of the branch of a load cycle on which each row lies.
 
-    A load cycle passes each level upwards and downwards, where a coarse gauge may read the same.
-    Such rows are not repeats, as they lie on different branches.
+    A branch is a part of the cycle in which the load only rises or only falls. A load cycle passes
+    each level upwards and downwards, and a coarse gauge may read the same value both times. Such
+    rows are not duplicates, because they lie on different branches.
 
     Parameters
     ----------
     table : TextTable
         Table of a static or flight trial.
     loads : sequence of str
-        Its columns of loads; a branch ends where any of them turns.
+        Its columns of loads; a branch ends if any of them changes direction.
     user : str
-        Whose columns they are, for messages.
+        Name of the trial, for messages.
     """
     begins_branch = np.zeros(len(table), dtype=np.int64)
     for column in loads:
@@ -239,10 +251,17 @@ def _channels_of_trial(
 def _readings(
     channel: Channel, section: schema.TrialSection, table: TextTable, remarks: list[str]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return a channel's readings in a trial (N,) [SI], and which of them are used (N,).
+    """Read a channel's column of a trial.
 
-    The reading of an empty cell is interpolated and not used, with a remark; a row in `left_out` is
-    not used.
+    An empty cell is replaced by interpolation and marked as not used, and a remark says so. Rows in
+    the key `left_out` of the trial are marked as not used, too.
+
+    Returns
+    -------
+    values : (N,) ndarray
+        Readings [SI].
+    used : (N,) ndarray of bool
+        False for readings that are left out.
     """
     values = numbers_in_si(table, channel, f"the channel {channel.name!r}", empty_allowed=True)
     used = np.isfinite(values)
@@ -272,10 +291,7 @@ def _readings(
 def _temperature(
     section: schema.TrialSection, table: TextTable, campaign: schema.CampaignSection, user: str
 ) -> FloatArray:
-    """Return the temperature of a trial (N,) less the reference temperature [K].
-
-    0 if not recorded.
-    """
+    """Return the temperature of a trial (N,) minus the reference temperature [K]; 0 if unknown."""
     has_column = "temperature" in table.columns
     if has_column and section.temperature is not None:
         raise CampaignFileError(
@@ -318,7 +334,9 @@ class _StiffnessLosses(NamedTuple):
 def _stiffness_losses(
     section: schema.TrialSection, table: TextTable, user: str
 ) -> _StiffnessLosses:
-    """Return the stiffness losses from columns, or from the keys of the trial; else zero.
+    """Read the stiffness losses of the damage regions from columns, or from the key `health`.
+
+    A region that neither states has no loss.
 
     Raises
     ------

@@ -70,7 +70,7 @@ UNITS = {
 
 @cache
 def conversion(unit: str, si: str) -> float:
-    """Return what one of a unit is in a unit of SI.
+    """Return the factor from a unit to a unit of SI: 0.001 from mm to m.
 
     Units of angle and plain numbers do not convert into each other, and neither do hertz and rad/s.
 
@@ -100,12 +100,12 @@ def conversion(unit: str, si: str) -> float:
 
 @cache
 def conversion_of(quantity: Quantity, unit: str) -> float:
-    """Return what one of a unit is in the SI unit of a quantity.
+    """Return the factor from a unit to the SI unit of a quantity.
 
     Raises
     ------
     ValueError
-        If the quantity is not measured in that unit; the sentence names units that it has.
+        If the quantity is not measured in that unit; the message names its usual units.
     """
     try:
         return _conversion_of(quantity, unit)
@@ -116,9 +116,12 @@ def conversion_of(quantity: Quantity, unit: str) -> float:
 
 
 def _conversion_of(quantity: Quantity, unit: str) -> float:
-    """Return what one of a unit is in the SI unit of a quantity.
+    """Return the factor from a unit to the SI unit of a quantity.
 
-    Raise a bare ValueError otherwise.
+    Raises
+    ------
+    ValueError
+        If the quantity is not measured in that unit; the error has no message.
     """
     if quantity is Quantity.TEMPERATURE:
         if LOGGER_NAMES.get(unit, unit) not in NEVER_CONVERTED:

@@ -27,9 +27,9 @@ NOISE_FILE = "noise.csv"
 
 
 _EXACT_DIGITS = 17
-"""Significant digits that keep a float as it is."""
+"""Significant digits from which a float is read again without a change."""
 _SHOWN_DIGITS = 15
-"""Significant digits that show 4.387 as such after it was in another unit."""
+"""Significant digits that hide rounding errors: 4.387 stays 4.387 after a change of units."""
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,9 @@ def write_campaign(
 ) -> Path:
     """Write a campaign to a folder from which `read_campaign` reads it again.
 
-    The campaign that is read is equal to rounding, but for its hash. Strain is written in
-    microstrain, displacement in mm, the rest in SI. `campaign.toml` is written last, so that an
-    unfinished folder is not a campaign.
+    The campaign that is read again is equal up to rounding, except for its hash. Strain is written
+    in microstrain, displacement in mm, and everything else in SI. `campaign.toml` is written last,
+    so that an incomplete folder is not a campaign.
 
     Parameters
     ----------
@@ -190,7 +190,7 @@ def _loss_columns(trial: records.Trial) -> dict[str, records.FloatArray]:
 
 
 def _unit(recorded: records.InTables, si: bool) -> str:
-    """Return the unit in which a channel or input is written, where the user states none."""
+    """Return the unit in which a channel or input is written if the user states none."""
     if recorded.unit in NEVER_CONVERTED:
         return recorded.unit
     units = UNITS[recorded.quantity]
@@ -294,7 +294,10 @@ def _campaign_text(
 
 
 def _channel(channel: records.Channel, file_units: _FileUnits) -> records.Channel:
-    """Return a channel as the file has it; its samples at rest stand in a table of their own."""
+    """Return a channel as `campaign.toml` states it, without its samples at rest.
+
+    These are written to a table of their own.
+    """
     noise = channel.noise
     if noise is not None and noise.samples is not None:
         noise = None
@@ -304,7 +307,7 @@ def _channel(channel: records.Channel, file_units: _FileUnits) -> records.Channe
 
 
 def _input(recorded: records.RecordedInput, file_units: _FileUnits) -> records.RecordedInput:
-    """Return an input as the file has it, without its values and in its unit."""
+    """Return an input as `campaign.toml` states it, with its deviation in the unit of the file."""
     is_reference = bool(recorded.quantity.moving) and recorded.hold is not records.Hold.SMOOTH
     unit = _input_unit(recorded, file_units)
     deviation = recorded.offset_deviation / conversion_of(recorded.quantity, unit)

@@ -41,11 +41,13 @@ Time and events of the campaign (`docs/when.md`)::
     begin = "pump_on"                            # laws and sensors, too, act from then on,
     end = "pump_on_until"                        # until then, in trials with these events only
 
-A force F = F_0 |v / (A w)|^p |x / A|^a sgn v takes F_0 A 2 B((p + 2) / 2, (a + 1) / 2) from a
-harmonic motion x = A sin w t in each cycle (B is the beta function), a viscous damper of ratio zeta
-2 pi zeta k A^2. Equal losses give the equivalent viscous ratio zeta_eq = F_0 B / (pi k A); B is the
-name `cycle_loss`. Spread over a wing, a force acts at each place by its share w of the area, on the
-place's motion r x, x the mean's: the loss is sum w r^(p + a + 1) times as large.
+Equivalent damping: in each cycle of a harmonic motion x = A sin w t, a force
+F = F_0 |v / (A w)|^p |x / A|^a sgn v dissipates the energy 2 F_0 A B, where B is the beta function
+of (p + 2) / 2 and (a + 1) / 2. A viscous damper of ratio zeta dissipates 2 pi zeta k A^2. Equal
+losses give the equivalent viscous ratio zeta_eq = F_0 B / (pi k A); expressions know B by the name
+`cycle_loss`. A force that is spread over a wing acts at each place with its fraction u of the area,
+on the motion r x of that place, where x is the mean motion. Its loss is larger by the factor
+sum u r^(p + a + 1).
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -71,12 +73,12 @@ from reporting.toml_file import read_toml, validate
 
 
 def effects_of_file(path: Path) -> tuple[Effect, ...]:
-    """Return the effects of a TOML file.
+    """Read the effects of a TOML file.
 
     Raises
     ------
     CatalogueError
-        If the file cannot be read, or an effect in it is not sound; the sentence says where.
+        If the file cannot be read, or an effect in it is not valid; the message names the place.
     """
     content = read_toml(path, CatalogueError, what="file of effects")
     tables = content.get("effect", [content])
@@ -93,9 +95,19 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
 
 
 def _effect(table: object, place: str) -> Effect:
-    """Return the effect of a table.
+    """Return the effect that a table describes.
 
-    `place` is the file and the number of the effect, for messages.
+    Parameters
+    ----------
+    table : object
+        Content of the table.
+    place : str
+        File and number of the effect, for messages.
+
+    Raises
+    ------
+    CatalogueError
+        If the table is not a valid effect.
     """
     section = validate(EffectSection, table, place, CatalogueError, what="an effect")
     names_of_parameters = [parameter.name for parameter in section.parameters]
@@ -158,7 +170,7 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
 def _check_trials_of_courses(
     section: EffectSection, templates: Sequence["_PrimitiveTemplate"]
 ) -> None:
-    """Refuse primitives that depend on time in an effect on trials of rows at rest."""
+    """Refuse an effect on static or flight trials that has primitives which depend on time."""
     timed = [
         template
         for template in templates
@@ -179,7 +191,7 @@ def _check_trials_of_courses(
 
 @dataclass(frozen=True)
 class _PrimitiveTemplate:
-    """A primitive of a patch whose values are still expressions.
+    """A primitive of a patch whose values are expressions that are not evaluated yet.
 
     Attributes
     ----------
@@ -188,9 +200,9 @@ class _PrimitiveTemplate:
     kind : str
         Kind of the primitive.
     values : mapping of str to (str, float or Expression)
-        Its values.
+        Values of the primitive's fields, constant or as expressions.
     conditions : mapping of str to Expression
-        When it acts: "begin", "end", "if".
+        Expressions for when it acts, by key: "begin" and "end" of a window, and "if".
     scales : frozenset of str
         Names in `SCALES` that the expressions use.
     moments : frozenset of str
@@ -206,11 +218,15 @@ class _PrimitiveTemplate:
 
     @property
     def in_windows(self) -> bool:
-        """Whether it acts in a window of time only."""
+        """Whether the primitive acts only in a window of time."""
         return "begin" in self.conditions or "end" in self.conditions
 
     def primitives(self, context: BuildContext) -> Iterator[Primitive]:
-        """Yield the primitive for each time that its events happened; none if `if` is zero."""
+        """Yield the evaluated primitive, once for each occurrence of its events.
+
+        Without events and windows there is one primitive. If the expression `if` is zero, there is
+        none.
+        """
         numbers = dict(context.values)
         for name in self.scales:
             numbers[name] = SCALES[name](context)
@@ -231,7 +247,15 @@ class _PrimitiveTemplate:
                 yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
     def _moment(self, key: str, numbers: Mapping[str, float]) -> float | None:
-        """Return when it begins or ends [s]; None if it states no such moment."""
+        """Return the begin or the end of its window [s]; None if the window is open on that side.
+
+        Parameters
+        ----------
+        key : str
+            "begin" or "end".
+        numbers : mapping of str to float
+            Values of the names in expressions.
+        """
         expression = self.conditions.get(key)
         return None if expression is None else expression.value(numbers)
 
@@ -245,6 +269,7 @@ class _PrimitiveTemplate:
         target : Target
             What the place stands for.
         """
+        # texts of a primitive that stand for the place of the effect
         words = {"place": target.name, "quantity of the place": target.quantity}
         courses = PRIMITIVES[self.kind].formula_fields
         row: dict[str, str | float] = {}
@@ -267,7 +292,7 @@ def _primitive_template(
     moments: frozenset[str],
     place: str,
 ) -> _PrimitiveTemplate:
-    """Return the template of a table `[[primitives]]`.
+    """Parse a table `[[primitives]]` into a template with expressions.
 
     Parameters
     ----------
@@ -290,6 +315,7 @@ def _primitive_template(
     types = primitive.value_types()
     window_keys = ("begin", "end") if primitive.can_act_in_windows else ()
     allowed_keys = ("kind", *types, *window_keys, "if")
+    # a scale can be used only if the effect has the shape parameters that it depends on
     scales = {name for name in SCALES if SHAPES_OF_SCALES.get(name, set()) <= parameters}
     known_names = parameters | scales
     values: dict[str, str | float | Expression] = {}
@@ -328,7 +354,10 @@ def _primitive_template(
 
 
 def _check_values(kind: str, values: Mapping[str, str | float | Expression]) -> None:
-    """Refuse a primitive that lacks a value, by building it with ones in place of expressions."""
+    """Refuse a primitive that lacks a value.
+
+    It is built with the number one in place of each expression, which raises if a value is missing.
+    """
     row: dict[str, str | float] = {}
     for key, value in values.items():
         if not isinstance(value, Expression):
@@ -370,7 +399,17 @@ class _EffectOfFile:
         return reason_against(self._in_setting(setting))
 
     def build(self, setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
-        """Return its patch at values of parameters and shape, at a place."""
+        """Return the patch of the effect.
+
+        Parameters
+        ----------
+        setting : Setting
+            Campaign and model.
+        values : mapping of str to float
+            Values of the parameters and shape parameters by name.
+        place : str
+            Name of the place where the effect acts.
+        """
         effect = self._in_setting(setting)
         primitives: list[Primitive] = []
         for target in effect.targets(place):
@@ -382,7 +421,7 @@ class _EffectOfFile:
 
 
 def _primitive_of(kind: str, row: Mapping[str, str | float]) -> Primitive:
-    """Return a primitive by its values; whole floats become integers where integers are needed."""
+    """Build a primitive from its values; floats become integers for fields that are integers."""
     types = PRIMITIVES[kind].value_types()
     integers: dict[str, int] = {}
     for name, value in row.items():

@@ -41,7 +41,7 @@ class EffectSection(EffectKeys):
     places : str, tuple of str or None
         A word of `PLACES`, the names of the places, or None if there is no choice.
     preferred : tuple of str
-        Ports of a wing that stand for its others.
+        Ports of a wing that stand for all its ports.
     needs : tuple of str
         Words of `NEEDS`.
     events : tuple of str
@@ -58,28 +58,28 @@ class EffectSection(EffectKeys):
 
 
 def _has_ports_of_a_wing(model: Model) -> bool:
-    """Return whether some ports of a model may stand for its others, as those of a wing do.
+    """Return whether a model has the ports of a wing, of which some may stand for the others.
 
-    The file of a structure names the ports that it means.
+    A structure from a file is excluded: its file names exactly the ports that may be used.
     """
     return set(model.ports) <= set(PORTS) and not isinstance(model, StructureModel)
 
 
 @dataclass(frozen=True)
 class EffectInSetting:
-    """An effect of a file in a setting: where it may act there, and why it cannot be tested.
+    """An effect of the catalogue for one campaign and one model: where it may act.
 
     Attributes
     ----------
     setting : Setting
         Campaign and model.
     section : EffectSection
-        Content of its file. The port "planform" of a force that is spread over an area is "span" in
-        a model without one.
+        Content of the effect's file.
     primitives : tuple of type
-        Kinds of primitives that it consists of.
+        Kinds of primitives that the effect consists of.
     moments : frozenset of str
-        Moments of events that its expressions use; it acts in trials that have all of them.
+        Names of the events whose times the effect's expressions use. The effect acts only in trials
+        that have all these events.
     """
 
     setting: Setting
@@ -89,40 +89,43 @@ class EffectInSetting:
 
     @property
     def trials(self) -> tuple[Trial, ...]:
-        """Fitted trials that it changes."""
+        """Fitted trials of the kinds that the effect acts on."""
         kinds = self.section.acts_on
         return tuple(trial for trial in self.setting.campaign.fitted if trial.kind in kinds)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
-        """Channels of these trials."""
+        """Channels that are recorded in at least one of the trials that the effect acts on."""
         recorded = {name for trial in self.trials for name in trial.channels}
         channels = self.setting.campaign.channels
         return tuple(channel for name, channel in channels.items() if name in recorded)
 
     def channels_of(self, condition: Callable[[Channel], bool] = lambda channel: True) -> Names:
-        """Return the names of its channels that fulfil a condition; all by default."""
+        """Return the names of the effect's channels that fulfil a condition; all by default."""
         return tuple(channel.name for channel in self.channels if condition(channel))
 
     @property
     def strain_channels(self) -> Names:
-        """Names of its strain channels."""
+        """Names of the strain channels in the trials that the effect acts on."""
         return self.channels_of(lambda channel: channel.quantity is Quantity.STRAIN)
 
     @property
     def state_ports(self) -> Names:
-        """Ports of states, at which laws are flows."""
+        """Ports of states such as a level or a temperature; a law at such a port is a flow."""
         return tuple(name for name, scale in self.setting.scales.ports.items() if scale.of_state)
 
     def force_ports(self, condition: Callable[[PortScale], bool] = lambda scale: True) -> Names:
-        """Return the ports at which forces may act.
+        """Return the ports of the model at which a force of this effect may act.
 
-        For a wing these are the `preferred` ones that it has, otherwise all.
+        Ports of states are excluded, because a law at such a port is a flow. For a wing, the
+        effect's `preferred` ports that the wing has stand for all its ports; if it has none of
+        them, and for any other model, all ports remain.
 
         Parameters
         ----------
         condition : callable
-            Condition on the natural scales of a port; all ports by default.
+            Condition on the natural scales of a port; always true by default. A port without
+            natural scales is kept, because the condition cannot be evaluated for it.
         """
         model = self.setting.model
         scales = self.setting.scales.ports
@@ -131,6 +134,8 @@ class EffectInSetting:
         if _has_ports_of_a_wing(model):
             preferred = []
             for name in self.section.preferred:
+                # The port "planform" (a force spread over the area) is not in `model.ports`. A wing
+                # that can carry such a force has scales for it; any other wing has "span" instead.
                 port = "span" if name == PLANFORM and name not in scales else name
                 if port in ports or port == PLANFORM:
                     preferred.append(port)
@@ -139,15 +144,26 @@ class EffectInSetting:
 
     @property
     def turning_ports(self) -> Names:
-        """Ports whose motion turns or is held, for forces with a memory or a zero.
+        """Force ports whose motion changes direction, for forces with a memory or a zero position.
 
-        A body that moves one way only, as in a fall, cannot distinguish such a force from drag: its
-        speed and its way grow together.
+        Such a force cannot be distinguished from drag at a body that moves in one direction only,
+        as in a fall, because speed and distance grow together.
         """
         return self.force_ports(lambda scale: scale.turns)
 
     def targets(self, place: str) -> "tuple[Target, ...]":
-        """Return the targets of a place; a law acts at each of them."""
+        """Return what a place stands for: the ports, channels, runs or loggers of the primitives.
+
+        Parameters
+        ----------
+        place : str
+            Name of one of the effect's places, such as a port, "root, lower skin" or "all strain".
+
+        Returns
+        -------
+        tuple of Target
+            One target for each primitive; several only for `EVERY_PORT`.
+        """
         if self.section.places == "skins at ports":
             port, _, skin = place.rpartition(", ")
             return (Target(port, number=SKINS[skin]),)
@@ -162,7 +178,10 @@ class EffectInSetting:
         return (Target(place or EVERY_CHANNEL),)
 
     def _channels_at(self, place: str) -> "Target":
-        """Return the target of a place that is a channel, or "all strain" and the like."""
+        """Return the target of a place that names one channel, or all channels of a quantity.
+
+        "all strain" stands for all strain channels, unless a channel has this name.
+        """
         if place.startswith(ALL) and place not in self.setting.campaign.channels:
             return Target(EVERY_CHANNEL, place.removeprefix(ALL))
         return Target(place)

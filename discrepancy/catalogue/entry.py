@@ -19,7 +19,7 @@ Number = Annotated[float, Strict()]
 ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
 """How a table of a file of effects is checked as one of these records."""
 LEAST_SHRINKAGE = 0.3
-"""Least factor by which a step of an iteration changes a positive value."""
+"""Least factor by which one step of an iteration may multiply a positive value."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Prior:
         return mean + deviation * u
 
     def normal(self, value: float) -> float:
-        """Return the standard normal variable of a value; the inverse of `value`."""
+        """Return the standard normal variable of a value: the inverse of the method `value`."""
         if self.shape == "uniform":
             probability = (value - self.low) / (self.high - self.low)
             return float(ndtri(min(max(probability, 1e-12), 1.0 - 1e-12)))
@@ -68,10 +68,19 @@ class Prior:
         return (value - mean) / deviation
 
     def stepped(self, u: float, step: float) -> float:
-        """Return the standard normal variable after a step along the value's tangent.
+        """Return the standard normal variable after a step of an iteration.
 
-        A prediction that is proportional to a log-normal value is far from linear in its logarithm,
-        so the step is made in the value. It leaves at least `LEAST_SHRINKAGE` of a positive value.
+        A prediction that is proportional to a log-normal value x is not linear in u, but linear in
+        x. The step is therefore made in x along its tangent: with x = exp(m + s u), a step d in u
+        changes x by the factor 1 + s d, thus u by log(1 + s d) / s. The factor is kept above
+        `LEAST_SHRINKAGE`, so that x stays positive.
+
+        Parameters
+        ----------
+        u : float
+            Standard normal variable before the step.
+        step : float
+            Step in u that the linear equations give.
         """
         if self.shape != "log_normal":
             return u + step
@@ -155,7 +164,7 @@ class Setting:
     scales : Scales
         Natural scales of the model in the campaign, which make parameters dimensionless.
     largest : dict
-        Largest readings that were computed; kept, because a fit builds patches at every step.
+        Cache of the largest readings at places, because a fit builds patches at every step.
     """
 
     campaign: Campaign
@@ -190,7 +199,7 @@ class EffectKeys:
     shape : tuple of ShapeParameter
         Numbers that the shape gate frees.
     confusable : tuple of str
-        Identifiers of effects that some campaigns cannot tell from it.
+        Identifiers of effects that some campaigns cannot distinguish from it.
     spectral : str
         Name of a parameter that is a frequency over the first natural frequency; fits of it begin
         at peaks of the residuals' spectrum at the place, a channel. Empty if there is none.
@@ -230,12 +239,19 @@ class Effect(EffectKeys):
     unavailable: Callable[[Setting], str | None] = field(default=lambda setting: None)
 
     def canonical_shape(self) -> dict[str, float]:
-        """Return the shape values of the named effect."""
+        """Return the shape parameters of the named effect by name, such as the exponent 2."""
         return {parameter.name: parameter.canonical for parameter in self.shape}
 
     def patch(self, setting: Setting, values: Mapping[str, float], place: str = "") -> ModelPatch:
-        """Return the patch at values of parameters and shape.
+        """Return the patch that adds the effect to a model.
 
-        A missing shape value is canonical.
+        Parameters
+        ----------
+        setting : Setting
+            Campaign and model.
+        values : mapping of str to float
+            Values of the parameters, and of shape parameters that are not canonical, by name.
+        place : str
+            Name of the place where the effect acts; empty if there is no choice.
         """
         return self.build(setting, {**self.canonical_shape(), **values}, place)

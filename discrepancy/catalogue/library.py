@@ -95,7 +95,7 @@ def load_catalogue(
 
 
 def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
-    """Return the effect of an identifier; raise `CatalogueError` with the known ones otherwise."""
+    """Return the effect with an identifier; raise `CatalogueError` if there is none."""
     known = {effect.identifier: effect for effect in effects}
     if identifier not in known:
         raise CatalogueError(
@@ -105,11 +105,11 @@ def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
 
 
 def in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
-    """Return the effects as they act during each event of a campaign, as further hypotheses.
+    """Return variants of effects that act only during an event, as further hypotheses.
 
-    An effect acts in the trials that have the event, held-out ones too, from its begin to its end;
-    the moments are not fitted. Effects that cannot act in a window of time, or whose law the model
-    cannot switch, are left out.
+    Such a variant acts in all trials that have the event, also in held-out ones, from the begin of
+    the event to its end. These times are known and not fitted. Effects that cannot act in a window
+    of time, or that the model cannot switch on and off, have no variant.
 
     Parameters
     ----------
@@ -121,22 +121,31 @@ def in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]
     Returns
     -------
     tuple of Effect
-        Effects in the order of events; none without events in fitted trials.
+        Variants of the effects, event by event; empty if no fitted trial has an event.
     """
     fitted = {trial.name for trial in setting.campaign.fitted}
     events = [event for event in setting.campaign.events if fitted.intersection(event.trials)]
-    names = dict.fromkeys(event.name for event in events)
-    if not names:
+    event_names = dict.fromkeys(event.name for event in events)
+    if not event_names:
         return ()
-    switched = [effect for effect in effects if _can_act_in_windows(effect, setting)]
-    return tuple(_during_event(effect, name, setting) for name in names for effect in switched)
+    switchable_effects = [effect for effect in effects if _can_act_in_windows(effect, setting)]
+    return tuple(
+        _during_event(effect, name, setting)
+        for name in event_names
+        for effect in switchable_effects
+    )
 
 
 def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
-    """Return whether an effect can act in windows of time of this model's trials."""
+    """Return whether an effect can be limited to windows of time with this model.
+
+    It must act in dynamic trials, have no windows of its own, and consist of primitives that allow
+    windows. The model must switch laws in time, unless the effect concerns sensors only.
+    """
     places = effect.places(setting)
     if not places or not effect.acts_on & DYNAMIC:
         return False
+    # any values of the parameters show of which primitives the patch consists
     values = {parameter.name: parameter.prior.value(0.5) for parameter in effect.parameters}
     patch = effect.patch(setting, values, places[0])
     has_other_windows = patch.has_windows
@@ -148,7 +157,7 @@ def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
 
 
 def _during_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
-    """Return an effect as it acts during the events of a name."""
+    """Return the variant of an effect that acts only during all events of a name."""
     windows: list[Window] = []
     for event in setting.campaign.events:
         if event.name == event_name:
@@ -168,7 +177,7 @@ def _during_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
 
 
 def check(effects: Iterable[Effect]) -> None:
-    """Raise `CatalogueError` for the first effect that is not sound."""
+    """Raise `CatalogueError` for the first effect that is not valid, or if identifiers clash."""
     effects = tuple(effects)
     counts = Counter(effect.identifier for effect in effects)
     for effect in effects:
@@ -189,7 +198,7 @@ def check(effects: Iterable[Effect]) -> None:
 
 
 def _faults(effect: Effect) -> Iterator[str]:
-    """Yield what is not sound in an effect, as the end of a sentence about it."""
+    """Yield the faults of an effect, each as the end of a sentence that begins with the effect."""
     if not (effect.name and _IDENTIFIER.fullmatch(str(effect.identifier))):
         yield " must have a name, and an identifier of lower-case letters, digits and underscores."
     if not effect.acts_on:

@@ -1,4 +1,8 @@
-"""What an effect needs to be tested, by the words in its file, and why it cannot be tested."""
+"""What a campaign and a model must have so that an effect can be tested.
+
+The file of an effect lists its needs by words. For each word, a function here returns the reason
+why the need is not met, or None if it is met.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -88,7 +92,7 @@ def _no_port(effect: EffectInSetting) -> str | None:
 
 
 def _no_turning_port(effect: EffectInSetting) -> str | None:
-    """Return why no port has a motion that turns, or None."""
+    """Return the reason if no port has a motion that changes its direction, else None."""
     return None if effect.turning_ports else NO_TURNING_PORT
 
 
@@ -124,7 +128,10 @@ def _no_channel(effect: EffectInSetting) -> str | None:
 
 
 def _no_second_clock(effect: EffectInSetting) -> str | None:
-    """Return why motion and inputs have one clock, or None; without inputs another need says so."""
+    """Return the reason if motion and inputs were recorded by the same logger, else None.
+
+    None also if no trial has inputs, because another need reports that.
+    """
     if len(effect.setting.campaign.loggers) != 1 or _no_trial(effect, INPUTS):
         return None
     return (
@@ -139,7 +146,10 @@ def _no_input(effect: EffectInSetting) -> str | None:
 
 
 def _no_strain_across(effect: EffectInSetting) -> str | None:
-    """Return why the model does not give the strains that a turned gauge sees, or None."""
+    """Return the reason if the model has no strains that a misaligned gauge measures, else None.
+
+    These are the transverse strain and the shear strain.
+    """
     setting = effect.setting
     for name in effect.strain_channels:
         output = setting.campaign.channels[name].output

@@ -1,4 +1,4 @@
-"""Where an effect may act, by the word in its file."""
+"""The places where an effect may act, by the word in its file, such as "ports" or "runs"."""
 
 from collections.abc import Callable
 from math import isinf
@@ -41,17 +41,20 @@ def _skins_at_ports(effect: EffectInSetting) -> Names:
 
 
 def _held_ports(effect: EffectInSetting) -> Names:
-    """Return the ports that something holds, for forces that depend on where a port is."""
+    """Return the force ports with a support or stiffness, for forces that depend on displacement.
+
+    A free port (of a body that falls or rolls) has no zero of displacement.
+    """
     return effect.force_ports(lambda scale: not scale.free)
 
 
 def _calibrated_channels(effect: EffectInSetting) -> Names:
-    """Return the channels with a known gain; a free gain absorbs an error of it."""
+    """Return the channels with a known gain, because a free gain absorbs any gain error."""
     return effect.channels_of(lambda channel: not isinf(channel.gain_deviation))
 
 
 def _timed_gauges(effect: EffectInSetting) -> Names:
-    """Return the gauges, or else channels, that were read at several times."""
+    """Return the strain gauges (without gauges, all channels) that were read at several times."""
     places = []
     for name in effect.strain_channels or effect.channels_of():
         times = [
@@ -86,16 +89,16 @@ def _loggers(effect: EffectInSetting) -> Names:
 
 
 def mains_lines(setting: Setting) -> Names:
-    """Return the mains lines that can be seen, such as "50 Hz" or "50 or 400 Hz".
+    """Return the mains frequencies that records can show, such as "50 Hz" or "50 or 400 Hz".
 
-    A line whose alias makes less than one period in every record is an offset there and left out.
-    Lines whose aliases differ by less than half a period in every record look alike and are one
-    place.
+    Sampling shifts a mains frequency to its alias. A line is left out if its alias has less than
+    one period in every record, because it then looks like an offset. Lines whose aliases differ by
+    less than half a period in every record cannot be distinguished, and form one place.
     """
     trials = [trial for trial in setting.campaign.fitted if trial.is_dynamic]
 
     def periods(frequency: float) -> FloatArray:
-        """Return the periods (T,) that the alias of a line makes in each record."""
+        """Return the number of periods (T,) of the alias of a frequency [Hz] in each record."""
         counts = []
         for trial in trials:
             duration = float(trial.time[-1] - trial.time[0])

@@ -16,7 +16,7 @@ from discrepancy.system.scales import PortScale
 from fe.runtime.patch import EVERY_CHANNEL
 
 LARGEST_SHARE = 0.9
-"""Largest fraction of a port's stiffness at rest for a force that does not fall with the speed."""
+"""Largest friction force at a port, as a fraction of its elastic force."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +56,24 @@ class BuildContext:
 
 
 def loss_integral(velocity_exponent: float, displacement_exponent: float) -> float:
-    """Return B((p + 2) / 2, (a + 1) / 2): half the loss of a cycle over F_0 A; 2 for p = a = 0."""
+    """Return the energy that a force dissipates in a cycle, over 2 F_0 A.
+
+    For the force F_0 |v / (A w)|^p |x / A|^a sgn v under x = A sin w t it is the beta function of
+    (p + 2) / 2 and (a + 1) / 2; for Coulomb friction (p = a = 0) it is 2.
+
+    Parameters
+    ----------
+    velocity_exponent, displacement_exponent : float
+        Exponents p and a.
+    """
     return float(beta(0.5 * velocity_exponent + 1.0, 0.5 * displacement_exponent + 0.5))
 
 
 def _cycle_loss(context: BuildContext) -> float:
-    """Return the loss of a cycle of a force |v|^p |x|^a over F_0 A, spread over the port's area."""
+    """Return the energy that a force |v|^p |x|^a dissipates in a cycle, over 2 F_0 A.
+
+    A force that is spread over an area is summed over its places.
+    """
     p = max(context.values["velocity_exponent"], 0.0)
     a = max(context.values["displacement_exponent"], 0.0) * _is_held(context)
     return loss_integral(p, a) * context.port.mean_power(p + a + 1.0)
@@ -73,16 +85,29 @@ def _is_held(context: BuildContext) -> float:
 
 
 def _holding_force(context: BuildContext) -> float:
-    """Return the largest force that lets the port move, unless the force falls with the speed."""
+    """Return the largest force with which the port still moves.
+
+    It is `LARGEST_SHARE` of the elastic force at the port's natural displacement. There is no limit
+    (infinity) for a force that vanishes at rest (a velocity exponent of one or more), for a port
+    that a drive moves, or if the stiffness at rest is not known.
+    """
     port = context.port
-    falls_with_speed = context.values["velocity_exponent"] >= 1.0
-    if port.static_stiffness is None or port.driven or falls_with_speed:
+    vanishes_at_rest = context.values["velocity_exponent"] >= 1.0
+    if port.static_stiffness is None or port.driven or vanishes_at_rest:
         return inf
     return LARGEST_SHARE * port.static_stiffness * port.displacement
 
 
 def _port_scale(name: str, fallback: str) -> Callable[[BuildContext], float]:
-    """Return the function of a natural scale of the port, with another scale if it is not known."""
+    """Return a function for a natural scale of the port.
+
+    Parameters
+    ----------
+    name : str
+        Name of the scale, an attribute of `PortScale`.
+    fallback : str
+        Name of the scale that replaces it if it is None.
+    """
 
     def scale(context: BuildContext) -> float:
         value: float | None = getattr(context.port, name)
@@ -96,12 +121,12 @@ def _largest_reading(context: BuildContext) -> float:
 
     It is kept in the setting, because a fit builds patches at every step.
     """
-    kept = context.setting.largest
+    cache = context.setting.largest
     key = (context.target, context.effect.section.acts_on)
-    if key not in kept:
+    if key not in cache:
         largest = _compute_largest_reading(context)
-        kept[key] = largest if largest > 0.0 and np.isfinite(largest) else 1.0
-    return kept[key]
+        cache[key] = largest if largest > 0.0 and np.isfinite(largest) else 1.0
+    return cache[key]
 
 
 def _compute_largest_reading(context: BuildContext) -> float:

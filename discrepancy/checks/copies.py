@@ -27,7 +27,10 @@ class _Copy(NamedTuple):
 
 
 def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
-    """Yield a fault for each pair of channels of which one is a copy of the other."""
+    """Yield one fault for each pair of channels of which one is a copy of the other.
+
+    The fault names the first trial in which it shows, and counts the others.
+    """
     trials_of_pairs: dict[tuple[str, str], list[tuple[Trial, str]]] = {}
     for trial in campaign.trials:
         if not trial.is_dynamic:
@@ -49,16 +52,19 @@ def copy_faults(campaign: Campaign) -> Iterator[DataFault]:
 
 
 def _copies(trial: Trial) -> Iterator[_Copy]:
-    """Yield the copies among the channels of a trial.
+    """Yield the pairs of channels of a trial of which one is a copy of the other.
 
-    Copies share their noise. It is separated from the motion by sixth differences, and the shift
-    between two channels is that of their largest cross-correlation.
+    Different sensors have independent noise, copies have the same. Sixth differences separate the
+    noise from the motion. The shift in time between two channels is the lag of the largest
+    cross-correlation of their noise. Channels without noise are copies only if they are equal digit
+    for digit.
     """
     if len(trial.time) < LEAST_COPIED:
         return
     noise = _noise_by_differences(trial.values[:_LAGS])
     power = np.sum(noise**2, axis=0)
-    # sixth differences of noise turn at each sample; those of a motion without noise do not
+    # Sixth differences of white noise have the lag-one correlation -6/7; those of a smooth motion
+    # without noise have a correlation near 1.
     has_noise = np.sum(noise[1:] * noise[:-1], axis=0) < -0.5 * power
     spectra = np.fft.rfft(noise, 2 * len(noise), axis=0)
     changes = np.count_nonzero(np.diff(trial.values, axis=0), axis=0)
@@ -72,7 +78,7 @@ def _copies(trial: Trial) -> Iterator[_Copy]:
             correlation = np.fft.irfft(spectra[:, j] * np.conj(spectra[:, i]))
             peak = int(np.argmax(np.abs(correlation)))
             if abs(correlation[peak]) >= 0.5 * np.sqrt(power[i] * power[j]):
-                # the second half of the transform has the negative shifts
+                # the second half of the inverse transform holds the negative lags
                 shift = peak if peak < len(noise) else peak - len(correlation)
                 how = _how_copied(
                     trial.values[:, i],
@@ -86,9 +92,10 @@ def _copies(trial: Trial) -> Iterator[_Copy]:
 
 
 def _noise_by_differences(values: FloatArray) -> FloatArray:
-    """Return the sixth differences (N - 6, C) of records (N, C), with zeros for jumps.
+    """Return the sixth differences (N - 6, C) of records (N, C), which contain mostly noise.
 
-    A jump or a wrong reading would outweigh all noise.
+    Differences above 15 times the median are set to zero, because a single jump or wrong reading
+    would outweigh all noise in a correlation.
     """
     differences = np.diff(values, 6, axis=0)
     limit = 15.0 * np.median(np.abs(differences), axis=0)
@@ -103,7 +110,7 @@ def _how_copied(
     copy_used: BoolArray,
     shift: int,
 ) -> str:
-    """Return how a record is a copy of another one, as a phrase; empty if it is not.
+    """Describe how one record is a copy of another: equal or scaled, and shifted in time.
 
     Parameters
     ----------
@@ -112,9 +119,14 @@ def _how_copied(
     original_used, copy_used : (N,) ndarrays of bool
         False for samples that are left out.
     shift : int
-        Samples by which the copy comes later.
+        Number of samples by which the copy comes later than the original.
+
+    Returns
+    -------
+    str
+        Phrase for a message, such as "times 1.5, 3 samples later,"; empty if it is no copy.
     """
-    # samples that both have, in the clock of the original
+    # the overlap of the two records after the shift
     count = len(original) - abs(shift)
     first = max(-shift, 0)
     first_of_copy = max(shift, 0)
@@ -125,6 +137,7 @@ def _how_copied(
     y = copy[in_copy][used]
     if len(y) < LEAST_COPIED or len(np.unique(x)) < LEAST_COPIED // 2:
         return ""
+    # the robust estimate is zero if most readings repeat; 924 is explained in `roughness`
     noise = roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
     if noise == 0.0:
         return ""

@@ -19,30 +19,37 @@ from discrepancy.checks.fault import DataFault, FaultKind, place_of
 LEAST_HELD = 8
 """Fewest equal readings in a row that are examined."""
 _SURROUNDINGS = 4
-"""Length of the surroundings before and after a run, in lengths of the run."""
+"""Length of the surroundings on either side of a run, as a multiple of the run's length."""
 _COMPARABLE = 0.25
-"""Relative length from which another run is comparable: pauses, square waves, coarse digits."""
+"""Least length of a comparable run, as a fraction of the length of the run that is judged.
+
+Comparable runs come from pauses, square waves and coarse digits."""
 _MOST_COMPARABLE = 1.0 / 3.0
 """Largest fraction of the surroundings that comparable runs may take."""
 _JUMP = 3.0
-"""Change of a reading in one sample, in digits, that no turning point makes."""
+"""Least jump of a reading from one sample to the next, in quanta; turning points change less."""
 _PACE = 0.25
-"""Change into or out of a run, over the mean change around it, that is no gradual standstill."""
+"""Least jump into or out of a run, as a fraction of the mean change between samples around it.
+
+A structure that slows down gradually changes less."""
 _MOVING = 0.5
-"""Range of another record during the run, over its usual one, from which on it moves."""
+"""Least range of another record during a run, over its usual range, if that record moves."""
 _RESTING = 0.25
-"""The same ratio, below which it rests."""
+"""Largest value of the same ratio if the other record rests."""
 _NOISE_DIGITS = 2.0
-"""Noise in digits above which a reading hardly comes twice."""
+"""Standard deviation of noise, in quanta, above which equal readings in a row are unlikely."""
 _LEAST_UPDATES = 4.0
-"""Fewest updates of a sensor, slower than its logger, that must show one value for a fault."""
+"""Fewest updates of a sensor that a faulty run must span.
+
+A logger that is faster than its sensor records each update several times."""
 
 
 def roughness(values: FloatArray) -> float:
-    """Return the standard deviation of white noise that explains a record's sixth differences.
+    """Estimate the standard deviation of the white noise in a record by its sixth differences.
 
-    It is robust (median absolute deviation). Differences of the sixth order take out motions with
-    more than some eight samples in a period.
+    Sixth differences remove motions with more than about eight samples in a period. The estimate is
+    1.4826 times their median absolute value, which single wrong readings do not change, divided by
+    the root of the variance 924 that they have for noise of unit variance.
 
     Parameters
     ----------
@@ -50,21 +57,28 @@ def roughness(values: FloatArray) -> float:
         A record in time.
     """
     differences = np.diff(values, 6)
-    # 924 is the sum of the squared binomial coefficients of order six
+    # 924 = sum_k binomial(6, k)^2
     return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))
 
 
 def runs_of(flags: BoolArray) -> IntArray:
-    """Return the runs of true entries (R, 2): the first index, and the one after the last."""
+    """Return the runs of consecutive true entries in an array of flags.
+
+    Returns
+    -------
+    (R, 2) ndarray of int
+        Index of the first entry of each run, and the index after its last entry.
+    """
     padded = np.concatenate(([False], flags, [False])).astype(np.int8)
     edges = np.flatnonzero(np.diff(padded))
     return np.stack((edges[::2], edges[1::2]), axis=1)
 
 
 def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
-    """Yield a fault for each stretch of a dynamic trial in which a channel stands still by mistake.
+    """Yield a fault for each span of a dynamic trial in which a sensor or its logger was stuck.
 
-    `held_spans` distinguishes it from a pause, a square wave, a coarse converter and a rest.
+    `held_spans` distinguishes such a span of equal readings from a true standstill of the structure
+    and from a coarse digital converter.
     """
     series = [trial.values]
     series += [recorded.values[:, np.newaxis] for recorded in trial.inputs]
@@ -115,15 +129,19 @@ class _RunsOfRecord(NamedTuple):
 def held_spans(
     values: FloatArray, used: BoolArray, others: FloatArray, noise: float = 0.0
 ) -> list[tuple[int, int]]:
-    """Return the runs of equal readings at which a sensor or logger failed.
+    """Return the runs of equal readings that show a failure of a sensor or logger.
 
-    Noise of more than two digits shows at rest too, so that any run is at fault that is longer than
-    four updates of the sensor (which may be slower than its logger). Without such noise, a
-    structure comes to rest before it stands still, and starts from rest: its readings go into and
-    out of the run by single digits. A run is at fault if the record goes in and out at speed. If it
-    does so on one side only, another record must move meanwhile, and no other run be comparable.
-    The following acquit a run: other records that rest meanwhile, a second run at the same value (a
-    dead zone), and comparable runs over a third of the surroundings (a square wave, pauses).
+    A digit is the quantum of the readings here. The rules are:
+
+    - If the noise exceeds two digits, it makes readings differ even at rest. Any run longer than
+      four updates of the sensor (which may be slower than its logger) is then a failure.
+    - Otherwise a run may be a true standstill. A structure slows down before it stands still, so
+      that the readings change by single digits just before and after the run. The run is a failure
+      if the readings jump on both sides of it. If they jump on one side only, it is a failure if
+      another record moves during the run and no other run is of comparable length.
+    - A run is no failure if the other records rest during it, if there is a second run at the same
+      value (a dead zone), or if runs of comparable length fill a third of its surroundings (a
+      square wave, pauses).
 
     Parameters
     ----------
@@ -132,7 +150,7 @@ def held_spans(
     used : (N,) ndarray of bool
         False for samples that are left out.
     others : (N, K) ndarray
-        The other records of the trial.
+        The records of the K other channels and inputs of the trial.
     noise : float
         Standard deviation of the channel's noise; 0 if it is not known.
 
@@ -142,21 +160,21 @@ def held_spans(
         First sample of each run, and the one after its last.
     """
     is_equal_to_next = (np.diff(values) == 0.0) & used[1:] & used[:-1]
-    bounds = runs_of(is_equal_to_next) + np.array([0, 1])
-    lengths = bounds[:, 1] - bounds[:, 0]
-    long_runs = bounds[lengths >= LEAST_HELD].tolist()
+    bounds_of_runs = runs_of(is_equal_to_next) + np.array([0, 1])
+    lengths = bounds_of_runs[:, 1] - bounds_of_runs[:, 0]
+    long_runs = bounds_of_runs[lengths >= LEAST_HELD].tolist()
     distinct = np.unique(values)
     if len(distinct) < 3 or not long_runs:
         return []
     # runs at an extreme value are clipped, which is another fault
     extremes = (distinct[0], distinct[-1])
     inner_runs = [(start, stop) for start, stop in long_runs if values[start] not in extremes]
-    digit = _digit_in_time(values)
-    if min(noise, roughness(values)) > _NOISE_DIGITS * digit:
+    quantum = _digit_in_time(values)
+    if min(noise, roughness(values)) > _NOISE_DIGITS * quantum:
         least_length = _LEAST_UPDATES * update_length(values)
         return [(start, stop) for start, stop in inner_runs if stop - start >= least_length]
     changes = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))
-    runs = _RunsOfRecord(values, changes, digit, bounds, lengths)
+    runs = _RunsOfRecord(values, changes, quantum, bounds_of_runs, lengths)
     return [(start, stop) for start, stop in inner_runs if _is_failure(start, stop, runs, others)]
 
 
@@ -179,25 +197,38 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
     if max(runs.changes[start], runs.changes[stop]) < least_jump:
         return False
 
-    # comparable runs acquit it: a dead zone, or pauses that fill much of the surroundings
-    low = max(start - _SURROUNDINGS * length, 0)
-    high = min(stop + _SURROUNDINGS * length, len(runs.values))
+    # no failure if runs of comparable length show a dead zone, or fill much of the surroundings
+    begin_of_surroundings = max(start - _SURROUNDINGS * length, 0)
+    end_of_surroundings = min(stop + _SURROUNDINGS * length, len(runs.values))
     is_comparable = runs.lengths >= _COMPARABLE * length
-    is_near = is_comparable & (runs.bounds[:, 0] >= low) & (runs.bounds[:, 1] <= high)
+    is_in_surroundings = (
+        is_comparable
+        & (runs.bounds[:, 0] >= begin_of_surroundings)
+        & (runs.bounds[:, 1] <= end_of_surroundings)
+    )
     values_of_comparable = runs.values[runs.bounds[is_comparable, 0]]
     is_dead_zone = np.count_nonzero(values_of_comparable == runs.values[start]) > 1
-    windows = [*range(start - length, low - 1, -length), *range(stop, high - length + 1, length)]
-    comparable_samples = runs.lengths[is_near].sum()
-    if len(windows) < 2 or is_dead_zone or comparable_samples > _MOST_COMPARABLE * (high - low):
+    window_starts = [
+        *range(start - length, begin_of_surroundings - 1, -length),
+        *range(stop, end_of_surroundings - length + 1, length),
+    ]
+    comparable_samples = runs.lengths[is_in_surroundings].sum()
+    if (
+        len(window_starts) < 2
+        or is_dead_zone
+        or comparable_samples > _MOST_COMPARABLE * (end_of_surroundings - begin_of_surroundings)
+    ):
         return False
 
     # does the record go in and out at speed?
-    changes_around = np.r_[runs.changes[low : start + 1], runs.changes[stop:high]]
+    changes_around = np.r_[
+        runs.changes[begin_of_surroundings : start + 1], runs.changes[stop:end_of_surroundings]
+    ]
     speed = max(least_jump, _PACE * float(np.mean(changes_around)))
     sides_at_speed = np.count_nonzero(runs.changes[[start, stop]] >= speed)
 
     # do other records move meanwhile, compared with windows of the same length around?
-    ranges = [np.ptp(others[first : first + length], axis=0) for first in windows]
+    ranges = [np.ptp(others[first : first + length], axis=0) for first in window_starts]
     usual_range = np.median(ranges, axis=0)
     range_meanwhile = np.ptp(others[start:stop], axis=0)
     moves = (range_meanwhile > _MOVING * usual_range) & (usual_range > 0.0)
@@ -210,23 +241,26 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
 
 
 def _digit_in_time(values: FloatArray) -> float:
-    """Return the quantum of a record in time (N,).
+    """Return the quantum of the readings (N,) of a record in time.
 
-    A record that rises throughout skips values of its sensor; its second differences do not.
+    Readings that rise steadily may differ by several quanta at every step. Their second differences
+    are then still as small as one quantum, and are tried as well.
     """
-    step = lattice_step(values)
-    if step is not None:
-        return step
-    bends = np.abs(np.diff(values, 2))
-    least_bend = least_beyond_rounding(bends[bends > 1e-9 * np.ptp(values)])
-    return min(quantum_of(values), least_bend or np.inf)
+    step_between_levels = lattice_step(values)
+    if step_between_levels is not None:
+        return step_between_levels
+    second_differences = np.abs(np.diff(values, 2))
+    least_second_difference = least_beyond_rounding(
+        second_differences[second_differences > 1e-9 * np.ptp(values)]
+    )
+    return min(quantum_of(values), least_second_difference or np.inf)
 
 
 def update_length(values: FloatArray) -> float:
-    """Return the number of samples that a logger usually takes of each reading of a slow sensor.
+    """Return how many samples a logger usually takes of each reading of a slower sensor.
 
-    It is the median length of runs of equal readings; 1 if readings repeat because of the sensor's
-    quantum.
+    The result is the median length of the runs of equal readings. It is 1 if the readings show the
+    quantum of the sensor, because they then repeat for another reason.
 
     Parameters
     ----------

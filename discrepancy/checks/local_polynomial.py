@@ -11,21 +11,34 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.campaign.sampling import is_even
 
 LOW_DEGREE = 5
-"""Least degree of the local polynomials, and the only one for unevenly spaced samples."""
+"""Lowest degree of the local polynomials, and the only degree for unevenly spaced samples."""
 Weights = Callable[[int, int], FloatArray]
-"""Returns the weights of a local polynomial's residual, by its half width and degree.
+"""Function from half width and degree of a local polynomial to the weights of its residual.
 
-They are (2 width + 1,) for even samples, (N - 2 width, 2 width + 1) for uneven ones."""
+The weights are (2 width + 1,) for evenly spaced samples, the same for all of them, and
+(N - 2 width, 2 width + 1) for unevenly spaced ones."""
 
 
 @lru_cache(maxsize=32)
 def event_patterns(width: int, degree: int) -> FloatArray:
-    """Return the residuals (4, 2 width + 1) of a wrong reading, a kink and two steps."""
-    places = np.arange(-2 * width, 2 * width + 1)
-    wrong_reading = places == 0
-    kink = np.abs(places)
-    step_at_sample = places >= 0
-    step_after_sample = places > 0
+    """Return the residuals that typical signals leave after the local polynomial is subtracted.
+
+    Parameters
+    ----------
+    width, degree : int
+        Half width of the neighbourhood in samples, and degree of the polynomial.
+
+    Returns
+    -------
+    (4, 2 width + 1) ndarray
+        Residuals around the middle sample for a single wrong reading there, a kink there, a step at
+        it, and a step after it.
+    """
+    offsets = np.arange(-2 * width, 2 * width + 1)
+    wrong_reading = offsets == 0
+    kink = np.abs(offsets)
+    step_at_sample = offsets >= 0
+    step_after_sample = offsets > 0
     weights = even_weights(width, degree)
     patterns = []
     for signal in (wrong_reading, kink, step_at_sample, step_after_sample):
@@ -57,9 +70,11 @@ class LocalPolynomial:
         self._weights[width] = weights(width, degree)
 
     def residual(self, values: FloatArray) -> FloatArray:
-        """Return samples minus prediction (N,), scaled to one scatter for noise.
+        """Return the residuals (N,) of a record (N,): each sample minus its prediction.
 
-        Zero at the edges.
+        For unevenly spaced samples the residuals are scaled so that white noise has the same
+        scatter in all of them. The first and last samples, which have no full neighbourhood of any
+        width, have the residual zero.
         """
         residual = np.zeros(len(values))
         for width, weights in self._weights.items():
@@ -81,10 +96,11 @@ class LocalPolynomial:
 
 @lru_cache(maxsize=32)
 def even_weights(width: int, degree: int) -> FloatArray:
-    """Return the weights (2 width + 1,) of a sample and its neighbours in the sample's residual.
+    """Return the weights (2 width + 1,) that give a sample's residual from its neighbourhood.
 
-    The residual is that of a polynomial that is fitted to the neighbours alone: the residual of a
-    Savitzky-Golay filter over its weight for the sample itself.
+    The residual is the sample minus a polynomial of least squares through its neighbours, without
+    the sample itself. It equals the residual of the Savitzky-Golay filter, which includes the
+    sample, divided by the weight of the sample in that residual (one minus its leverage).
     """
     weights = -savgol_coeffs(2 * width + 1, degree)
     weights[width] += 1.0
@@ -92,14 +108,15 @@ def even_weights(width: int, degree: int) -> FloatArray:
 
 
 def weights_at(time: FloatArray) -> Weights:
-    """Return the weights of local polynomials at times (N,), which are kept for all channels."""
+    """Return the function of weights for records at times (N,); it caches what it has computed."""
     return even_weights if is_even(time) else cache(partial(uneven_weights, time))
 
 
 def uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
-    """Return the weights of each sample and its neighbours for unevenly spaced times.
+    """Return the weights that give each sample's residual, for unevenly spaced samples.
 
-    They are scaled so that noise gives the same scatter as with evenly spaced samples.
+    As in `even_weights`, the polynomial is fitted to the neighbours alone. The weights are scaled
+    so that white noise gives the same scatter of residuals as with evenly spaced samples.
 
     Parameters
     ----------
@@ -114,14 +131,14 @@ def uneven_weights(time: FloatArray, width: int, degree: int) -> FloatArray:
         Weights of each sample that has all its neighbours.
     """
     inner_times = time[width : len(time) - width, np.newaxis]
-    places = sliding_window_view(time, 2 * width + 1) - inner_times
-    places /= np.max(np.abs(places), axis=1, keepdims=True)
-    basis = np.polynomial.polynomial.polyvander(np.delete(places, width, axis=1), degree)
-    # ridge: beside a wide gap the samples may not determine the whole polynomial
+    relative_times = sliding_window_view(time, 2 * width + 1) - inner_times
+    relative_times /= np.max(np.abs(relative_times), axis=1, keepdims=True)
+    basis = np.polynomial.polynomial.polyvander(np.delete(relative_times, width, axis=1), degree)
+    # a ridge, because next to a wide gap the samples may not determine the whole polynomial
     ridge = 1e-10 * np.eye(degree + 1)
-    inverse = np.linalg.inv(basis.transpose(0, 2, 1) @ basis + ridge)
-    # the prediction at the sample itself is the constant of the polynomial
-    prediction_weights = (basis @ inverse[..., :1])[..., 0]
+    inverse_gram = np.linalg.inv(basis.transpose(0, 2, 1) @ basis + ridge)
+    # the sample itself is at time zero, where the polynomial equals its constant coefficient
+    prediction_weights = (basis @ inverse_gram[..., :1])[..., 0]
     weights = np.insert(-prediction_weights, width, 1.0, axis=1)
     norm = np.linalg.norm(weights, axis=1, keepdims=True)
     return np.asarray(weights * (np.linalg.norm(even_weights(width, degree)) / norm))

@@ -30,12 +30,19 @@ MOST_OF_PRIOR = 0.9
 
 
 def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
-    """Return the posterior standard deviation of each calibrated parameter over its prior one.
+    """Return how much the records determine each calibrated parameter.
 
-    It comes from the information matrix of the fitted trials at the prior mean. Unknown initial
-    states are first fitted, because a model at rest shows no parameter. Gains, zeros, initial
-    states, constants of inputs and the other parameters are free within their priors, so that what
-    they explain as well is projected out.
+    The measure is the posterior standard deviation over the prior one, from the information matrix
+    of the fitted trials at the prior mean: 0 if a parameter is determined exactly, 1 if the records
+    do not depend on it. Gains, zeros, initial states, constants of inputs and all parameters are
+    unknown at the same time, so that a parameter counts as undetermined if others can explain the
+    same readings. Unknown initial states are fitted first, because a model at rest does not depend
+    on any parameter.
+
+    Returns
+    -------
+    dict of str to float
+        Ratio by the name of the parameter, for parameters with a prior standard deviation above 0.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     channel_weights = np.ones(len(problem.channel_names))
@@ -43,7 +50,8 @@ def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
     information = normal_equations(problem, at_prior, Candidate(), channel_weights).matrix
     covariance = np.linalg.pinv(information, hermitian=True)
     count = problem.shared.count
-    ratios = np.sqrt(np.diag(covariance)[:count])  # unknowns are in prior standard deviations
+    # the unknowns are scaled by their prior standard deviations, so that these are ratios already
+    ratios = np.sqrt(np.diag(covariance)[:count])
     prior_deviations = problem.shared.scale[:count]
     return {
         parameter.name: float(ratio)
@@ -55,7 +63,10 @@ def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
 
 
 def unobservable(campaign: Campaign, model: Model) -> Iterator[DataFault]:
-    """Yield a limit if the records do not determine some calibrated parameters."""
+    """Yield one fault that names the calibrated parameters that the records do not determine.
+
+    Those keep more than `MOST_OF_PRIOR` of their prior standard deviation.
+    """
     ratios = posterior_over_prior(campaign, model)
     undetermined = {name: ratio for name, ratio in ratios.items() if ratio > MOST_OF_PRIOR}
     if undetermined:
@@ -74,19 +85,23 @@ LEAST_PERIODS = 3.0
 LEAST_SAMPLES = 4.0
 """Fewest samples in a period of the first mode."""
 MATTERS = 0.3
-"""Difference between courses of an input that matters, over the noise (rms)."""
+"""Least effect of an input's course between samples that is reported (rms, over the noise)."""
 
 
 def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ...]:
-    """Return the faults that show when data are compared with the model at its prior mean.
+    """Return the faults of the data that a comparison with the model at its prior mean shows.
 
-    The scale of the data over the prediction is found for each channel and trial. A scale is a unit
-    slip if two units of the channel differ by it (within a factor of 3 from 200 on, of 2 from 20
-    on, of 1.35 from 7 on, of 1.1 below) in all its trials; if all channels of some trials slip
-    alike, the input of those trials does. Negative scales are reversed signs. Channels of one
-    quantity are swapped if exchanging them leaves each less than half of its misfit and explains 30
-    units of chi-squared. A noise record with a line at the first mode is a limit, and so are an
-    input whose course between samples matters and a parameter that the records do not determine.
+    The scale is the ratio of data to prediction for each channel and trial. The checks are:
+
+    - Unit slip: two units of the channel's quantity differ by the scale in all its trials (within a
+      factor of 3 for slips from 200 on, 2 from 20 on, 1.35 from 7 on, 1.1 below). If all channels
+      of a trial have the same slip, the input of that trial has it.
+    - Reversed sign: the scale is negative.
+    - Swapped channels: exchanging two channels of one quantity leaves each less than half of its
+      misfit and lowers chi-squared by 30 or more.
+    - Limits of what can be concluded: a noise record with a spectral line at the first mode, an
+      input whose course between samples matters, and a parameter that the records do not determine.
+
     Signals of unknown scale are not checked.
 
     Parameters
@@ -125,7 +140,10 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
 
 
 def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
-    """Return the conditions of a trial before a fit: prior means, nominal release, exact clock."""
+    """Return the conditions under which a trial is simulated before any fit.
+
+    The parameters have their prior means, the release its nominal displacement, the clock no error.
+    """
     parameters = np.array([mean for mean, _ in model.stated(campaign)])
     initial_modes = np.zeros((0, 2))
     if trial.release is not None:
@@ -136,36 +154,49 @@ def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
 
 
 def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[DataFault]:
-    """Yield a limit if the course of inputs between samples matters and is not stated.
+    """Yield a fault if the course of inputs between their samples matters and is not stated.
 
-    Straight lines between the samples are compared with curves. There is no limit if no channel
-    with a noise record shows a difference.
+    The key `hold` of a campaign states whether an input is smooth, linear or constant between its
+    samples. For inputs without this key, the model's response to straight lines is compared with
+    its response to smooth curves. The fault is reported if the two differ by more than `MATTERS`
+    times the noise (rms) in any channel with a noise record. It limits the conclusions, but does
+    not make the data wrong.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign, for channels and noise.
+    model : Model
+        The model without a patch.
+    trial : Trial
+        The trial; only forced and driven trials have such inputs.
     """
     if trial.kind not in (TrialKind.FORCED, TrialKind.DRIVEN) or len(trial.time) < 4:
         return
-    is_force = trial.kind is TrialKind.FORCED and trial.hold is None
-    unstated = [recorded.name for recorded in trial.inputs if recorded.hold is None]
-    if is_force:
-        unstated = ["force"]
-    if not unstated:
+    force_is_open = trial.kind is TrialKind.FORCED and trial.hold is None
+    open_inputs = [recorded.name for recorded in trial.inputs if recorded.hold is None]
+    if force_is_open:
+        open_inputs = ["force"]
+    if not open_inputs:
         return
     smooth_inputs = tuple(
-        replace(recorded, hold=Hold.SMOOTH) if recorded.name in unstated else recorded
+        replace(recorded, hold=Hold.SMOOTH) if recorded.name in open_inputs else recorded
         for recorded in trial.inputs
     )
     smooth_trial = replace(
-        trial, inputs=smooth_inputs, hold=Hold.SMOOTH if is_force else trial.hold
+        trial, inputs=smooth_inputs, hold=Hold.SMOOTH if force_is_open else trial.hold
     )
     conditions = prior_mean(campaign, model, trial)
-    straight = observe(model, campaign, trial, ModelPatch(), conditions).values
-    smooth = observe(model, campaign, smooth_trial, ModelPatch(), conditions).values
+    response_to_lines = observe(model, campaign, trial, ModelPatch(), conditions).values
+    response_to_curves = observe(model, campaign, smooth_trial, ModelPatch(), conditions).values
+    # infinite without a noise record, so that the difference counts as zero
     noise = [trial.noise_deviation(campaign.channels[name]) or np.inf for name in trial.channels]
-    differences = np.sqrt(np.mean((straight - smooth) ** 2, axis=0)) / noise
+    differences = np.sqrt(np.mean((response_to_lines - response_to_curves) ** 2, axis=0)) / noise
     largest = differences.max()
     if largest > MATTERS:
-        names = ", ".join(map(repr, unstated))
+        names = ", ".join(map(repr, open_inputs))
         channel = trial.channels[int(differences.argmax())]
-        table = "[[trial]]" if is_force else "[[input]]"
+        table = "[[trial]]" if force_is_open else "[[input]]"
         sentence = (
             f"In the trial {trial.name!r} straight lines and curves between the samples of {names} "
             f"differ by {largest:.2g} noise deviations (rms) in {channel!r}: say what it did, hold "
@@ -176,7 +207,10 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
 
 
 def _output_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
-    """Yield a fault for each channel whose output the model lacks, or has as another quantity."""
+    """Yield a fault for each channel without a matching output of the model.
+
+    The output does not exist, or is of another quantity than the channel measures.
+    """
     for name, channel in campaign.channels.items():
         quantity = model.output_quantity(channel.output)
         if quantity is None:
@@ -223,7 +257,17 @@ def _length_faults(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
 
 
 def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> str:
-    """Return the message that a trial has too few samples in a period."""
+    """Return the message that a trial has too few samples in a period of the first mode.
+
+    Parameters
+    ----------
+    trial : Trial
+        The trial.
+    frequency : float
+        Frequency of the first mode [Hz].
+    samples : float
+        Number of samples in a period.
+    """
     in_milliseconds = 1e3 * samples
     if samples < LEAST_SAMPLES / 10.0 and in_milliseconds >= LEAST_SAMPLES:
         return (
@@ -239,34 +283,57 @@ def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> st
 
 
 def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> Iterator[DataFault]:
-    """Yield a fault for each channel that stands still under loads at rest that would move it.
+    """Yield a fault for each channel with constant readings in a static trial that should change.
 
-    `check_data` reports the channels that stand still in a motion, or in all their trials.
+    By the prediction they would change by more than `ABOVE_NOISE` times the noise or the sensor's
+    quantum. `check_data` reports, without a model, the channels that are constant in a dynamic
+    trial or in all their trials.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    predictions : mapping of str to (N, C) ndarray
+        Predicted readings by the name of the trial.
     """
     for trial in campaign.trials:
         for column, name in enumerate(trial.channels):
             if trial.is_dynamic or not is_still(trial, name):
                 continue
             readings = np.concatenate([values for _, values, _ in campaign.records(name)])
-            digit = quantum_of(readings)
+            quantum = quantum_of(readings)
             noise = trial.noise_deviation(campaign.channels[name])
             predicted_range = np.ptp(predictions[trial.name][:, column])
-            if digit and predicted_range > ABOVE_NOISE * max(noise, digit):
+            if quantum and predicted_range > ABOVE_NOISE * max(noise, quantum):
                 yield dead_fault(trial, name)
 
 
 def _sign_faults(
     campaign: Campaign, scales: Mapping[tuple[str, str], float]
 ) -> Iterator[DataFault]:
-    """Yield a fault for each channel whose scale is negative in all its trials."""
+    """Yield a fault for each channel whose sign is opposite to the model's in all its trials.
+
+    If that holds for all of several channels, one fault reports the sign of the forces instead.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    scales : mapping of (str, str) to float
+        Signed ratio of data to prediction by channel and trial; see `data_scales`.
+    """
     dynamic_trials = {trial.name for trial in campaign.trials if trial.is_dynamic}
     channels_at_rest = {name for name, trial in scales if trial not in dynamic_trials}
     scales_of_channels: dict[str, list[float]] = defaultdict(list)
     for (name, trial), scale in scales.items():
-        # a filter may turn the phase of a motion: readings at rest decide where there are any
+        # a filter may reverse the phase of a motion: readings at rest decide, if there are any
         if trial not in dynamic_trials or name not in channels_at_rest:
             scales_of_channels[name].append(scale)
-    reversed_channels = [name for name, found in scales_of_channels.items() if max(found) < 0.0]
+    reversed_channels = [
+        name
+        for name, scales_of_channel in scales_of_channels.items()
+        if max(scales_of_channel) < 0.0
+    ]
     if len(reversed_channels) == len(scales_of_channels) > 1:
         sentence = (
             "All channels move against the model: check the sign of the forces, which are positive "

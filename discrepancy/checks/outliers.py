@@ -22,9 +22,9 @@ from discrepancy.checks.row_outliers import NORMAL_OVER_MAD, repeat_outliers, ro
 LARGEST_SHARE = 0.03
 """Largest fraction of a record in time that may be left out; above it the record is at fault."""
 SIGNIFICANT = 5.0
-"""Residual of an outlier in robust standard deviations, and in those of the channel's noise."""
+"""Least residual of an outlier, in robust standard deviations and in those of the noise."""
 WRONG_END = 8.0
-"""Residual of a wrong reading at the ends of a record, beside the prediction of a model."""
+"""Least deviation of a wrong reading at the ends of a record, in standard deviations."""
 _SHAPES = (
     (3, 5),
     (4, 5),
@@ -44,9 +44,9 @@ _EDGE = 3
 _ENDS = (slice(0, _EDGE), slice(-_EDGE, None))
 """The first and the last samples of a record."""
 _NEIGHBOURS = [0, 1, 3, 4]
-"""Places of the neighbours of the middle one of five samples."""
+"""Indices of the neighbours of the middle sample among five samples in a row."""
 _NEAR = 25
-"""Half width of the neighbourhood with whose scatter a sample is compared."""
+"""Half width of the window, in samples, whose scatter a residual is compared with."""
 _PASSES = 8
 """Most passes in which outliers are found and replaced."""
 
@@ -54,18 +54,19 @@ _PASSES = 8
 def mark_outliers(campaign: Campaign) -> Campaign:
     """Return the campaign with isolated outliers left out, and a remark for each channel and trial.
 
-    Dynamic trials: a sample is compared with a local polynomial through its neighbours, whose width
-    is the one that predicts the record best. It is an outlier if its residual is five robust
-    standard deviations of the whole record and of its surroundings, and five of the channel's noise
-    record, and if it is isolated: three of five samples in a row are an event, such as an impact,
-    and stay, and so does a sample at a kink or a step. The first and last three samples are not
-    judged. If more than 3 % of a record would go, nothing is left out (`check_data` reports a
-    fault), and neither if the campaign accepts outliers.
+    Dynamic trials: each sample is compared with a local polynomial through its neighbours; of
+    several widths and degrees the one that predicts the record best is used. A sample is an outlier
+    if its residual exceeds five robust standard deviations of the residuals of the whole record,
+    five of those around it, and five standard deviations of the channel's noise, and if it is
+    isolated. Three outliers among five samples in a row are an event such as an impact and are
+    kept, and so is a sample at a kink or a step. The first and last three samples are not judged.
+    Nothing is left out if more than 3 % of a record would be (`check_data` then reports a fault),
+    or if the campaign accepts outliers.
 
-    Static and flight trials: a row of at least three repeats is compared with their median.
-    Otherwise, in trials of eight or more rows, one row may go if a parabola through the others
-    explains them within twice the noise and misses this one by eight deviations. Both need a noise
-    record.
+    Static and flight trials: if a trial was done at least three times, each row is compared with
+    the median over these repeats. Otherwise one row of a trial with eight or more may be left out,
+    if a parabola through the others scatters by less than twice the noise and misses this row by
+    more than eight standard deviations. Both rules need a noise record.
     """
     used = {trial.name: trial.used.copy() for trial in campaign.trials}
     remarks = list(campaign.remarks)
@@ -86,7 +87,17 @@ def mark_outliers(campaign: Campaign) -> Campaign:
 
 
 def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
-    """Yield trial, channel and outliers (N,) of each record that has any."""
+    """Yield the outliers of each record of a campaign that has any.
+
+    Yields
+    ------
+    trial : Trial
+        The trial.
+    channel : str
+        Name of the channel.
+    is_outlier : (N,) ndarray of bool
+        Which of its readings are outliers.
+    """
     # all channels of a trial have its times
     weights = {trial.name: weights_at(trial.time) for trial in campaign.trials if trial.is_dynamic}
     for name, channel in campaign.channels.items():
@@ -110,7 +121,7 @@ def sample_outliers(
     *,
     noise: float = 0.0,
 ) -> BoolArray:
-    """Return which samples (N,) of a record are isolated outliers.
+    """Return which samples (N,) of a record in time are isolated outliers.
 
     `mark_outliers` states the rules.
 
@@ -126,21 +137,26 @@ def sample_outliers(
         Standard deviation of the channel's noise; 0 if it is not known.
     """
     count = len(values)
-    size = float(np.max(np.abs(values), initial=0.0))
+    largest_reading = float(np.max(np.abs(values), initial=0.0))
     if used is None:
         used = np.ones(count, dtype=bool)
-    if count < 4 * _EDGE + 4 or used.sum() < 0.5 * count or size == 0.0:
+    if count < 4 * _EDGE + 4 or used.sum() < 0.5 * count or largest_reading == 0.0:
         return np.zeros(count, dtype=bool)
     # scaled, so that squares of readings of any size stay in range
-    rows = np.arange(count)
-    record = np.where(used, values / size, np.interp(rows, rows[used], values[used] / size))
+    indices = np.arange(count)
+    record = np.where(
+        used,
+        values / largest_reading,
+        np.interp(indices, indices[used], values[used] / largest_reading),
+    )
     polynomial = _best_polynomial(record, weights or even_weights)
-    # least scatter by rounding to digits, which a record at rest may not show
+    # Rounding to a quantum q has the standard deviation q / sqrt(12). A record at rest may show no
+    # rounding at all, so that this is the least scatter that residuals are compared with.
     weight_norm = float(np.linalg.norm(even_weights(polynomial.width, polynomial.degree)))
-    rounding = quantum_of(values[used] / size) * 12.0**-0.5 * weight_norm
+    rounding = quantum_of(values[used] / largest_reading) * 12.0**-0.5 * weight_norm
 
     # readings within the noise are no outliers
-    noise_limit = SIGNIFICANT * noise / size
+    noise_limit = SIGNIFICANT * noise / largest_reading
     suspects, cleaned = _suspects(record, polynomial, rounding, noise_limit)
     # judge the suspects again, now with clean neighbours
     residual = polynomial.residual(cleaned)
@@ -149,7 +165,7 @@ def sample_outliers(
     is_beyond_noise = deviation > noise_limit
     is_beyond_scatter = deviation > SIGNIFICANT * _scale(residual, rounding)
     outliers = used & suspects & is_beyond_noise & is_beyond_scatter
-    # three of five samples in a row are an event, and no single wrong readings
+    # three outliers among five samples in a row are an event and not single wrong readings
     is_crowded = np.convolve(outliers, np.ones(5), mode="same") >= 3
     is_event = np.convolve(is_crowded, np.ones(5), mode="same") > 0
     isolated: BoolArray = outliers & ~is_event
@@ -169,7 +185,10 @@ def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
 def _suspects(
     record: FloatArray, polynomial: LocalPolynomial, rounding: float, noise_limit: float
 ) -> tuple[BoolArray, FloatArray]:
-    """Return the samples that may be outliers, worst first, and the record without them.
+    """Find the samples that may be outliers, and replace them by their predictions.
+
+    In each pass the worst sample of each neighbourhood is replaced, because a wrong reading spoils
+    the predictions of the samples around it.
 
     Parameters
     ----------
@@ -178,16 +197,16 @@ def _suspects(
     polynomial : LocalPolynomial
         The polynomial that predicts each sample.
     rounding : float
-        Scatter of its residuals by rounding to digits.
+        Standard deviation of its residuals that rounding of the readings causes.
     noise_limit : float
-        Residual up to which a sample is within the noise of its channel.
+        Largest residual that the noise of the channel explains.
 
     Returns
     -------
     suspects : (N,) ndarray of bool
-        Samples that are off and not at an event, such as a kink.
+        Samples with a significant residual that are not at an event such as a kink.
     cleaned : (N,) ndarray
-        The record with these samples as predicted.
+        The record with the predictions in place of these samples.
     """
     count = len(record)
     suspects = np.zeros(count, dtype=bool)
@@ -199,7 +218,6 @@ def _suspects(
         ratio = np.abs(residual) / _scale(residual, rounding)
         ratio[:edge] = 0.0
         ratio[-edge:] = 0.0
-        # only the worst of each neighbourhood: it spoils the prediction of the samples around it
         neighbourhood = 2 * polynomial.width + 1
         is_worst = ratio == maximum_filter1d(ratio, neighbourhood, mode="constant")
         is_beyond_noise = np.abs(residual) > noise_limit
@@ -211,17 +229,19 @@ def _suspects(
         events[new[at_event]] = True
         new_suspects = new[~at_event]
         suspects[new_suspects] = True
+        # for unevenly spaced samples the weight of a sample in its own residual is not one
         correction = residual / polynomial.weight_of_sample(count)
         cleaned[new_suspects] -= correction[new_suspects]
     return suspects, cleaned
 
 
 def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0) -> BoolArray:
-    """Return which samples (N, C) at the ends of a trial's records are single wrong readings.
+    """Return which of the first and last three samples of records are single wrong readings.
 
-    `sample_outliers` cannot judge the ends; beside the prediction of a model they can be judged.
-    What several channels show at once, or several samples in a row, is no single wrong reading but
-    a release, an impact, or a trigger that came late.
+    `sample_outliers` does not judge these samples, because they lack neighbours on one side. The
+    residual of a model's prediction makes it possible. A deviation in several channels at once, or
+    in several samples of one end, is not a single wrong reading but a release, an impact, or a
+    trigger that came late.
 
     Parameters
     ----------
@@ -232,6 +252,11 @@ def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float 
     noise : (C,) ndarray or float
         Standard deviation of each channel's noise, in the unit of the residual; 0 if it is not
         known.
+
+    Returns
+    -------
+    (N, C) ndarray of bool
+        True for a wrong reading.
     """
     wrong = np.zeros(residual.shape, dtype=bool)
     noise = np.broadcast_to(noise, residual.shape[1:])
@@ -248,67 +273,77 @@ def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float 
 
 
 def _wrong_ends_of_channel(residual: FloatArray, noise: float) -> BoolArray:
-    """Return which samples (N,) at the ends of a record are single wrong readings.
+    """Return which samples (N,) at the ends of one record are single wrong readings.
+
+    A sample is wrong if its residual is more than twice as large as that of its two neighbours on
+    either side, and differs from their median by more than `WRONG_END` standard deviations.
 
     Parameters
     ----------
     residual : (N,) ndarray
         Readings minus prediction.
     noise : float
-        Standard deviation of the noise.
+        Standard deviation of the noise; 0 if it is not known.
     """
     padded = np.pad(residual, 2, constant_values=np.nan)
     neighbours = sliding_window_view(padded, 5)[:, _NEIGHBOURS]
     deviation = residual - np.nanmedian(neighbours, axis=1)
-    sticks_out = np.abs(residual) > 2.0 * np.nanmax(np.abs(neighbours), axis=1)
+    exceeds_neighbours = np.abs(residual) > 2.0 * np.nanmax(np.abs(neighbours), axis=1)
     # the scatter near each end, where the motion may be fastest
-    near_ends = (deviation[: 4 * _NEAR], deviation[-4 * _NEAR :])
+    deviations_near_ends = (deviation[: 4 * _NEAR], deviation[-4 * _NEAR :])
     wrong = np.zeros(len(residual), dtype=bool)
-    for end, near_end in zip(_ENDS, near_ends, strict=True):
-        scatter = NORMAL_OVER_MAD * float(np.median(np.abs(near_end)))
+    for end, deviation_near_end in zip(_ENDS, deviations_near_ends, strict=True):
+        scatter = NORMAL_OVER_MAD * float(np.median(np.abs(deviation_near_end)))
         scale = max(scatter, noise, 1e-300)
-        is_off = sticks_out[end] & (np.abs(deviation[end]) > WRONG_END * scale)
-        if is_off.sum() == 1:
-            wrong[end] = is_off
+        is_wrong = exceeds_neighbours[end] & (np.abs(deviation[end]) > WRONG_END * scale)
+        if is_wrong.sum() == 1:
+            wrong[end] = is_wrong
     return wrong
 
 
 def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> bool:
-    """Return whether a kink or a step explains the residuals near a sample better than one reading.
+    """Return whether a kink or a step explains residuals better than a single wrong reading does.
+
+    Each pattern of `event_patterns` is fitted to the residuals around the sample; the pattern that
+    explains the largest sum of squares decides.
 
     Parameters
     ----------
     residual : (N,) ndarray
         Residuals of the local polynomial.
     index : int
-        The sample.
+        Index of the sample.
     polynomial : LocalPolynomial
         The polynomial.
     """
     width = polynomial.width
     low = max(index - width, 0)
     high = min(index + width + 1, len(residual))
-    first = low - index + width
-    patterns = event_patterns(width, polynomial.degree)[:, first : first + high - low]
+    first_of_pattern = low - index + width
+    patterns = event_patterns(width, polynomial.degree)[
+        :, first_of_pattern : first_of_pattern + high - low
+    ]
+    # sum of squares that a pattern p explains by least squares: (p . r)^2 / p . p
     explained = (patterns @ residual[low:high]) ** 2 / np.sum(patterns**2, axis=1)
+    # the first pattern is the single wrong reading
     return int(np.argmax(explained)) > 0
 
 
 def _scatter(residual: FloatArray) -> float:
-    """Return the robust standard deviation of residuals (N,), without those at the edges."""
+    """Return the robust standard deviation of residuals (N,), without the unjudged edges."""
     return NORMAL_OVER_MAD * float(np.median(np.abs(residual[_EDGE:-_EDGE])))
 
 
 def _scale(residual: FloatArray, least: float) -> FloatArray:
-    """Return the scatter (N,) with which each residual is compared.
+    """Return the robust standard deviation (N,) with which each residual (N,) is compared.
 
-    It is that of the whole record or that of its surroundings, whichever is larger, and at least
-    `least`.
+    It is that of the whole record or that of the samples around it, whichever is larger, and at
+    least `least`.
     """
-    of_record = max(_scatter(residual), least, 1e-300)
-    inner = np.abs(residual[_EDGE:-_EDGE])
-    if len(inner) <= 2 * _NEAR:
-        return np.full(len(residual), of_record)
-    windows = sliding_window_view(np.pad(inner, _NEAR, mode="reflect"), 2 * _NEAR + 1)
-    of_surroundings = np.pad(np.median(windows, axis=1), _EDGE, mode="edge")
-    return np.maximum(of_record, NORMAL_OVER_MAD * of_surroundings)
+    scatter_of_record = max(_scatter(residual), least, 1e-300)
+    inner_magnitudes = np.abs(residual[_EDGE:-_EDGE])
+    if len(inner_magnitudes) <= 2 * _NEAR:
+        return np.full(len(residual), scatter_of_record)
+    windows = sliding_window_view(np.pad(inner_magnitudes, _NEAR, mode="reflect"), 2 * _NEAR + 1)
+    median_of_surroundings = np.pad(np.median(windows, axis=1), _EDGE, mode="edge")
+    return np.maximum(scatter_of_record, NORMAL_OVER_MAD * median_of_surroundings)

@@ -29,12 +29,13 @@ _NOISE_FACTOR = 2.0
 
 
 def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
-    """Return the faults that a campaign shows by itself, by channel and trial.
+    """Return the faults of a campaign's data that can be found without a model.
 
-    A limit of what can be concluded is reported for a channel without a noise record, or whose
-    record contradicts repeats (F test at 0.1 %) or itself (by a factor of two), or moves. A fault
-    of the data (`DataFault.fatal`) is reported for a dead, clipped, held or copied channel, and for
-    more than 3 % of outliers in a record in time.
+    Some faults only limit what can be concluded: a channel without a noise record, or a noise
+    record that contains a motion, or that contradicts repeats (F test at 0.1 %) or the roughness of
+    the readings (by a factor of two). Others make the data wrong (`DataFault.fatal`): a channel
+    that is constant (dead), clipped, stuck for a time (held) or a copy of another one, and more
+    than 3 % of outliers in a record in time.
     """
     faults: list[DataFault] = []
     for name, channel in campaign.channels.items():
@@ -68,7 +69,7 @@ def _outlier_faults(campaign: Campaign) -> Iterator[DataFault]:
 
 
 def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
-    """Yield a limit if a channel has no noise record, or one that its readings contradict."""
+    """Yield a fault if a channel has no noise record, or if its readings contradict the record."""
     record = channel.noise
     if record is None:
         sentence = (
@@ -82,8 +83,8 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
         return
     stated = record.standard_deviation
     contradiction = ""
-    # Only downwards: a fast motion may be rougher than the noise, but nothing is smoother than its
-    # noise.
+    # One-sided: a fast motion may make a record rougher than its noise, but no record is smoother
+    # than its noise.
     least_roughness = _least_roughness(campaign, channel.name)
     recorded_roughness = stated
     if record.samples is not None and len(record.samples) >= LEAST_FOR_COLOUR:
@@ -111,7 +112,10 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
 
 
 def _least_roughness(campaign: Campaign, name: str) -> float:
-    """Return the least roughness of a channel's records in time, at a noise factor of one."""
+    """Return the least roughness of a channel's dynamic records, scaled to a noise factor of one.
+
+    It is infinite if no record is long enough.
+    """
     least = np.inf
     for trial, values, _ in campaign.records(name):
         if trial.is_dynamic and len(values) >= LEAST_FOR_COLOUR:
@@ -123,7 +127,7 @@ def _least_roughness(campaign: Campaign, name: str) -> float:
 
 
 def _dead_faults(campaign: Campaign, name: str) -> Iterator[DataFault]:
-    """Yield a fault for each trial in which a channel shows one value by mistake."""
+    """Yield a fault for each trial in which a channel is constant although it should change."""
     trials = [trial for trial, *_ in campaign.records(name)]
     still = [trial for trial in trials if is_still(trial, name)]
     for trial in still:
@@ -176,11 +180,12 @@ def _clipped_faults(
 
 
 def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = None) -> int:
-    """Return the length of the longest run of readings at an extreme that is clipped; 0 if none is.
+    """Return the length of the longest clipped run of readings at an extreme; 0 if none is clipped.
 
-    A run is clipped if the record would have gone beyond the extreme by more than some quanta of
-    the sensor (`quantum_of`) and six deviations of its scatter. A record with few digits is flat at
-    its turning points, too, but only by a digit.
+    A run is clipped if an extrapolation of the other readings exceeds the extreme by more than some
+    quanta of the sensor (`quantum_of`) and six standard deviations of its scatter. A record of
+    coarse quanta is flat at its turning points, too, but there it would exceed the extreme only by
+    about a quantum.
 
     Parameters
     ----------

@@ -21,13 +21,15 @@ LARGEST_LINE = 0.05
 LEAST_PERIODS = 8.0
 """Fewest periods in a noise record in which a line is searched."""
 NEAR = 0.1
-"""Relative error of the model's frequency that is allowed for."""
+"""Half width of the band around the model's frequency in which a line is searched, relative."""
 _LEVEL = 1e-5
 """Level of the F test between quarters of a noise record."""
 
 
 def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[DataFault]:
-    """Yield a limit for each channel whose noise record moves.
+    """Yield a fault for each channel whose noise record contains more than stationary noise.
+
+    Such a record overestimates the noise, which limits what can be concluded.
 
     Parameters
     ----------
@@ -51,14 +53,25 @@ def rest_faults(campaign: Campaign, frequency: float | None = None) -> Iterator[
 
 
 def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
-    """Return what a noise record contains beside stationary noise, as a verb phrase.
+    """Return what a noise record contains besides stationary noise.
 
-    None if nothing.
+    Without a frequency two contents are searched. One is a drift: a cubic in time that has more
+    than `LARGEST_DRIFT` of the variance. The other is an unsteady scatter: two quarters of the
+    record whose standard deviations differ by at least a factor of two, and significantly by an F
+    test at 1e-5. With a frequency, a vibration is searched: a spectral line within 10 % of the
+    frequency that has more than 5 % of the variance. Lines at mains frequencies do not count.
 
-    Without a frequency that is a cubic in time with most of the variance, or quarters that scatter
-    differently (F test at 1e-5 with the degrees of freedom that correlation leaves, and a factor of
-    two). With the frequency of a mode [Hz] it is a line within 10 % of it with more than 5 % of the
-    variance. Lines of the mains are not a motion.
+    Parameters
+    ----------
+    record : NoiseRecord
+        The noise record.
+    frequency : float, optional
+        Frequency of a mode [Hz].
+
+    Returns
+    -------
+    str or None
+        Verb phrase for a message, such as "drifts by ..."; None if there is only stationary noise.
     """
     if record.samples is None or record.interval is None or len(record.samples) < SHORTEST:
         return None
@@ -74,9 +87,16 @@ def moves(record: NoiseRecord, frequency: float | None = None) -> str | None:
 
 
 def _vibration(residual: FloatArray, interval: float, frequency: float) -> str | None:
-    """Return the vibration at a mode's frequency [Hz] in a noise record (n,).
+    """Return the phrase about a vibration at a mode's frequency in a noise record; None without it.
 
-    None if there is none.
+    Parameters
+    ----------
+    residual : (n,) ndarray
+        The noise record without mains lines, mean removed.
+    interval : float
+        Its sampling interval [s].
+    frequency : float
+        Frequency of the mode [Hz].
     """
     is_short = frequency * interval * len(residual) < LEAST_PERIODS
     if is_short or any(abs(frequency / mains - 1.0) < NEAR for mains in MAINS):
@@ -91,23 +111,31 @@ def _vibration(residual: FloatArray, interval: float, frequency: float) -> str |
 
 
 def _unsteady_scatter(residual: FloatArray, interval: float) -> str | None:
-    """Return which quarter of a noise record (n,) scatters more than another; None if none does."""
+    """Return the phrase about the quarter of a noise record that scatters most; None if all agree.
+
+    Parameters
+    ----------
+    residual : (n,) ndarray
+        The noise record without mains lines and drift.
+    interval : float
+        Its sampling interval [s].
+    """
     quarters = np.array_split(residual, 4)
-    # means of absolute values, in which single spikes weigh little
+    # mean absolute values, which single spikes change less than the standard deviation
     scatter = np.array([np.mean(np.abs(quarter)) for quarter in quarters])
     loudest = int(scatter.argmax())
     quietest = int(scatter.argmin())
     ratio = np.inf
     if scatter[quietest] > 0.0:
         ratio = float(scatter[loudest] / scatter[quietest])
-    freedom = (_freedom(quarters[loudest]), _freedom(quarters[quietest]))
-    # 12 ordered pairs of quarters
-    p_value = 12.0 * f_distribution.sf(ratio**2, *freedom)
+    degrees_of_freedom = (_freedom(quarters[loudest]), _freedom(quarters[quietest]))
+    # Bonferroni: the largest ratio among 12 ordered pairs of quarters
+    p_value = 12.0 * f_distribution.sf(ratio**2, *degrees_of_freedom)
     if ratio < LARGEST_RATIO or p_value > _LEVEL:
         return None
-    first = sum(map(len, quarters[:loudest]))
-    begin = first * interval
-    end = (first + len(quarters[loudest])) * interval
+    first_sample = sum(map(len, quarters[:loudest]))
+    begin = first_sample * interval
+    end = (first_sample + len(quarters[loudest])) * interval
     return (
         f"scatters {ratio:.2g} times as much from {begin:.4g} to {end:.4g} s as where it is "
         "quietest"
@@ -115,6 +143,9 @@ def _unsteady_scatter(residual: FloatArray, interval: float) -> str | None:
 
 
 def _freedom(series: FloatArray) -> float:
-    """Return the degrees of freedom of the variance of a series (n,) that is correlated in time."""
+    """Return the effective number of independent samples in a series (n,) correlated in time.
+
+    It is the degrees of freedom of the variance of the series.
+    """
     rho, chance = autocorrelation([series])
     return len(series) / times_fewer(rho, chance)

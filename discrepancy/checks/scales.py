@@ -11,24 +11,27 @@ from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.held import roughness
 
 ABOVE_NOISE = 5.0
-"""Size, in standard deviations of the noise, above which a reading is clear."""
+"""Least size of a clear reading, in standard deviations of the noise."""
 _VISIBLE = 0.01
-"""Fraction of the largest prediction of its quantity below which a channel shows nothing."""
+"""Least predicted amplitude of a channel, as a fraction of the largest of its quantity.
+
+Below it the load has hardly any effect on the channel."""
 _AGREE = 0.9
-"""Fraction of the pairs of loads whose slopes must have one sign."""
+"""Least fraction of the pairs of rows whose slopes must have one sign."""
 _NOTHING = 1e9
-"""Data over prediction above which the model shows rounding alone."""
+"""Ratio of data to prediction above which the prediction is only a rounding error."""
 _FLOOR = 0.02
-"""Relative error of a prediction that does not make a channel another one."""
+"""Relative error that any prediction may have, in a comparison of channels."""
 
 
 def data_scales(
     campaign: Campaign, predictions: Mapping[str, FloatArray]
 ) -> dict[tuple[str, str], float]:
-    """Return the signed scale of data over prediction by channel and trial, where it is determined.
+    """Return the signed ratio of data to prediction for each channel and trial that determine it.
 
-    It is the robust slope of data over prediction for readings at rest (static, flight), and the
-    ratio of amplitudes for records in time, whose phase the model need not predict.
+    For readings at rest (static and flight trials) it is the robust slope of the data over the
+    prediction. For records in time it is the ratio of their amplitudes, because the model need not
+    predict their phase.
 
     Parameters
     ----------
@@ -36,6 +39,11 @@ def data_scales(
         The campaign.
     predictions : mapping of str to (N, C) ndarray
         Predicted readings by the name of the trial.
+
+    Returns
+    -------
+    dict of (str, str) to float
+        Ratio by the names of channel and trial.
     """
     scales = {}
     for trial in campaign.trials:
@@ -73,7 +81,10 @@ def _largest_amplitudes(
 
 
 def _amplitude(values: FloatArray, trial: Trial) -> float:
-    """Return the amplitude of readings (N,): rms about their median in time, else their largest."""
+    """Return the amplitude of readings (N,) in a trial.
+
+    It is the root mean square about the median for a dynamic trial, else the largest magnitude.
+    """
     if len(values) == 0:
         return 0.0
     if trial.is_dynamic:
@@ -84,61 +95,65 @@ def _amplitude(values: FloatArray, trial: Trial) -> float:
 def _static_scale(
     data: FloatArray, model: FloatArray, noise: float, zero_deviation: float
 ) -> float:
-    """Return the scale of readings at rest: a median slope, or a ratio at one load.
+    """Return the ratio of readings at rest to their prediction; 0 if it is not determined.
 
-    It is 0 if it is not determined: within the noise and the deviation of the zero, if pairs of
-    loads disagree in its sign, or if the readings have the model's sign and the slope has not (then
-    it is that of something else, such as a temperature).
+    It is the median of the slopes over all pairs of rows. If all rows have nearly the same load, it
+    is the ratio of the median reading to the median prediction. It is not determined if the
+    readings are within the noise or the uncertainty of the zero, if the pairs of rows disagree in
+    the sign of the slope, or if the slope is negative while the readings have the sign of the
+    prediction: another cause, such as temperature, then dominates.
 
     Parameters
     ----------
     data, model : (N,) ndarrays
-        Readings and prediction.
+        Readings, and their prediction by the model [channel's unit].
     noise, zero_deviation : float
-        Standard deviations of the noise and of the channel's zero.
+        Standard deviations of the noise and of the channel's zero [channel's unit].
     """
     # all pairs of at most 400 rows
     rows = np.linspace(0, len(data) - 1, min(len(data), 400)).round().astype(int)
     first, second = np.triu_indices(len(rows), 1)
     data_steps = data[rows][first] - data[rows][second]
     model_steps = model[rows][first] - model[rows][second]
-    # rows that differ by their health alone would give the noise over next to nothing
-    is_far = np.abs(model_steps) > 0.2 * np.max(np.abs(model))
+    # Only pairs of clearly different predictions: rows that differ in the damage state alone would
+    # give slopes of noise over nearly zero.
+    is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(model))
     median_reading = float(np.median(data))
     median_prediction = float(np.median(model))
-    if not is_far.any():
+    if not is_clear_step.any():
         is_visible = abs(median_reading) > ABOVE_NOISE * max(noise, zero_deviation)
         return median_reading / median_prediction if median_prediction and is_visible else 0.0
-    slopes = data_steps[is_far] / model_steps[is_far]
+    slopes = data_steps[is_clear_step] / model_steps[is_clear_step]
     slope = float(np.median(slopes))
-    usual_step = np.median(np.abs(model_steps[is_far]))
+    usual_step = np.median(np.abs(model_steps[is_clear_step]))
     is_above_noise = max(abs(slope), 1.0) * usual_step > ABOVE_NOISE * noise
     pairs_agree = np.mean(slopes * slope > 0.0) > _AGREE
     has_sign_of_model = median_reading * np.sign(median_prediction) > 2.0 * zero_deviation
-    is_of_something_else = slope < 0.0 and has_sign_of_model
-    return slope if is_above_noise and pairs_agree and not is_of_something_else else 0.0
+    has_another_cause = slope < 0.0 and has_sign_of_model
+    return slope if is_above_noise and pairs_agree and not has_another_cause else 0.0
 
 
 def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, channel: Channel) -> float:
-    """Return the scale of a record in time; 0 if the record is within its noise.
+    """Return the ratio of the amplitudes of a record in time and its prediction.
 
-    It is the ratio of amplitudes, with the sign of the correlation at the start of a release.
+    The sign is that of `sign_of_release`. The result is 0 if the record is within its noise.
 
     Parameters
     ----------
     data, model : (N,) ndarrays
-        Readings and prediction.
+        Readings, and their prediction by the model [channel's unit].
     trial : Trial
         The trial.
     channel : Channel
         The channel.
     """
-    # a high quantile is robust against outliers, and for a decaying record not that of its quiet
-    # end
+    # The 95 % quantile ignores outliers. Unlike the median it shows the motion of a record that
+    # decays and is quiet for most of its length.
     data_amplitude = np.quantile(np.abs(data - np.median(data)), 0.95)
     model_amplitude = np.quantile(np.abs(model - np.median(model)), 0.95)
     scale = float(data_amplitude / model_amplitude) * sign_of_release(data, model, trial)
-    # a record within the noise has no scale, unless the noise is in another unit than the data
+    # A record within the noise has no scale. If its noise was stated in a wrong unit, however, the
+    # record stands out of its own scatter, and the prediction out of the stated noise.
     predicted = _amplitude(model, trial)
     measured = abs(scale) * predicted
     scatter = roughness(data) if len(data) > 6 else 0.0
@@ -151,7 +166,7 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, channel: C
 
 
 def sign_of_release(data: FloatArray, model: FloatArray, trial: Trial) -> float:
-    """Return -1 if a release from rest begins on the other side than predicted, else 1.
+    """Return -1 if a ring-down starts on the opposite side of its prediction, else 1.
 
     Parameters
     ----------
@@ -162,7 +177,7 @@ def sign_of_release(data: FloatArray, model: FloatArray, trial: Trial) -> float:
     """
     if trial.release is None or not trial.release.at_rest:
         return 1.0
-    # before the first return through zero an error of frequency does not matter
+    # until the prediction first crosses zero, an error of its frequency does not matter
     crossings = np.flatnonzero(np.sign(model) != np.sign(model[0]))
     first_crossing = int(crossings[0]) if crossings.size else len(model)
     count = max(first_crossing, 3)
@@ -176,8 +191,8 @@ def swapped_channels(
 ) -> list[tuple[str, str]]:
     """Return the pairs of channels that fit the model clearly better if they are exchanged.
 
-    Channels of one quantity that occur in the same trials are assigned to each other's predictions
-    so that the sum of their misfits is least.
+    Channels of one quantity that occur in the same trials are assigned to the predictions of these
+    channels so that the sum of their misfits is least (linear assignment problem).
 
     Parameters
     ----------
@@ -217,9 +232,16 @@ def swap_fault(first: str, second: str) -> DataFault:
 
 
 def _exchange_is_better(misfits: FloatArray, first: int, second: int) -> bool:
-    """Return whether exchanging two channels lowers their misfits (C, C) clearly.
+    """Return whether two channels fit clearly better if they are exchanged.
 
-    Each must be less than half, and the sum lower by 30 units of chi-squared.
+    Each misfit must become less than half, and their sum must fall by more than 30.
+
+    Parameters
+    ----------
+    misfits : (C, C) ndarray
+        Chi-squared of each channel (row) to the prediction of each channel (column).
+    first, second : int
+        Indices of the two channels.
     """
     pair = [first, second]
     exchanged = [second, first]
@@ -229,31 +251,39 @@ def _exchange_is_better(misfits: FloatArray, first: int, second: int) -> bool:
 
 
 def _misfits(trial: Trial, predictions: FloatArray, channels: Sequence[Channel]) -> FloatArray:
-    """Return the misfits (C, C) of channels to the predictions of each of them.
+    """Return the misfit of each of C channels to the prediction of each of them.
 
     Parameters
     ----------
     trial : Trial
         The trial.
     predictions : (N, M) ndarray
-        Predicted readings of all its channels.
+        Predicted readings of all channels of the trial.
     channels : sequence of Channel
-        C of its channels.
+        The C channels.
+
+    Returns
+    -------
+    (C, C) ndarray
+        Chi-squared of the readings of a channel (row) to the prediction of a channel (column).
     """
     columns = [trial.channels.index(channel.name) for channel in channels]
     misfits = np.zeros((len(channels), len(channels)))
     for row, channel in enumerate(channels):
         used = trial.used[:, columns[row]]
         data = trial.values[used, columns[row]]
-        for other, column in enumerate(columns):
-            misfits[row, other] = _misfit(data, predictions[used, column], channel, trial)
+        for column_of_misfit, column_of_prediction in enumerate(columns):
+            misfits[row, column_of_misfit] = _misfit(
+                data, predictions[used, column_of_prediction], channel, trial
+            )
     return misfits
 
 
 def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial) -> float:
-    """Return chi-squared of readings about a prediction.
+    """Return chi-squared of a channel's readings to a prediction.
 
-    The standard deviation is at least a fraction of the prediction, which any model may be off.
+    The standard deviation of a reading combines the noise with 2 % of the prediction, because any
+    model may be wrong by that much.
 
     Parameters
     ----------
@@ -266,7 +296,8 @@ def _misfit(data: FloatArray, model: FloatArray, channel: Channel, trial: Trial)
     """
     noise = trial.noise_deviation(channel)
     if trial.is_dynamic:
-        # amplitudes only: a small error of frequency would outweigh the distance of two gauges
+        # Only the amplitudes are compared: over many periods a small error of the frequency would
+        # outweigh the difference between two gauges.
         sign = sign_of_release(data, model, trial)
         residual = np.asarray(sign * np.std(data) - np.std(model))
         deviation = np.hypot(noise / np.sqrt(len(data)), _FLOOR * np.std(model))

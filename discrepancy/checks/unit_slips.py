@@ -53,14 +53,17 @@ class Slip(NamedTuple):
 
     @property
     def width(self) -> float:
-        """Factor by which physics may change the ratio besides: the more, the larger the slip."""
+        """Factor by which the ratio may differ from the slip because of physical effects.
+
+        A larger slip is distinct from other slips, and allows for a larger factor.
+        """
         for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBT, 1.35)):
             if self.size >= least_size:
                 return width
         return 1.1
 
     def distance(self, scale: float) -> float:
-        """Return the absolute logarithm of a data scale over the factor of this slip."""
+        """Return |log(scale / factor)|: how far a ratio of data to model is from this slip."""
         return abs(log(abs(scale) / self.factor))
 
     def __str__(self) -> str:
@@ -73,24 +76,24 @@ class Slip(NamedTuple):
 def slip_between(
     scale: float, quantity: Quantity, stated: str = "", *, drive: bool = False
 ) -> Slip | None:
-    """Return the pair of a quantity's units that explains a factor of data over model best.
+    """Return the two units of a quantity whose confusion best explains a ratio of data to model.
 
     Parameters
     ----------
     scale : float
-        Data over model, of any sign.
+        Ratio of data to model, of any sign.
     quantity : Quantity
         The quantity whose units may have been mixed up.
     stated : str
-        The unit that the file states; if empty, any pair of units counts of which one is SI.
+        The unit that the file states. If it is empty, all pairs with one SI unit are tried.
     drive : bool
-        True if the quantity drives the model: a drive that is too small shows as data that are too
-        large.
+        True if the quantity is an input of the model. An input that is too small makes the data
+        look too large, so that the ratio is inverted.
 
     Returns
     -------
     Slip or None
-        None if no pair of units explains the factor.
+        The two units; None if no pair explains the ratio.
     """
     if abs(log(abs(scale))) < log(LEAST / 1.1):
         return None
@@ -100,13 +103,13 @@ def slip_between(
     units_in_si = {unit: conversion_of(quantity, unit) for unit in sorted(names)}
     units_in_si |= UNITS[quantity].foreign
     distances: dict[Slip, float] = {}
-    for given, given_in_si in units_in_si.items():
+    for assumed, assumed_in_si in units_in_si.items():
         for meant, meant_in_si in units_in_si.items():
-            has_si = 1.0 in (given_in_si, meant_in_si)
-            if given != stated and (stated or not has_si):
+            has_si = 1.0 in (assumed_in_si, meant_in_si)
+            if assumed != stated and (stated or not has_si):
                 continue
-            factor = meant_in_si / given_in_si if drive else given_in_si / meant_in_si
-            slip = Slip(factor, meant, given)
+            factor = meant_in_si / assumed_in_si if drive else assumed_in_si / meant_in_si
+            slip = Slip(factor, meant, assumed)
             if slip.size > LEAST:
                 distances[slip] = slip.distance(scale)
     explaining = [slip for slip, distance in distances.items() if distance < log(slip.width)]
@@ -114,10 +117,11 @@ def slip_between(
 
 
 def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> Iterator[DataFault]:
-    """Yield the unit slips of channels, and of the inputs of trials.
+    """Yield the unit slips of channels and of the inputs of trials.
 
-    A channel that slips between its units in all its trials has a wrong unit itself. If all other
-    channels of a trial slip alike, the input of that trial has a wrong unit.
+    A unit slip is a ratio of data to model that two units of a quantity explain. A channel with the
+    same slip in all its trials has a wrong unit itself. If all other channels of a trial have one
+    slip in common, the input of that trial has a wrong unit.
 
     Parameters
     ----------
@@ -160,7 +164,9 @@ def _slips_in_trial(
     scales: Mapping[tuple[str, str], float],
     input_slips: Mapping[tuple[str, str], Slip | None],
 ) -> Iterator[DataFault]:
-    """Yield the slip of a trial's input, or those of channels in this trial alone.
+    """Yield the unit slip of a trial's input, or the slips of channels in this trial alone.
+
+    If all its channels have the same ratio of data to model, the input of the trial has the slip.
 
     Parameters
     ----------
@@ -188,13 +194,13 @@ def _slips_in_trial(
     for key in keys:
         channel, _ = key
         slip = _slip_of_channel(campaign, channel, [scales[key]])
-        # a small factor in one trial alone may be physical: lift that leaves the outer wing
+        # a small factor in one trial may be physical, such as lift that shifts from the outer wing
         if slip is not None and slip.size >= SURE_SLIP:
             yield from _channel_faults(campaign, channel, slip, [trial])
 
 
 def _common_slip(slips: Sequence[Slip | None]) -> Slip | None:
-    """Return the slip that all of several scales have; None if they differ or there are none."""
+    """Return the slip that is common to all entries; None if they differ or there are none."""
     if not slips or any(slip != slips[0] for slip in slips):
         return None
     return slips[0]
@@ -212,9 +218,10 @@ def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> 
 
 
 def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
-    """Return the slip between units of a trial's inputs that explains a scale.
+    """Return the slip between units of a trial's inputs that explains a ratio of data to model.
 
-    None if none does.
+    The inputs are what drives a trial of this kind, and the recorded inputs. The result is None if
+    no slip explains the ratio.
     """
     drives = []
     if trial.kind in _DRIVES:
@@ -230,7 +237,19 @@ def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
 def _channel_faults(
     campaign: Campaign, name: str, slip: Slip, trials: Sequence[Trial]
 ) -> Iterator[DataFault]:
-    """Yield the fault of a channel that slips in some trials."""
+    """Yield the fault of a channel whose readings have a wrong unit in some trials.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    name : str
+        Name of the channel.
+    slip : Slip
+        The two units.
+    trials : sequence of Trial
+        The trials that show it.
+    """
     channel = campaign.channels[name]
     first = trials[0]
     column = ""
@@ -245,22 +264,22 @@ def _channel_faults(
     )
     trial_name = first.name if is_in_one_of_several else ""
     fault = DataFault(FaultKind.UNIT_SLIP, sentence, name, trial_name)
-    # gravity in an acceleration is known, so that a single record shows the slip
+    # an accelerometer also shows gravity, whose value is known: this counts as a second record
     witnesses = 1 if channel.quantity is Quantity.ACCELERATION else 0
     yield from _graded(fault, slip, agreeing=len(trials) + witnesses)
 
 
 def _graded(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
-    """Yield a slip as a fault, as a doubt, or not at all.
+    """Yield a slip as a fault, as a doubt, or not at all, by its size and the evidence for it.
 
     Parameters
     ----------
     fault : DataFault
-        The fault, with a sentence that may go on.
+        The fault, whose sentence has no full stop yet.
     slip : Slip
         The slip.
     agreeing : int
-        Number of records that agree on it.
+        Number of records that show the same slip.
     """
     sentence = fault.sentence
     if slip.size >= SURE_SLIP or (slip.size >= DOUBT and agreeing > 1):

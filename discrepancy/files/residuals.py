@@ -1,7 +1,7 @@
 """`residuals.nc`: measured, predicted and residual values of every trial, with units (NetCDF-4).
 
-One group for each trial (`trial_001` ..) with its name as an attribute, and a group `noise` for
-what was recorded of the noise.
+There is one group for each trial (`trial_001` and so on) with its name as an attribute, and a group
+`noise` for the noise records of the channels.
 """
 
 import json
@@ -47,7 +47,7 @@ _DAMAGED = (
     DiscrepancyError,
 )
 _PLAIN = ("name", "output", "gain_deviation", "offset_deviation", "station", "chord")
-"""Fields of a channel that the file has as they are."""
+"""Fields of a channel that are written unchanged."""
 _NOTE = "unit of each channel: see the coordinate `unit`"
 _ARRAYS: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(
     Path(__file__).with_suffix(".toml").read_text("utf-8")
@@ -58,7 +58,7 @@ _ARRAYS: dict[str, dict[str, dict[str, Any]]] = tomllib.loads(
 def write_residuals(
     path: Path, residuals: ResidualSet, attributes: Mapping[str, str] | None = None
 ) -> Path:
-    """Write a set of residuals, whole or not at all.
+    """Write a set of residuals to a NetCDF file, completely or not at all.
 
     Parameters
     ----------
@@ -153,14 +153,14 @@ def _channel_row(channel: Channel) -> dict[str, Any]:
 
 
 def _channel(row: Mapping[str, Any], samples: FloatArray | None) -> Channel:
-    """Return the channel of a row of the attribute `channels`.
+    """Read a channel from its row of the attribute `channels`; inverse of `_channel_row`.
 
     Parameters
     ----------
     row : mapping
         The row.
     samples : (n,) ndarray or None
-        Its samples at rest.
+        The samples of the channel's noise record [channel's unit]; None if it has none.
     """
     noise = None
     if row["noise"] is not None:
@@ -177,7 +177,15 @@ def _channel(row: Mapping[str, Any], samples: FloatArray | None) -> Channel:
 
 
 def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.Dataset:
-    """Return the group of a trial: its readings, its fit, and its attributes."""
+    """Return a trial as a group of a residual file: readings, prediction, residuals, attributes.
+
+    Parameters
+    ----------
+    fitted_trial : FittedTrial
+        The trial with its prediction and residuals.
+    channels : mapping of str to Channel
+        Channels by name, for the units of the readings.
+    """
     trial = fitted_trial.trial
     by_row_and_channel = ("row", "channel")
     variables: dict[str, Any] = {
@@ -217,7 +225,12 @@ def _dataset(fitted_trial: FittedTrial, channels: Mapping[str, Channel]) -> xr.D
 
 
 def _fitted_trial(group: xr.Dataset) -> FittedTrial:
-    """Return the trial of a group with its fit.
+    """Read a trial with its prediction and residuals from its group of a residual file.
+
+    Parameters
+    ----------
+    group : Dataset
+        The group, as `_dataset` writes it.
 
     Raises
     ------

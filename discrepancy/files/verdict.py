@@ -103,7 +103,7 @@ def read_verdict_file(path: Path) -> StoredVerdict:
 
 
 def _drop_old_definitions(content: dict[str, Any]) -> None:
-    """Remove from an older file what has another definition now: fractions and chi-squared."""
+    """Remove entries of an older file whose definition has changed: fractions and chi-squared."""
     verdict = content["verdict"]
     proof = content["proof"]
     verdict.pop("explained", None)
@@ -223,7 +223,7 @@ class StoredPatch:
     channels : mapping of str to str
         Outputs of the wing FMU by the names of channels.
     parameters : tuple of CalibratedParameter
-        Parameters of the model, fitted beside these effects.
+        Calibrated parameters of the model, fitted together with these effects.
     origin : Origin
         Model, campaign and program that it comes from.
     """
@@ -245,7 +245,15 @@ class StoredPatch:
         return sum((effect.patch for effect in self.effects), ModelPatch())
 
     def upon(self, earlier: "StoredPatch | None") -> "StoredPatch":
-        """Return this patch after an earlier one that is in its model, for the bare model."""
+        """Return this patch combined with an earlier one that is already in its model.
+
+        The result applies to the model without either patch.
+
+        Parameters
+        ----------
+        earlier : StoredPatch or None
+            The earlier patch; None if the model has none.
+        """
         if earlier is None:
             return self
         origin = replace(
@@ -271,8 +279,8 @@ def primitive_intervals(
     patch : ModelPatch
         Patch at the centre of the posterior.
     draws : sequence of ModelPatch
-        Patches of the same effect at draws of its posterior, whose quantiles 0.05 and 0.95 are
-        taken.
+        Patches of the same effect at draws of its posterior. The ends of an interval are their
+        quantiles 0.05 and 0.95; nan without draws.
 
     Raises
     ------
@@ -337,7 +345,7 @@ def patch_effects(
 
 
 def write_patch(path: Path, stored: StoredPatch) -> Path:
-    """Write `patch.json`, whole or not at all.
+    """Write `patch.json`, completely or not at all.
 
     Raises
     ------

@@ -12,11 +12,11 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 
 SMALLEST_SIGNAL = 4.0
-"""A mode counts in a window while its amplitude there is this many standard errors."""
+"""Least amplitude of a mode that still rings in a window, in standard errors."""
 _GREATEST_CHANGE = 0.3
 """Largest relative change of a frequency from its start value."""
 _FEWEST_PER_UNKNOWN = 2.0
-"""Fewest samples in a window for each unknown."""
+"""Fewest samples of a window per unknown of the fit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,23 +56,26 @@ def backbones(
     averaging_width: float = 0.0,
     periods: float = 4.0,
 ) -> tuple[Backbone, ...]:
-    """Return the backbone of each mode: damped cosines are fitted in windows along a ring-down.
+    """Return how frequency and damping of each mode change along a ring-down.
+
+    Damped cosines, one for each mode that still rings, are fitted in windows that overlap by half.
+    The result for a mode is called its backbone: frequency and damping ratio over the amplitude.
 
     Parameters
     ----------
     time, signal : (N,) ndarray
         The record, evenly spaced [s], [any unit].
     frequencies : sequence of float
-        Start values of the frequencies of all modes that ring [Hz].
+        Start values of the frequencies of all modes in the signal [Hz].
     noise_deviation : float, optional
-        Standard deviation of the noise. Without it that of each window's residuals is used, which
-        also contains what the cosines do not describe.
+        Standard deviation of the noise [signal's unit]. By default, that of the residuals of each
+        window, which also contain what the cosines do not describe.
     averaging_width : float
         Interval over which each value is an average [s]; 0 for samples.
     periods : float
-        Length of a window in periods of the lowest frequency. Longer windows have smaller errors
-        and smear what changes with amplitude: three periods of a quadratic damping with a ratio of
-        0.045 give 0.043. The next window repeats half of it.
+        Length of a window in periods of the lowest frequency. A longer window gives smaller
+        standard errors, but averages over a larger change of amplitude: for quadratic damping with
+        a ratio of 0.045, windows of three periods give 0.043.
 
     Raises
     ------
@@ -91,7 +94,7 @@ def backbones(
             "finely sampled record."
         )
     is_ringing = np.ones(start.size, dtype=bool)
-    poles = (1j - 0.02) * start
+    poles = (1j - 0.02) * start  # first guess: a damping ratio of 2 %
     points: list[list[BackbonePoint]] = [[] for _ in start]
     for first in range(0, time.size - width + 1, max(1, round(0.5 * width))):
         samples = slice(first, first + width)
@@ -114,7 +117,7 @@ def backbones(
                 continue
             for mode, point in points_of_window.items():
                 points[mode].append(point._replace(time=float(time[first]) + point.time))
-            # the next window begins from here, with some damping
+            # start values for the next window: these poles, with a damping ratio of at least 1e-4
             fitted = solution.pole
             poles[is_ringing] = np.minimum(fitted.real, -1e-4 * fitted.imag) + 1j * fitted.imag
             break
@@ -135,7 +138,10 @@ class BackbonePoint(NamedTuple):
     damping_ratio_error: float
 
     def is_credible(self, start: float) -> bool:
-        """Return whether the mode still rings, near its start frequency [rad/s]."""
+        """Return whether the mode still rings, at a frequency close to its start value [rad/s].
+
+        Its amplitude must exceed `SMALLEST_SIGNAL` standard errors.
+        """
         change = abs(2.0 * np.pi * self.frequency / start - 1.0)
         is_above_error = self.amplitude > SMALLEST_SIGNAL * self.amplitude_error
         return is_above_error and change < _GREATEST_CHANGE and abs(self.damping_ratio) < 0.5
@@ -152,7 +158,10 @@ def _backbone(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
 def _points(
     time: FloatArray, solution: DampedCosineFit, noise_deviation: float | None
 ) -> list[BackbonePoint]:
-    """Return each mode of a window at the centroid of its energy.
+    """Return amplitude, frequency and damping of each mode in a window, with standard errors.
+
+    They belong to the centroid of the mode's energy in time, because a mode that decays quickly is
+    visible mainly at the start of the window.
 
     Parameters
     ----------
@@ -168,8 +177,10 @@ def _points(
     points = []
     for mode in solution.modes:
         decay = -mode.pole.real
+        # energy is proportional to exp(-2 decay t); centred and clipped against overflow
         energy = np.exp(-2.0 * np.clip(decay * (time - time[-1] / 2.0), -50.0, 50.0))
         centroid = float(energy @ time / energy.sum())
+        # number of equally weighted samples with the same information: (sum w)^2 / sum w^2
         effective_samples = float(energy.sum()) ** 2 / float(energy @ energy)
         frequency_error = mode.standard_error["frequency"]
         damping_ratio_error = mode.standard_error["damping_ratio"]

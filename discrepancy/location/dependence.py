@@ -35,12 +35,13 @@ def mode_bands(frequencies: Sequence[float]) -> list[tuple[float, float]]:
 def modal_motion(
     values: FloatArray, interval: float, frequencies: Sequence[float]
 ) -> NDArray[np.complex128]:
-    """Return the component of each mode in a motion without noise, such as a prediction.
+    """Split a motion without noise, such as a prediction, into its modes by bands of frequency.
 
     Parameters
     ----------
     values : (N, C) ndarray
-        The motion. Its mirror images are set before and after it, so that it has no ends.
+        The motion. It is extended by its mirror images on both sides, so that the Fourier
+        transform meets no jump at its ends.
     interval : float
         Sampling interval [s].
     frequencies : sequence of float
@@ -50,8 +51,8 @@ def modal_motion(
     Returns
     -------
     (K, N, C) ndarray
-        Analytic signals: displacement less i rate / angular frequency; the modulus is the
-        amplitude.
+        Analytic signal x - i v / w of each mode, with displacement x, rate v and angular frequency
+        w. Its modulus is the amplitude of the mode at each time.
     """
     count = len(values)
     mirrored = np.concatenate([values[:0:-1], values, values[-2::-1]])
@@ -68,7 +69,9 @@ def modal_motion(
 def mode_shares(
     trials: Sequence[FittedTrial], white: Sequence[FloatArray], frequencies: Sequence[float]
 ) -> FloatArray:
-    """Return the fraction of the excess variance in the band of each mode, (M,).
+    """Return the fraction (M,) of the excess variance in the frequency band of each mode.
+
+    The excess is the sum of squares of the residuals minus its expectation for white noise.
 
     Parameters
     ----------
@@ -82,7 +85,8 @@ def mode_shares(
     excess_of_modes = np.zeros(len(frequencies))
     total_excess = 0.0
     for fitted, values in zip(trials, white, strict=True):
-        # each ordinate stands for two terms of the sum of squares, and is one for noise
+        # An ordinate of the periodogram is one on average for white noise of unit variance, and
+        # stands for two terms of the sum of squares: a cosine and a sine.
         surplus = sum(2.0 * (periodogram(series) - 1.0) for series in values.T)
         duration = len(values) * fitted.trial.interval
         ordinate_frequencies = np.arange(1, np.size(surplus) + 1) / duration
@@ -96,11 +100,12 @@ def mode_shares(
 
 
 def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
-    """Return the frequencies [Hz] of the highest peaks of the predictions' spectra, at most four.
+    """Return the frequencies [Hz] of up to four modes, from the spectra of the predictions.
 
-    They come lowest first. A peak is the largest ordinate within a factor of 1.4 on both sides,
-    above a thousandth of the greatest, and makes at least four periods in the record: below that a
-    zero or a slow decay looks like one.
+    The modes are the highest peaks, sorted by frequency. A peak is the largest ordinate within a
+    factor of 1.4 in frequency on both sides, and at least a thousandth of the largest of all. It
+    has at least four periods in the record, because a wrong zero or a slow decay looks like a peak
+    at lower frequencies.
     """
     longest = max(trials, key=lambda fitted: len(fitted.trial.time)).trial
     count = len(longest.time)
@@ -110,7 +115,7 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
         if len(fitted.trial.time) != count or abs(interval_ratio - 1.0) > 1e-6:
             continue
         values = fitted.prediction - fitted.prediction.mean(axis=0)
-        # half a window, because the start of a ring-down counts most
+        # the falling half of a Hann window, because most of a ring-down is at its start
         taper = np.hanning(2 * count)[count:, np.newaxis]
         spectra = np.abs(np.fft.rfft(values * taper, axis=0)) ** 2 / fitted.noise_deviation**2
         power += spectra[1 : power.size + 1].sum(axis=1)
@@ -118,15 +123,15 @@ def predicted_frequencies(trials: Sequence[FittedTrial]) -> tuple[float, ...]:
     peaks = []
     for index in range(3, power.size - 1):
         frequency = float(frequencies[index])
-        is_near = (frequencies > frequency / 1.4) & (frequencies < frequency * 1.4)
-        if power[index] >= power[is_near].max() and power[index] > 1e-3 * power.max():
+        is_neighbour = (frequencies > frequency / 1.4) & (frequencies < frequency * 1.4)
+        if power[index] >= power[is_neighbour].max() and power[index] > 1e-3 * power.max():
             peaks.append((float(power[index]), frequency))
     highest = sorted(peaks, reverse=True)[:4]
     return tuple(sorted(frequency for _, frequency in highest))
 
 
 _HATS = 9
-"""Knots of a dependence on time or amplitude."""
+"""Number of knots of a piecewise linear function of time or amplitude."""
 
 
 class Dependence(NamedTuple):
@@ -154,7 +159,10 @@ class Dependence(NamedTuple):
 
 
 def excess(trials: Sequence[FittedTrial]) -> float:
-    """Return the excess variance of trials, in units of the noise variance."""
+    """Return the excess variance of trials, in units of the noise variance.
+
+    It is the sum of squares of their residuals minus its expectation if the model is right.
+    """
     total = 0.0
     for fitted in trials:
         expected = np.sum(fitted.expected_variance[fitted.used])
@@ -163,7 +171,20 @@ def excess(trials: Sequence[FittedTrial]) -> float:
 
 
 def _hats(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Return piecewise linear hat functions (n, `_HATS`) of values (n,) between two ends."""
+    """Return piecewise linear hat functions, whose sums are all piecewise linear functions.
+
+    Parameters
+    ----------
+    values : (n,) ndarray
+        Values at which the functions are evaluated.
+    low, high : float
+        First and last knot.
+
+    Returns
+    -------
+    (n, `_HATS`) ndarray
+        Value of each hat function; the constant 1 in a single column if the knots coincide.
+    """
     if high <= low:
         return np.ones((values.size, 1))
     knots = np.linspace(low, high, _HATS)
@@ -171,11 +192,12 @@ def _hats(values: FloatArray, low: float, high: float) -> FloatArray:
 
 
 def dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
-    """Yield what single dependences explain of the excess variance of trials.
+    """Yield how much of the excess variance each dependence of the residuals explains alone.
 
-    Every dependence is fitted to each channel by itself, with one set of coefficients for all
-    trials, so that amplitude and time can be distinguished if releases differ. The strongest line
-    has a phase of its own in each trial. Modes are split at the peaks of the predictions' spectra.
+    A dependence (on amplitude, time, load, temperature and so on) is a set of functions that is
+    fitted to the residuals of each channel, with the same coefficients in all trials. Amplitude and
+    time can thus be distinguished if the releases differ. Only the strongest spectral line has a
+    phase of its own in each trial. Nothing is yielded if there is no significant excess.
 
     Parameters
     ----------
@@ -183,8 +205,11 @@ def dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
         Trials of one kind with the same channels.
     """
     excess_variance = excess(trials)
-    freedom = sum(float(np.sum(fitted.expected_variance[fitted.used])) for fitted in trials)
-    if freedom <= 0.0 or excess_variance <= 2.0 * np.sqrt(2.0 * freedom):
+    degrees_of_freedom = sum(
+        float(np.sum(fitted.expected_variance[fitted.used])) for fitted in trials
+    )
+    # the sum of squares has about the variance 2 x degrees of freedom: two standard deviations
+    if degrees_of_freedom <= 0.0 or excess_variance <= 2.0 * np.sqrt(2.0 * degrees_of_freedom):
         return  # there is no excess to explain
     line = None
     modes: tuple[float, ...] = ()
@@ -201,14 +226,14 @@ def dependences(trials: Sequence[FittedTrial]) -> Iterator[Dependence]:
             bases["", line.name] = line.waves(with_channel, column)
         rows = [(fitted, fitted.used[:, column]) for fitted in with_channel]
         for key, basis in bases.items():
-            of_channel = normal_equations_of(basis, rows, column)
-            if of_channel is not None:
-                equations.setdefault(key, []).append(of_channel)
-    for (subject, name), of_channels in equations.items():
-        statistic, count = explained(of_channels)
+            channel_equations = normal_equations_of(basis, rows, column)
+            if channel_equations is not None:
+                equations.setdefault(key, []).append(channel_equations)
+    for (subject, name), equations_of_channels in equations.items():
+        statistic, count = explained(equations_of_channels)
         share = float(np.clip((statistic - count) / excess_variance, 0.0, 1.0))
         p_value = float(stats.chi2.sf(statistic, count)) if count else 1.0
-        # the line was chosen among many
+        # Bonferroni: the line was chosen among many
         choices = line.choices if line is not None and name == line.name else 1
         yield Dependence(subject, name, share, min(1.0, p_value * choices), count)
 
@@ -236,7 +261,20 @@ class SpectralLine(NamedTuple):
         return f"a {'decaying ' if self.decay else ''}line at {self.frequency:.3g} Hz"
 
     def waves(self, trials: Sequence[FittedTrial], column: int) -> FloatArray:
-        """Return its cosine and sine (n, 2 T) at the used samples of a channel in T trials."""
+        """Return the decaying cosine and sine of the line, with separate columns for each trial.
+
+        Parameters
+        ----------
+        trials : sequence of FittedTrial
+            The T trials.
+        column : int
+            Column of the channel.
+
+        Returns
+        -------
+        (n, 2 T) ndarray
+            Values at the n used samples of the channel in all trials.
+        """
         waves_of_trials = []
         for fitted in trials:
             times = fitted.trial.time[fitted.used[:, column]] - fitted.trial.time[0]
@@ -246,11 +284,12 @@ class SpectralLine(NamedTuple):
 
 
 def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
-    """Return the line that explains most of the residuals of dynamic trials, over all channels.
+    """Return the spectral line that explains most of the residuals of dynamic trials.
 
-    Frequencies are those of a spectrum padded four times, from one period of the record upwards.
-    Decays are none, and 1, 3, 10 and 30 e-folds within a record. None for records of fewer than
-    eight samples.
+    The sum of squares that a decaying sine explains is computed for the frequencies of a Fourier
+    transform with four-fold zero padding, from one period in the record upwards, and for decays by
+    0, 1, 3, 10 and 30 e-folds within the record. It is summed over all channels. The result is None
+    for records of fewer than eight samples.
     """
     length = max(len(fitted.trial.time) for fitted in trials)
     interval = trials[0].trial.interval
@@ -270,12 +309,13 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
             weight = np.exp(-decay * interval * np.arange(len(fitted.trial.time)))
             weighted = np.nan_to_num(fitted.standardised) * weight[:, np.newaxis]
             spectra = np.abs(np.fft.rfft(weighted, 4 * length, axis=0)) ** 2
-            # a cosine and a sine under this weight have about half the square of the weight each
+            # A cosine and a sine under this weight each have about half the squared norm of the
+            # weight, so that the explained sum of squares is 2 |spectrum|^2 / |weight|^2.
             power += 2.0 * spectra.sum(axis=1) / (weight @ weight)
-        power[:4] = 0.0
+        power[:4] = 0.0  # less than one period in the record
         index = int(np.argmax(power))
         choices += length // 2
-        # a decay must explain visibly more than the same line without it
+        # a decaying line must explain at least 5 % more than the best so far
         if power[index] > 1.05 * greatest_power:
             greatest_power = float(power[index])
             strongest = SpectralLine(float(frequencies[index]), decay, choices)
@@ -285,7 +325,7 @@ def dominant_line(trials: Sequence[FittedTrial]) -> SpectralLine | None:
 def dependence_bases(
     trials: Sequence[FittedTrial], column: int, modes: Sequence[float]
 ) -> dict[tuple[str, str], FloatArray]:
-    """Return the functions (n, k) of each dependence at the n used samples of a channel.
+    """Return the functions of each dependence at the used samples of a channel.
 
     Parameters
     ----------
@@ -299,7 +339,8 @@ def dependence_bases(
     Returns
     -------
     dict of (str, str) to (n, k) ndarray
-        Functions by subject and name of the dependence.
+        Values of the functions at the n used samples, by subject ("mode 1", or empty for the
+        whole channel) and name of the dependence.
     """
     samples = _UsedSamples(trials, column)
     bases = {
@@ -334,7 +375,18 @@ class _UsedSamples:
         self._features = [features(fitted, column) for fitted in trials]
 
     def of_trials(self, values: Callable[[FittedTrial], FloatArray]) -> FloatArray:
-        """Return an array (N, ...) of each trial at its used samples, stacked (n, ...)."""
+        """Return an array of each trial at its used samples, stacked over the trials.
+
+        Parameters
+        ----------
+        values : callable
+            Returns the array (N, ...) of a trial of N samples.
+
+        Returns
+        -------
+        (n, ...) ndarray
+            Its rows at the n used samples of all trials.
+        """
         return self.stacked([values(fitted) for fitted in self.trials])
 
     def stacked(self, arrays: Sequence[NDArray[Any]]) -> NDArray[Any]:
@@ -343,28 +395,42 @@ class _UsedSamples:
         return np.concatenate(used)
 
     def per_trial(self, functions: FloatArray) -> FloatArray:
-        """Return functions (n, k) with coefficients of their own in each of T trials, (n, k T)."""
+        """Return functions with separate columns for each trial, thus separate coefficients.
+
+        Parameters
+        ----------
+        functions : (n, k) ndarray
+            Values of k functions at the n used samples of T trials.
+
+        Returns
+        -------
+        (n, k T) ndarray
+            Block diagonal: the columns of a trial are zero at the samples of the others.
+        """
         ends = np.cumsum([int(rows.sum()) for rows in self.rows])
         return np.asarray(block_diag(*np.split(functions, ends[:-1])))
 
     def features(self, *names: str) -> FloatArray:
-        """Return features of the prediction by name, (n, k); zeros in a trial that lacks one."""
+        """Return features of the prediction by name (n, k); zeros in a trial that lacks one.
+
+        The features are those of `discrepancy.location.map.features`.
+        """
         widths = [
-            table.shape[1]
-            for tables in self._features
-            for name, table in tables.items()
+            feature.shape[1]
+            for features_of_trial in self._features
+            for name, feature in features_of_trial.items()
             if name in names
         ]
         width = max(widths, default=1)
         stacked = []
-        for tables, rows in zip(self._features, self.rows, strict=True):
+        for features_of_trial, rows in zip(self._features, self.rows, strict=True):
             zeros = np.zeros((int(rows.sum()), width))
-            stacked.append(np.hstack([tables.get(name, zeros) for name in names]))
+            stacked.append(np.hstack([features_of_trial.get(name, zeros) for name in names]))
         return np.vstack(stacked)
 
 
 def _bases_at_rest(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
-    """Return the dependences of readings at rest: on time and load."""
+    """Return the functions of each dependence of static readings: on time and load."""
     bases: dict[tuple[str, str], FloatArray] = {}
     time = samples.of_trials(lambda fitted: fitted.trial.time)
     if np.ptp(time) > 0.0:
@@ -381,7 +447,11 @@ def _bases_at_rest(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
 def _bases_in_time(
     samples: _UsedSamples, modes: Sequence[float]
 ) -> dict[tuple[str, str], FloatArray]:
-    """Return the dependences of records in time: on drift, motion, harmonics and modes."""
+    """Return the functions of each dependence of dynamic records: drift, motion, harmonics, modes.
+
+    For a mode, its predicted motion is multiplied by hat functions of its amplitude or of time, in
+    phase and a quarter of a period out of phase.
+    """
     bases: dict[tuple[str, str], FloatArray] = {}
     relative_time = samples.of_trials(lambda fitted: np.linspace(-1.0, 1.0, len(fitted.trial.time)))
     drift = np.asarray(np.polynomial.legendre.legvander(relative_time, 4), dtype=np.float64)
@@ -403,8 +473,8 @@ def _bases_in_time(
         amplitude = np.abs(motion[:, 0])
         if not amplitude.any():
             continue
-        level = np.log(np.clip(amplitude / amplitude.max(), 1e-3, None))
-        by_amplitude = _hats(level, float(level.min()), 0.0)
+        log_amplitude = np.log(np.clip(amplitude / amplitude.max(), 1e-3, None))
+        by_amplitude = _hats(log_amplitude, float(log_amplitude.min()), 0.0)
         for name, shapes in (("amplitude", by_amplitude), ("time", by_time)):
             in_and_out_of_phase = [shapes * motion.real, shapes * motion.imag]
             bases[f"mode {mode + 1}", name] = np.hstack(in_and_out_of_phase)

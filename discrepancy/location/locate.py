@@ -46,15 +46,15 @@ MAP_RATE = 0.05
 """False discovery rate of the map."""
 
 _TOO_SMALL = 1e-3
-"""p-value below which residuals are smaller than the noise record allows."""
+"""p-value below which residuals count as smaller than the noise record allows."""
 _FAR_OUT = 6.0
-"""Noise deviations beyond which a sample is far out; 2e-9 of Gaussian samples are."""
+"""Least size of an outlier, in standard deviations; 2e-9 of Gaussian samples exceed it."""
 _MEDIAN = 0.6745
 """Median of the absolute value of a standard normal variable."""
 _LEAST_SHARE = 0.05
 """Least fraction of the excess variance for which a dependence is reported."""
 _CLOSE = 0.02
-"""Difference of two fractions up to which they are not distinguished."""
+"""Largest difference of two fractions of the excess variance that count as equal."""
 
 
 @dataclass(frozen=True)
@@ -84,19 +84,22 @@ class Location:
 
 
 def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
-    """Return where model and data disagree in the fitted trials of a set.
+    """Find where model and data disagree in the fitted trials of a set.
+
+    Omnibus tests decide whether they disagree at all. Only then dependences and patterns are
+    searched. The map of cells is computed in any case.
 
     Parameters
     ----------
     residuals : ResidualSet
         Residuals of one hypothesis; held-out trials are left out.
     seed : int
-        Seed of the draw that restores what the fit absorbed.
+        Seed of the random draw that makes the residuals white; see `ResidualSet.white`.
 
     Returns
     -------
     Location
-        The same to the last bit for the same input and seed.
+        Tests, map, findings and remarks; reproducible to the last bit for the same seed.
 
     Raises
     ------
@@ -129,13 +132,18 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
 
 
 def _findings(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Disagreement]:
-    """Return the findings in all kinds of trials.
+    """Return the findings in all kinds of trials, sorted by the excess variance that they explain.
 
-    What explains most of the whole gap comes first.
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The fitted trials.
+    white : sequence of (N, C) ndarray
+        White residuals of each trial.
     """
     findings: list[tuple[float, Disagreement]] = []
     for kind in kinds_of(residuals, white):
-        # the share of a finding is that of its kind of trial
+        # the share of a finding is a fraction of the excess in its own kind of trial
         excess_of_kind = sum(max(excess([fitted]), 0.0) for fitted in kind.trials)
         patterns = singular_patterns(residuals, kind)
         dependence = _main_dependence(kind, patterns)
@@ -173,11 +181,16 @@ def _noise_remarks(residuals: ResidualSet) -> tuple[str, ...]:
 
 
 def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
-    """Return the remark on single samples far out whose neighbours are not: errors of the data.
+    """Return the remark on isolated outliers among the residuals, which may be errors of the data.
 
-    Far out means beyond the noise, and beyond the usual residuals of the hypothesis: if a model is
-    off, its residuals are large at many samples. Samples beside a gap have no neighbours to be
-    compared with.
+    An outlier exceeds six standard deviations of the noise and of the residuals themselves, because
+    the residuals of a wrong model are large at many samples. It is isolated if both neighbours are
+    less than half as large. Samples next to a gap are not judged.
+
+    Returns
+    -------
+    tuple of str
+        The remark, or nothing if there is no outlier.
     """
     counts: dict[str, int] = {}
     for fitted in residuals.trials:
@@ -196,7 +209,13 @@ def outlier_remarks(residuals: ResidualSet) -> tuple[str, ...]:
 
 
 def _count_far_out(size: FloatArray) -> int:
-    """Return the number of single samples far out, from absolute residuals (N,), nan in gaps."""
+    """Return the number of isolated outliers in a record.
+
+    Parameters
+    ----------
+    size : (N,) ndarray
+        Absolute residuals in units of the noise; nan in gaps.
+    """
     finite = size[np.isfinite(size)]
     if not finite.size:
         return 0
@@ -204,15 +223,16 @@ def _count_far_out(size: FloatArray) -> int:
     neighbours = np.full((2, len(size)), np.nan)
     neighbours[0, 1:] = size[:-1]
     neighbours[1, :-1] = size[1:]
-    # a comparison with nan, beside a gap, is false
-    is_alone = (size > limit) & (neighbours.max(axis=0) < 0.5 * size)
-    return int(is_alone.sum())
+    # next to a gap a neighbour is nan, and the comparison with it is false
+    is_isolated_outlier = (size > limit) & (neighbours.max(axis=0) < 0.5 * size)
+    return int(is_isolated_outlier.sum())
 
 
 def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Disagreement | None:
-    """Return the finding on what the residuals of a kind of trial depend on; None if on nothing.
+    """Return the finding on the dependence that best explains the residuals of a kind of trial.
 
-    Of dependences that explain about as much, the one with the fewest coefficients is taken.
+    Of several dependences that explain nearly the same fraction of the excess variance, the one
+    with the fewest coefficients is taken. None if no dependence is significant.
 
     Parameters
     ----------
@@ -230,8 +250,10 @@ def _main_dependence(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> Di
     if not significant:
         return None
     largest_share = max(candidate.share for candidate in significant)
-    close = [candidate for candidate in significant if candidate.share >= largest_share - _CLOSE]
-    simplest = min(close, key=lambda candidate: (candidate.coefficients, -candidate.share))
+    nearly_as_good = [
+        candidate for candidate in significant if candidate.share >= largest_share - _CLOSE
+    ]
+    simplest = min(nearly_as_good, key=lambda candidate: (candidate.coefficients, -candidate.share))
     subject = simplest.subject or _subject(kind, patterns)
     phrase = f"by {simplest.name}"
     if _amplitude_and_time_look_alike(simplest, candidates):
@@ -262,7 +284,17 @@ def _amplitude_and_time_look_alike(
 
 
 def _subject(kind: TrialsOfKind, patterns: Sequence[Disagreement]) -> str:
-    """Return what disagrees: a single channel, the mode with most excess, or all channels."""
+    """Return what disagrees: a single channel, the mode with most of the excess, or all channels.
+
+    A channel or a mode is named only if it has more than half of the excess variance.
+
+    Parameters
+    ----------
+    kind : TrialsOfKind
+        The trials.
+    patterns : sequence of Disagreement
+        Their patterns over the channels.
+    """
     channels = kind.trials[0].trial.channels
     for pattern in patterns:
         if pattern.subject == "sensor" and pattern.share > 0.5:

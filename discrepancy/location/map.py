@@ -1,8 +1,11 @@
 """The map of residuals: cells of sensor, trial and bin, with the statistics of each.
 
-Whole records are correlated with what they may depend on; bins of time, amplitude, frequency and
-load are tested for mean and size. Every p-value allows for what the fit has absorbed: a function b
-has the statistic z = b . r / sqrt(b . b - |S^T b|^2), and one that the fit absorbs is not tested.
+Whole records are correlated with functions that they may depend on; bins of time, amplitude,
+frequency and load are tested for mean and mean square. Every p-value allows for what the fit has
+absorbed. The residuals r, in units of the noise, have the covariance I - S S^T with the
+sensitivities S (see `discrepancy.location.residuals`). The projection b . r on a function b thus
+has the variance b . b - |S^T b|^2, and z = b . r / sqrt(b . b - |S^T b|^2) is standard normal. A
+function whose variance nearly vanishes, because the fit has absorbed it, is not tested.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +21,9 @@ from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.location.residuals import FittedTrial, ResidualSet, quadratic_moments
 
 _LEAST_SURVIVING = 0.02
-"""Fraction of a direction's square that must survive the fit, otherwise it says nothing."""
+"""Least variance of the projection on a unit function, as a fraction of that before the fit.
+
+Below it the fit has absorbed the function, and its projection is not evidence."""
 
 
 class NormalEquations(NamedTuple):
@@ -27,11 +32,11 @@ class NormalEquations(NamedTuple):
     Attributes
     ----------
     gram : (k, k) ndarray
-        B'B.
+        B^T B; without sensitivities B^T V B, with the expected variances V of the residuals.
     projection : (k,) ndarray
-        B'r.
+        B^T r.
     absorbed : (P, k) ndarray
-        S'B, with the sensitivities S of the residuals; no rows without them.
+        S^T B, with the sensitivities S of the residuals to P parameters; (0, k) without them.
     """
 
     gram: FloatArray
@@ -42,21 +47,22 @@ class NormalEquations(NamedTuple):
 def normal_equations_of(
     basis: FloatArray, rows: Sequence[tuple[FittedTrial, BoolArray]], column: int
 ) -> NormalEquations | None:
-    """Return the normal equations of functions fitted to a channel's residuals.
+    """Return the normal equations of functions that are fitted to a channel's residuals.
 
     Parameters
     ----------
     basis : (n, k) ndarray
-        Values of the functions.
+        Values of the k functions at n samples; they are scaled to unit norm here.
     rows : sequence of (FittedTrial, (N,) ndarray of bool)
-        Trials, and which of their samples are the n rows of `basis`.
+        Trials, and which of their N samples are the rows of `basis`, one trial after the other.
     column : int
         Column of the channel.
 
     Returns
     -------
     NormalEquations or None
-        None if there are no functions, or as many as samples, which explain anything.
+        None if all functions are zero, or if there are as many functions as samples, which would
+        fit any residuals exactly.
     """
     norms = np.linalg.norm(basis, axis=0)
     basis = basis[:, norms > 0.0] / norms[norms > 0.0]
@@ -70,39 +76,59 @@ def normal_equations_of(
     if len(sensitivities) == len(rows):
         absorbed = np.vstack(sensitivities).T @ basis
         return NormalEquations(basis.T @ basis, basis.T @ residual, absorbed)
-    # without sensitivities: the expected variance of each sample
+    # without sensitivities the residuals count as independent, with their expected variances
     variance = np.concatenate([fitted.expected_variance[used, column] for fitted, used in rows])
     gram = (basis.T * variance) @ basis
     return NormalEquations(gram, basis.T @ residual, np.zeros((0, function_count)))
 
 
 def explained(equations: Sequence[NormalEquations]) -> tuple[float, int]:
-    """Return the sum of squares that functions explain, and the number of their coefficients.
+    """Return the sum of squares that functions explain in the residuals of several channels.
 
-    B'r has the covariance G = B'(I - S S')B if the model is right, so that (B'r)' G^-1 (B'r) is
-    chi-squared. Directions that the fit has absorbed are left out.
+    If the model is right, the projection B^T r has the covariance G = B^T (I - S S^T) B, so that
+    (B^T r)^T G^-1 (B^T r) is chi-squared. Eigenvectors of G that the fit has absorbed are left out.
 
     Parameters
     ----------
     equations : sequence of NormalEquations
-        Normal equations of each channel, whose coefficients are its own.
+        Normal equations of each channel; every channel has its own coefficients.
+
+    Returns
+    -------
+    sum_of_squares : float
+        Explained sum of squares, in units of the noise variance.
+    count : int
+        Its degrees of freedom: the number of directions that remain.
     """
-    covariance = block_diag(*(of_channel.gram for of_channel in equations))
-    if all(of_channel.absorbed.shape[0] for of_channel in equations):
-        absorbed = np.hstack([of_channel.absorbed for of_channel in equations])
+    covariance = block_diag(*(channel_equations.gram for channel_equations in equations))
+    if all(channel_equations.absorbed.shape[0] for channel_equations in equations):
+        absorbed = np.hstack([channel_equations.absorbed for channel_equations in equations])
         covariance = covariance - absorbed.T @ absorbed
-    projection = np.concatenate([of_channel.projection for of_channel in equations])
-    values, vectors = np.linalg.eigh(covariance)
-    survives = values > _LEAST_SURVIVING
-    squares = (vectors[:, survives].T @ projection) ** 2 / values[survives]
+    projection = np.concatenate([channel_equations.projection for channel_equations in equations])
+    eigenvalues, eigenvectors = np.linalg.eigh(covariance)
+    survives = eigenvalues > _LEAST_SURVIVING
+    squares = (eigenvectors[:, survives].T @ projection) ** 2 / eigenvalues[survives]
     return float(np.sum(squares)), int(survives.sum())
 
 
 def envelope(fitted: FittedTrial, column: int) -> FloatArray:
-    """Return the amplitude (N,) of a channel's predicted motion: sqrt(x^2 + (v / w)^2).
+    """Return the amplitude of a channel's predicted motion at each sample of a dynamic trial.
 
-    w is the ratio of the root mean squares of rate and value; the value at rest is subtracted
-    first.
+    It is sqrt(x^2 + (v / w)^2) with the displacement x from the value at rest and the rate v,
+    averaged over one period. The angular frequency w is the rms of v over the rms of x, as it is
+    for a harmonic motion.
+
+    Parameters
+    ----------
+    fitted : FittedTrial
+        The trial, with rates.
+    column : int
+        Column of the channel.
+
+    Returns
+    -------
+    (N,) ndarray
+        Amplitude [channel's unit].
     """
     assert fitted.rates is not None
     x = fitted.prediction[:, column] - _value_at_rest(fitted, column)
@@ -112,7 +138,8 @@ def envelope(fitted: FittedTrial, column: int) -> FloatArray:
     if rms_value == 0.0 or rms_rate == 0.0:
         return np.abs(x)
     amplitude = np.hypot(x, v * rms_value / rms_rate)
-    # moving average over one period
+    # Moving average over one period 2 pi / w. Near the ends fewer samples are in the window, so the
+    # sums are divided by their numbers.
     period = 2.0 * np.pi * rms_value / (rms_rate * fitted.trial.interval)
     width = min(max(1, round(period)), len(x))
     kernel = np.ones(width)
@@ -128,10 +155,11 @@ def _value_at_rest(fitted: FittedTrial, column: int) -> float:
 
 
 def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
-    """Return the functions (n, k) that residuals of a channel may depend on, at its n used samples.
+    """Return the functions that the residuals of a channel may depend on, at its used samples.
 
-    Functions that are not linear (x^3, |v|v and so on) are made orthogonal to mean, x and v, so
-    that an error of amplitude or phase does not show in all of them.
+    Here x is the predicted displacement from rest and v its rate. The nonlinear functions (x^3,
+    |v|v and so on) are made orthogonal to the mean, x and v, so that an error of amplitude or phase
+    does not appear in all of them.
 
     Parameters
     ----------
@@ -139,24 +167,32 @@ def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
         The trial.
     column : int
         Column of the channel.
+
+    Returns
+    -------
+    dict of str to (n, k) ndarray
+        Values of each function, k = 1 or 2 columns, at the n used samples. The names are those of
+        `Cell.statistic`.
     """
     used = fitted.used[:, column]
     trial = fitted.trial
-    rest = _value_at_rest(fitted, column) if trial.is_dynamic else 0.0
-    x = fitted.prediction[used, column] - rest
+    value_at_rest = _value_at_rest(fitted, column) if trial.is_dynamic else 0.0
+    x = fitted.prediction[used, column] - value_at_rest
     linear = {"mean": np.ones(int(used.sum())), "x": x}
     nonlinear = {"x^3": [x**3], "|x|": [np.abs(x)], "sgn x": [np.sign(x)]}
-    # loads, time and temperature are what a reader looks for: only their mean is projected out
-    inputs = {"time": trial.time[used], "temperature": trial.temperature[used]}
+    # Only the mean is projected out of load, time and temperature: a dependence on them is to be
+    # reported under their names even if x and v could explain part of it.
+    conditions = {"time": trial.time[used], "temperature": trial.temperature[used]}
     if not trial.is_dynamic:
-        inputs["load"] = trial.force[used]
-        inputs["load factor"] = trial.load_factor[used]
+        conditions["load"] = trial.force[used]
+        conditions["load factor"] = trial.load_factor[used]
     elif fitted.rates is not None:
         v = fitted.rates[used, column]
         linear["v"] = v
         nonlinear["sgn v"] = [np.sign(v)]
         nonlinear["|v|v"] = [np.abs(v) * v]
         amplitude = envelope(fitted, column)[used]
+        # phase of a harmonic motion x = a cos(phase), v = -a w sin(phase)
         phase = np.angle(x / _rms_or_one(x) - 1j * v / _rms_or_one(v))
         for order, name in ((2, "2nd harmonic"), (3, "3rd harmonic")):
             nonlinear[name] = [
@@ -172,7 +208,7 @@ def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
             functions[name] = values[:, np.newaxis]
     for name, columns in nonlinear.items():
         _add_projected(functions, name, np.column_stack(columns), linear_basis)
-    for name, values in inputs.items():
+    for name, values in conditions.items():
         _add_projected(functions, name, values[:, np.newaxis], mean_basis)
     return functions
 
@@ -180,9 +216,20 @@ def features(fitted: FittedTrial, column: int) -> dict[str, FloatArray]:
 def _add_projected(
     functions: dict[str, FloatArray], name: str, columns: FloatArray, basis: FloatArray
 ) -> None:
-    """Add columns (n, k) made orthogonal to a basis (n, b).
+    """Add a function to a dictionary after it was made orthogonal to a basis.
 
-    Not if little remains of any of them.
+    It is not added if hardly anything remains of one of its columns.
+
+    Parameters
+    ----------
+    functions : dict of str to ndarray
+        Functions by name, changed in place.
+    name : str
+        Name of the function.
+    columns : (n, k) ndarray
+        Values of the function.
+    basis : (n, b) ndarray
+        Orthonormal columns that are projected out.
     """
     remaining = columns - basis @ (basis.T @ columns)
     norms = np.linalg.norm(columns, axis=0)
@@ -245,7 +292,10 @@ class Cell:
 def residual_map(
     residuals: ResidualSet, white: tuple[FloatArray, ...], rate: float = 0.05
 ) -> tuple[Cell, ...]:
-    """Return all cells; significant ones by the false discovery rate of Benjamini and Yekutieli.
+    """Return the cells of all trials and channels, with the significant ones marked.
+
+    A cell is significant if it is a discovery at the false discovery rate by the rule of Benjamini
+    and Yekutieli (2001), which holds for dependent tests.
 
     Parameters
     ----------
@@ -270,14 +320,24 @@ def residual_map(
 def _cells_of_trial(
     residuals: ResidualSet, fitted: FittedTrial, white: FloatArray
 ) -> Iterator[Cell]:
-    """Yield the cells of a trial with white residuals (N, C)."""
+    """Yield the cells of a trial: its whole records, and their bins.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The set, for the noise records.
+    fitted : FittedTrial
+        The trial.
+    white : (N, C) ndarray
+        White residuals of the trial.
+    """
     trial = fitted.trial
     for column, channel in enumerate(trial.channels):
         noise_freedom = residuals.degrees_of_freedom(channel)
         used = fitted.used[:, column]
         if not used.any():
             continue
-        empty = Cell(
+        template = Cell(
             trial=trial.name,
             channel=channel,
             axis="whole",
@@ -290,7 +350,7 @@ def _cells_of_trial(
         )
         for span in _spans(fitted, column):
             count = int(span.used.sum())
-            cell = replace(empty, axis=span.axis, low=span.low, high=span.high, count=count)
+            cell = replace(template, axis=span.axis, low=span.low, high=span.high, count=count)
             functions = {"mean": np.ones((count, 1))}
             if span.axis == "whole":
                 functions = features(fitted, column)
@@ -301,7 +361,7 @@ def _cells_of_trial(
                 )
             yield from _variance_cells(fitted, column, span.used, cell, noise_freedom)
         if trial.is_dynamic and used.all():
-            yield from _frequency_cells(white[:, column], trial.interval, empty, noise_freedom)
+            yield from _frequency_cells(white[:, column], trial.interval, template, noise_freedom)
 
 
 class _Span(NamedTuple):
@@ -324,7 +384,10 @@ class _Span(NamedTuple):
 
 
 def _spans(fitted: FittedTrial, column: int) -> Iterator[_Span]:
-    """Yield the whole record of a channel, and then its bins of time and amplitude, or of load."""
+    """Yield the spans of a channel's record that are tested: the whole, and its bins.
+
+    The bins are of time and amplitude for a dynamic trial, else of load.
+    """
     trial = fitted.trial
     used = fitted.used[:, column]
     yield _Span("whole", np.nan, np.nan, used)
@@ -343,7 +406,19 @@ def _spans(fitted: FittedTrial, column: int) -> Iterator[_Span]:
 
 
 def _bins(axis: str, values: FloatArray, edges: FloatArray, used: BoolArray) -> Iterator[_Span]:
-    """Yield the used samples between each pair of edges on an axis with values (N,)."""
+    """Yield a span for each bin of an axis.
+
+    Parameters
+    ----------
+    axis : str
+        Name of the axis.
+    values : (N,) ndarray
+        Value of each sample on the axis.
+    edges : (B + 1,) ndarray
+        Edges of the bins, ascending.
+    used : (N,) ndarray of bool
+        Used samples.
+    """
     numbers = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, edges.size - 2)
     for number, (low, high) in enumerate(pairwise(edges.tolist())):
         if low < high:
@@ -358,7 +433,9 @@ def _dependence_cells(
     cell: Cell,
     noise_freedom: float,
 ) -> Iterator[Cell]:
-    """Yield the cell of a function that residuals may depend on, unless the fit has absorbed it.
+    """Yield the cell of a function that residuals may depend on; nothing if the fit absorbed it.
+
+    Its value is the correlation coefficient of residuals and function, or the mean residual.
 
     Parameters
     ----------
@@ -367,11 +444,11 @@ def _dependence_cells(
     column : int
         Column of the channel.
     used : (N,) ndarray of bool
-        The n samples.
+        The n samples of the cell.
     columns : (n, k) ndarray
         Values of the function.
     cell : Cell
-        The cell without value and p-value.
+        The cell, still without value and p-value.
     noise_freedom : float
         Degrees of freedom of the channel's noise record; 0 without one.
     """
@@ -384,6 +461,7 @@ def _dependence_cells(
     residual = fitted.standardised[used, column]
     value = float(np.mean(residual))
     if cell.statistic != "mean":
+        # the functions have unit norm, thus b . r / |r| is the correlation
         correlations = equations.projection / (float(np.linalg.norm(residual)) or 1.0)
         value = float(correlations[0] if count == 1 else np.linalg.norm(correlations))
     p_value = variance_p_value(statistic / count, count, noise_freedom or np.inf)
@@ -393,7 +471,7 @@ def _dependence_cells(
 def _variance_cells(
     fitted: FittedTrial, column: int, used: BoolArray, cell: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
-    """Yield the cell of the residuals' mean square at some samples, if the noise is recorded.
+    """Yield the cell of the residuals' mean square over its expectation, if the noise is recorded.
 
     Parameters
     ----------
@@ -402,9 +480,9 @@ def _variance_cells(
     column : int
         Column of the channel.
     used : (N,) ndarray of bool
-        The samples.
+        The samples of the cell.
     cell : Cell
-        The cell without value and p-value.
+        The cell, still without value and p-value.
     noise_freedom : float
         Degrees of freedom of the channel's noise record; 0 without one.
     """
@@ -422,7 +500,19 @@ def _variance_cells(
 def _frequency_cells(
     series: FloatArray, interval: float, empty: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
-    """Yield the mean square of white residuals (N,) in bands of frequency that widen upwards."""
+    """Yield the cells of a dynamic record in bands of frequency, which are wider at high frequency.
+
+    Parameters
+    ----------
+    series : (N,) ndarray
+        White residuals of a channel.
+    interval : float
+        Sampling interval [s].
+    empty : Cell
+        Cell with the names of trial and channel.
+    noise_freedom : float
+        Degrees of freedom of the channel's noise record; 0 without one.
+    """
     ordinates = periodogram(series)
     if ordinates.size < 4 * BINS or noise_freedom <= 0.0:
         return

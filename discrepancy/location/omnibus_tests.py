@@ -42,9 +42,16 @@ class OmnibusTest:
 
 
 def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
-    """Return the channels that share a noise record, by the first of them.
+    """Group the channels by their noise record.
 
-    Channels whose stated records are equal share one; channels without a noise record are left out.
+    Channels with equal stated noise share one record, so that their variance tests are not
+    independent. A recorded noise belongs to its own channel. Channels without a noise record are
+    left out.
+
+    Returns
+    -------
+    dict of str to tuple of str
+        Names of the channels of each group, by the first of them.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
     for name in residuals.recorded:
@@ -58,12 +65,18 @@ def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
 
 
 def variance_test(residuals: ResidualSet) -> OmnibusTest:
-    """Return the test of the mean squares against the noise records; nan without any record.
+    """Test whether the mean squares of the residuals agree with the noise records.
 
-    Each noise record gives one p-value: Bonferroni's over all its trials together and each kind of
-    trial, because few static readings would be lost among thousands of samples of ring-downs. These
-    p-values are combined. Each channel in each trial gives a further one, for a gap in a single
-    record.
+    For each noise record, the mean square is tested over all trials together and over each kind of
+    trial, because a few static readings would be lost among thousands of samples of ring-downs. The
+    least of these p-values counts, times their number (Bonferroni). The p-values of the noise
+    records are combined. A gap in a single record is tested too: the least p-value of a channel in
+    a trial, times the number of records. The result is the lesser of the two, times two.
+
+    Returns
+    -------
+    OmnibusTest
+        The test; its statistic is nan if no channel has a noise record.
     """
     subsets = [residuals, *_by_kind(residuals)]
     p_values_of_groups: list[float] = []
@@ -90,7 +103,8 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
     worst = min(records, key=lambda record: record.p_value, default=_RecordVariance("", 2.0))
     if len(records) > 1:
         p_value = min(1.0, 2.0 * min(p_value, len(records) * worst.p_value))
-    # far from the truth a fit may leave no degree of freedom to the whole, but some to a trial
+    # A very wrong model may leave no degree of freedom to all trials together, but some to a single
+    # trial.
     statistic = weighted_sum / total_freedom if total_freedom > 0.0 else np.nan
     return OmnibusTest("variance", p_value, statistic, worst.where)
 
@@ -131,7 +145,10 @@ def _by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
 def serial_tests(
     residuals: ResidualSet, white: Sequence[FloatArray], coloured: Sequence[str] = ()
 ) -> tuple[OmnibusTest, ...]:
-    """Return Ljung-Box, cumulative periodogram and Fisher g over all series of dynamic trials.
+    """Test the residuals of all dynamic trials for correlation in time and for spectral lines.
+
+    The tests are those of Ljung and Box, of the cumulative periodogram, and Fisher's g. Each is
+    combined over all records.
 
     Parameters
     ----------
@@ -140,7 +157,7 @@ def serial_tests(
     white : sequence of (N, C) ndarray
         White residuals of each trial, from its method `white`.
     coloured : sequence of str
-        Channels whose noise record itself is not white: they are left out.
+        Channels whose noise record is not white itself, and which are therefore left out.
     """
     ljung_box: list[_SerialTest] = []
     cumulative_periodogram: list[_SerialTest] = []
@@ -172,7 +189,10 @@ class _SerialTest(NamedTuple):
 
 
 def _combined(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
-    """Return the tests of all series as one; nan without any."""
+    """Return the tests of all series combined into one; its p-value is nan if there are none.
+
+    Statistic and place are those of the series with the least p-value.
+    """
     if not tests:
         return OmnibusTest(name, np.nan, np.nan, "")
     worst = min(tests, key=lambda test: test.p_value)
@@ -181,7 +201,7 @@ def _combined(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
 
 
 def coloured_noise(residuals: ResidualSet) -> dict[str, str]:
-    """Return the channels whose noise record itself is not white, with a remark for each."""
+    """Return a remark on each channel whose noise record is not white itself, by its name."""
     remarks = {}
     for name, channel in residuals.channels.items():
         series = record_at_rest(channel)

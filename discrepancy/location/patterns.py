@@ -11,7 +11,7 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.location.residuals import FittedTrial, ResidualSet
 
 ALIKE = 0.9
-"""Squared cosine from which two patterns over the channels count as the same."""
+"""Least squared cosine between two patterns over the channels that count as the same."""
 PATTERN_LEVEL = 0.01
 """Largest p-value of a pattern that is reported."""
 MOST_PATTERNS = 3
@@ -115,13 +115,14 @@ def kinds_of(residuals: ResidualSet, white: Sequence[FloatArray]) -> list[Trials
 
 
 def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagreement]:
-    """Return the significant singular patterns of a kind of trial, largest first.
+    """Return the significant patterns of residuals over the channels, largest first.
 
-    They are singular vectors of the residual matrix (samples x channels, in units of the noise).
-    Their p-value is that of the largest singular value of a noise matrix of this size: Tracy and
-    Widom's law (Johnstone 2001, Ann. Statist. 29, 295-327) by the gamma distribution of its moments
-    (Chiani 2014, J. Multivar. Anal. 129, 69-81), averaged over the error of the noise record of the
-    loudest channel.
+    A pattern is a right singular vector of the matrix of white residuals (samples x channels, in
+    units of the noise). Its p-value is that of the largest singular value of a noise matrix of this
+    size. The square of that value has the law of Tracy and Widom (Johnstone 2001, Ann. Statist. 29,
+    295-327), approximated by a shifted gamma distribution with the same moments (Chiani 2014,
+    J. Multivar. Anal. 129, 69-81). The p-value is averaged over the error of the noise records,
+    because a channel whose noise was underestimated looks like a pattern.
 
     Parameters
     ----------
@@ -144,14 +145,16 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
     scale = (longer_root + shorter_root) * (1.0 / longer_root + 1.0 / shorter_root) ** (1.0 / 3.0)
     noise_ratios = _largest_noise_ratios(residuals, kind)
     patterns: list[Disagreement] = []
-    # after k patterns the rest is compared with whole noise matrices: a little too strict, never
-    # lax
+    # After k patterns the remaining matrix is smaller, but compared with a full noise matrix: later
+    # p-values are a little too large, never too small.
     for square, weights in zip(singular_values[:MOST_PATTERNS] ** 2, right_vectors, strict=False):
         standardised = (square / noise_ratios - centre) / scale
+        # Chiani's gamma approximation for real data: shape 46.446, scale 0.186054, shift 9.84801
         tail = stats.gamma.sf(standardised + 9.84801, 46.446, scale=0.186054)
         p_value = float(np.mean(tail))
         if p_value > PATTERN_LEVEL:
             break
+        # noise alone has about this squared singular value, if samples and channels differ much
         square_of_noise = max(sample_count, channel_count)
         share = float(np.clip((square - square_of_noise) / excess_squares, 0.0, 1.0))
         meaning, phrase = _meaning(residuals, kind.trials, weights)
@@ -162,9 +165,17 @@ def singular_patterns(residuals: ResidualSet, kind: TrialsOfKind) -> list[Disagr
 
 
 def _largest_noise_ratios(residuals: ResidualSet, kind: TrialsOfKind) -> FloatArray:
-    """Return quantiles (1000,) of the largest true variance of C channels over that of its record.
+    """Return how much the largest noise variance of C channels may exceed that of its record.
 
-    The records are taken to have the degrees of freedom of the shortest one.
+    The estimate of a variance with n degrees of freedom is the variance times chi-squared over n.
+    The true variance over the estimate is thus n over chi-squared, and the largest of C independent
+    ones has the quantile function n / chi2.isf(q^(1/C)). All records are taken to have the degrees
+    of freedom of the shortest one.
+
+    Returns
+    -------
+    (1000,) ndarray
+        Quantiles of the ratio at evenly spaced probabilities.
     """
     channels = kind.trials[0].trial.channels
     freedoms = [residuals.degrees_of_freedom(name) for name in channels]
@@ -193,7 +204,10 @@ class _PatternMeaning(NamedTuple):
 def _meaning(
     residuals: ResidualSet, trials: Sequence[FittedTrial], weights: FloatArray
 ) -> _PatternMeaning:
-    """Return the meaning of a pattern over the channels.
+    """Interpret a pattern over the channels by the known pattern that it agrees with best.
+
+    The agreement is the squared cosine of the angle between the two. The meaning is "mixed" if it
+    is less than `ALIKE` for all known patterns, or if two of them agree about equally well.
 
     Parameters
     ----------
@@ -215,13 +229,13 @@ def _meaning(
         strongest = np.argsort(-np.abs(weights))[:3]
         names = ", ".join(channels[index] for index in strongest)
         return _PatternMeaning("mixed", f"A pattern of its own, strongest on {names},")
-    rivals = set()
+    competing_subjects = set()
     for agreement, meaning in candidates:
         agrees_as_well = agreement >= max(ALIKE, best_agreement - 0.05)
         if agrees_as_well and meaning.subject != best.subject:
-            rivals.add(meaning.subject)
-    if rivals:
-        phrase = f"{best.phrase.rstrip(',')} or equally {' or '.join(sorted(rivals))}"
+            competing_subjects.add(meaning.subject)
+    if competing_subjects:
+        phrase = f"{best.phrase.rstrip(',')} or equally {' or '.join(sorted(competing_subjects))}"
         return _PatternMeaning("mixed", phrase)
     return best
 
@@ -229,9 +243,26 @@ def _meaning(
 def _known_patterns(
     residuals: ResidualSet, trials: Sequence[FittedTrial], weights: FloatArray
 ) -> Iterator[tuple[_PatternMeaning, FloatArray]]:
-    """Yield meanings with their patterns over the channels (C,), in units of the noise.
+    """Yield the known patterns over C channels, each with its meaning.
 
-    A pattern is zero if the predictions are zero.
+    They are one channel alone, the same physical value in all channels, and the main pattern of the
+    predicted motion, which is zero if the predictions are zero.
+
+    Parameters
+    ----------
+    residuals : ResidualSet
+        The set, for the quantities of the channels.
+    trials : sequence of FittedTrial
+        The trials.
+    weights : (C,) ndarray
+        The pattern to interpret; its largest entry selects the single channel.
+
+    Yields
+    ------
+    meaning : _PatternMeaning
+        What the pattern means.
+    pattern : (C,) ndarray
+        The pattern, in units of each channel's noise.
     """
     channels = trials[0].trial.channels
     noise = trials[0].noise_deviation
@@ -242,7 +273,7 @@ def _known_patterns(
     if len({residuals.channels[name].quantity for name in channels}) == 1:
         phrase = "All channels alike, whatever they measure (hum, temperature or zero),"
         yield _PatternMeaning("common", phrase), 1.0 / noise
-    # the main pattern of the predictions
+    # the main pattern of the predictions is their first right singular vector
     predictions = []
     for fitted in trials:
         predictions.append((fitted.prediction - fitted.prediction.mean(axis=0)) / noise)

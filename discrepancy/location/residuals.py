@@ -120,7 +120,7 @@ class ChannelFit(NamedTuple):
 
 
 def of_channel(trials: Iterable[FittedTrial], channel: str) -> Iterator[ChannelFit]:
-    """Yield a channel in each of the trials that have it."""
+    """Yield the column and the used samples of a channel in each trial that records it."""
     for fitted_trial in trials:
         if channel in fitted_trial.trial.channels:
             column = fitted_trial.column(channel)
@@ -155,16 +155,16 @@ class ResidualSet:
 
     @property
     def fitted(self) -> "ResidualSet | None":
-        """The trials that were fitted; None without any."""
+        """The set of the fitted trials; None if there are none."""
         return self._where(held_out=False)
 
     @property
     def held_out(self) -> "ResidualSet | None":
-        """The trials that were held out for proof; None without any."""
+        """The set of the trials that were held out for proof; None if there are none."""
         return self._where(held_out=True)
 
     def _where(self, *, held_out: bool) -> "ResidualSet | None":
-        """Return the trials that are held out, or those that are not; None without any."""
+        """Return the set of the held-out trials, or of the fitted ones; None if there are none."""
         trials = tuple(fitted for fitted in self.trials if fitted.trial.held_out is held_out)
         return replace(self, trials=trials) if trials else None
 
@@ -187,13 +187,14 @@ class ResidualSet:
     def white(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
         """Return residuals that are white with unit variance if the model is right.
 
-        A residual at a draw of the posterior is distributed as the noise itself (Johnson 2007,
-        Bayesian Analysis 2(4), 719-734): r + S z with z standard normal, one z for all trials,
-        restores exactly what the fit has absorbed. Held-out trials lose the error of the parameters
-        in the same way. Without sensitivities, what the fit has absorbed is restored sample by
-        sample, r + sqrt(leverage) z, and residuals of a larger variance than the noise are divided
-        by their standard deviation. Samples that are not used are drawn from the noise, so that
-        series keep their even spacing.
+        A fit absorbs part of the noise: its residuals r have the covariance I - S S^T. The sum
+        r + S z, with one standard normal vector z for all trials, has the covariance I: a residual
+        at a draw of the posterior is distributed as the noise itself (Johnson 2007, Bayesian
+        Analysis 2(4), 719-734). In held-out trials r contains the error of the parameters, which
+        is subtracted; see `_held_out_draw`. Without sensitivities, sqrt(leverage) z is added with
+        an independent z for each sample, and residuals with a variance above that of the noise are
+        divided by their standard deviation. Samples that are not used are replaced by draws of the
+        noise, so that series stay evenly spaced.
 
         Parameters
         ----------
@@ -224,19 +225,28 @@ class ResidualSet:
         return tuple(white)
 
     def _parameter_count(self) -> int:
-        """Return the number P of parameters of the sensitivities; 0 without any."""
+        """Return the number P of parameters in the sensitivities; 0 if no trial has them."""
         for fitted in self.trials:
             if fitted.sensitivity is not None:
                 return int(fitted.sensitivity.shape[2])
         return 0
 
     def series(self, white: Sequence[FloatArray]) -> Iterator[tuple[FittedTrial, str, FloatArray]]:
-        """Yield trial, channel and white residuals (N,) of records that are long enough for tests.
+        """Yield the white residuals of each dynamic record that is long enough for serial tests.
 
         Parameters
         ----------
         white : sequence of (N, C) ndarray
             White residuals of each trial, from the method `white`.
+
+        Yields
+        ------
+        fitted : FittedTrial
+            The trial.
+        channel : str
+            Name of the channel.
+        series : (N,) ndarray
+            White residuals of the channel, in units of the noise.
         """
         for fitted, values in zip(self.trials, white, strict=True):
             if not fitted.trial.is_dynamic or len(values) < SHORTEST_SERIES:
@@ -246,15 +256,16 @@ class ResidualSet:
                     yield fitted, name, values[:, column]
 
     def _held_out_draw(self, draw: FloatArray) -> FloatArray:
-        """Return a draw of the parameters' error given the held-out trials, (P,).
+        """Return a draw (P,) of the error z of the parameters, given the held-out residuals.
 
-        In held-out trials r = e + S z. Given r, z is Gaussian with the precision I + S^T S, and r
+        In held-out trials r = e + S z with the white noise e and z standard normal. Given r, z is
+        Gaussian with the precision I + S^T S and the mean (I + S^T S)^-1 S^T r. The residual r
         minus S times a draw of z is distributed as the noise e.
 
         Parameters
         ----------
         draw : (P,) ndarray
-            Standard normal variables.
+            Independent standard normal variables.
         """
         precision = np.eye(draw.size)
         weighted_residual = np.zeros(draw.size)
@@ -264,14 +275,15 @@ class ResidualSet:
                 precision += sensitivity.T @ sensitivity
                 weighted_residual += sensitivity.T @ fitted.standardised[fitted.used]
         mean = np.linalg.solve(precision, weighted_residual)
+        # precision = L L^T, thus L^-T times a standard normal vector has its inverse as covariance
         factor = np.linalg.cholesky(precision)
         return np.asarray(mean + np.linalg.solve(factor.T, draw))
 
 
 def without_colour(residuals: ResidualSet) -> ResidualSet:
-    """Return a set without the records whose noise is coloured and could not be whitened.
+    """Mark the records with coloured noise that cannot be whitened as not used.
 
-    Such noise would look like a discrepancy.
+    Correlated noise in them would be taken for a discrepancy of the model.
     """
     noise = {name: noise_model(channel, 1.0) for name, channel in residuals.channels.items()}
     trials = []
@@ -287,42 +299,54 @@ def quadratic_moments(
 ) -> tuple[float, float]:
     """Return mean and effective degrees of freedom of a sum of squares of residuals.
 
-    With the covariance A = I - S S^T these are tr A and (tr A)^2 / tr A^2 (Satterthwaite 1946), so
-    that the sum over its mean is about chi-squared over the degrees of freedom.
+    If the residuals have the covariance A, the sum has the mean tr A and the variance 2 tr A^2. A
+    multiple of a chi-squared variable with the same two moments has (tr A)^2 / tr A^2 degrees of
+    freedom (Satterthwaite 1946). Here A = I - S S^T with the sensitivities S; see the text of the
+    module. Without sensitivities tr A^2 is replaced by tr A, which is exact if A is a projection.
 
     Parameters
     ----------
     items : iterable of ((n,) ndarray, (n, P) ndarray or None)
-        Expected variances of the residuals, and their sensitivities, by trial and channel.
+        Expected variances of n residuals in units of the noise variance (the diagonal of A), and
+        their sensitivities S, for each trial and channel.
     held_out : bool
         True for residuals of held-out trials, where A = I + S S^T.
 
     Returns
     -------
-    mean, degrees_of_freedom : float
+    mean : float
+        Expected sum of squares tr A, in units of the noise variance.
+    degrees_of_freedom : float
+        Effective degrees of freedom; 0 if the fit has absorbed all residuals.
     """
     trace = 0.0
     trace_of_square = 0.0
-    cross: FloatArray | None = None
+    gram_of_sensitivities: FloatArray | None = None
     for expected_variance, sensitivity in items:
         trace += float(expected_variance.sum())
         if sensitivity is None:
+            # A^2 = A for a projection, such as I - S S^T of a linear fit without priors
             trace_of_square += float(expected_variance.sum())
             continue
-        # tr A^2 = n -+ 2 tr S S^T + tr (S^T S)^2, whose last term is that of all items together
+        # A^2 = I -+ 2 S S^T + (S S^T)^2, thus tr A^2 = n -+ 2 tr S S^T + tr (S^T S)^2. The last
+        # term does not split into items: S^T S is summed over them first.
         leverage = np.einsum("np,np->n", sensitivity, sensitivity)
         trace_of_square += float(np.sum(1.0 + (2.0 if held_out else -2.0) * leverage))
-        product = sensitivity.T @ sensitivity
-        cross = product if cross is None else cross + product
-    if cross is not None:
-        trace_of_square += float(np.sum(cross**2))
+        gram_of_item = sensitivity.T @ sensitivity
+        gram_of_sensitivities = (
+            gram_of_item if gram_of_sensitivities is None else gram_of_sensitivities + gram_of_item
+        )
+    if gram_of_sensitivities is not None:
+        trace_of_square += float(np.sum(gram_of_sensitivities**2))
     if trace <= 1e-9 or trace_of_square <= 1e-12:
         return max(trace, 0.0), 0.0
     return trace, trace**2 / trace_of_square
 
 
 def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float, float]:
-    """Return the sum of squares of channels over its expectation, and its degrees of freedom.
+    """Return the sum of squares of channels' residuals divided by its expectation.
+
+    It is 1 on average if the model is right.
 
     Parameters
     ----------
@@ -330,6 +354,13 @@ def mean_square(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float,
         Trials that are all fitted, or all held out.
     channels : sequence of str
         Names of the channels.
+
+    Returns
+    -------
+    ratio : float
+        Sum of squares over its expectation; nan if that is zero.
+    degrees_of_freedom : float
+        Effective degrees of freedom of the sum; see `quadratic_moments`.
     """
     sum_of_squares = 0.0
     moments = []

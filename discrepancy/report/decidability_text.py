@@ -13,7 +13,17 @@ from reporting.words import listing
 
 
 def seen_of(detectability: Detectability) -> tuple[str, str, str]:
-    """Return texts on whether an effect is visible, from which size on, and its prior median."""
+    """Return texts on the detectability of an effect, for a row of a table.
+
+    Returns
+    -------
+    visible : str
+        Whether the effect is detectable at its prior median.
+    least_size : str
+        Least detectable size, with unit.
+    median : str
+        Prior median of its size, with unit; empty for an effect without a size.
+    """
     is_visible = detectability.distance >= DETECTED
     visible = "yes" if is_visible else "larger than usual only"
     if not detectability.parameter:
@@ -32,11 +42,11 @@ def neighbours(separability: Separability, name: str) -> list[str]:
         return []
     index = separability.identifiers.index(name)
     distance = np.minimum(separability.distance[index], separability.distance[:, index])
-    is_near = distance < CONFUSED
+    is_confusable = distance < CONFUSED
     return [
         other
         for other_index, other in enumerate(separability.identifiers)
-        if is_near[other_index] and other_index != index
+        if is_confusable[other_index] and other_index != index
     ]
 
 

@@ -105,11 +105,14 @@ def _map_of_names(
 
 
 def separability_figure(separability: Separability) -> Figure | None:
-    """Draw how well each effect can be distinguished from each other; None with fewer than two."""
+    """Draw the squared distances between effects as a map: how well they can be distinguished.
+
+    Pairs that these data confuse are marked by a cross. None with fewer than two effects.
+    """
     names = separability.identifiers
     if len(names) < 2:
         return None
-    # members of a confusion group stand side by side
+    # sort the effects so that members of a confusion group are next to each other
     group_numbers: dict[str, int] = {}
     for group_number, group in enumerate(separability.groups):
         for name in group:
@@ -136,7 +139,10 @@ def separability_figure(separability: Separability) -> Figure | None:
 
 
 def confusion_figure(self_calibration: SelfCalibration) -> Figure:
-    """Draw the confusion matrix of the workflow on simulated campaigns of this geometry."""
+    """Draw the confusion matrix of the workflow: hidden effects (rows) against verdicts (columns).
+
+    Colours show the fraction of each row, texts the numbers of simulated campaigns.
+    """
     rows, columns, counts = self_calibration.confusion()
     row_sums = np.maximum(counts.sum(axis=1, keepdims=True), 1)
     fractions = np.where(counts > 0, counts / row_sums, np.nan)
@@ -147,13 +153,16 @@ def confusion_figure(self_calibration: SelfCalibration) -> Figure:
 
 
 MOST_DOTS = 3000
-"""Most dots of a panel; of longer records samples are left out evenly."""
+"""Most dots of a panel; longer records are thinned evenly."""
 MOST_TURNS = 400
-"""Most samples of the force over time; they surround its largest value."""
+"""Most samples of the force in a panel over time, centred on its largest value."""
 
 
 def missing_force_figure(missing: MissingForce) -> Figure:
-    """Draw a missing force over displacement, speed and time, and what its law leaves."""
+    """Draw a missing force over displacement, speed and time.
+
+    A second row of panels shows the force that remains with the fitted law, if there is one.
+    """
     row_titles = {"force": "missing force"}
     if missing.law:
         row_titles["left"] = "what is left"
@@ -189,18 +198,18 @@ def missing_force_figure(missing: MissingForce) -> Figure:
 
 
 def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: bool) -> None:
-    """Draw a series of the trial with the largest force, around the time at which it is largest.
+    """Draw a force over time around its largest value, in the trial in which that occurs.
 
     Parameters
     ----------
     axes : Axes
-        Where it is drawn.
+        The axes to draw on.
     missing : MissingForce
         The missing force.
     series : str
-        "force", or "left" for what its law leaves.
+        "force", or "left" for the force that remains with its law.
     has_law : bool
-        True to draw the law, too.
+        True to draw the law as well.
     """
     strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
     first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
@@ -224,7 +233,7 @@ def _draw_over_motion(
     Parameters
     ----------
     axes : Axes
-        Where it is drawn.
+        The axes to draw on.
     missing : MissingForce
         The missing force.
     motion, series, law : str
@@ -264,12 +273,12 @@ def _draw_over_motion(
 
 
 Pack = Callable[[Path, Path], str]
-"""(patch.json, FMU to be written) -> what to say about it."""
+"""Function that packs an FMU: from `patch.json` and the FMU's path to a sentence about it."""
 
 
 @dataclass(frozen=True)
 class ReportInput:
-    """All that the report shows, and what is written beside it.
+    """Content of the report and of the files that are written with it.
 
     Attributes
     ----------
@@ -302,7 +311,7 @@ class ReportInput:
 
 
 def _unit_of_noise(before: ResidualSet) -> str:
-    """Return the sentence on the unit of sizes of residuals."""
+    """Return the sentence on the unit of the rms residuals in figures: the noise, if recorded."""
     unknown = [name for name in before.measured if name not in before.recorded]
     if not unknown:
         return "1 is noise."

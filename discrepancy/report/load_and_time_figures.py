@@ -26,6 +26,7 @@ from reporting import figures as style
 MOST_RECORDS = 12
 """Records that are drawn; those with the largest gaps go first."""
 LONGEST_NAME = 26
+"""Most characters of a trial's name at the axis."""
 
 
 class _LoadPanel(NamedTuple):
@@ -38,8 +39,8 @@ class _LoadPanel(NamedTuple):
 
 
 def _load_panels(residuals: ResidualSet) -> list[_LoadPanel]:
-    """Return a panel for each quantity of static trials and of flights."""
-    found = []
+    """Return a panel for each measured quantity of the static trials, and then of the flights."""
+    load_panels = []
     for kind, label in ((TrialKind.STATIC, "force, N"), (TrialKind.FLIGHT, "load factor")):
         measured: set[str] = set()
         for fitted in residuals.trials:
@@ -52,14 +53,24 @@ def _load_panels(residuals: ResidualSet) -> list[_LoadPanel]:
                 if channel.quantity is quantity and name in measured
             ]
             if names:
-                found.append(_LoadPanel(kind, label, quantity, names))
-    return found
+                load_panels.append(_LoadPanel(kind, label, quantity, names))
+    return load_panels
 
 
 def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None:
-    """Draw residuals of static trials and flights over the load, by quantity.
+    """Draw the residuals of static trials and flights over the load, a panel for each quantity.
 
-    None without such trials.
+    Parameters
+    ----------
+    before : ResidualSet
+        Residuals of the model without the effect.
+    after : ResidualSet or None
+        Residuals of the model with the effect.
+
+    Returns
+    -------
+    Figure or None
+        The figure with at most four panels; None if there are no such trials.
     """
     load_panels = _load_panels(before)[:4]
     if not load_panels:
@@ -85,24 +96,29 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
 def _draw_loads(
     axes: Axes, drawn: DrawnModel, kind: TrialKind, names: Sequence[str], factor: float
 ) -> float:
-    """Draw the residuals of a model over the load, and return the largest deviation of the noise.
+    """Draw the residuals of several channels over the load, one marker for each reading.
 
     Parameters
     ----------
     axes : Axes
-        Where they are drawn.
+        The axes to draw on.
     drawn : DrawnModel
-        The model.
+        Residuals of one model, with the marker, colour and label of that model.
     kind : TrialKind
-        Kind of the trials.
+        Kind of the trials to draw: static trials or flights.
     names : sequence of str
-        Names of the channels.
+        Names of the channels to draw.
     factor : float
         Factor from SI to the unit of the figure.
+
+    Returns
+    -------
+    float
+        Largest standard deviation of the noise of these channels, in the unit of the figure.
     """
-    noise = 0.0
-    label = drawn.label
-    shift = 0.0 if drawn.marker == "o" else 0.006  # so that models do not hide each other
+    largest_noise = 0.0
+    legend_label = drawn.label
+    relative_shift = 0.0 if drawn.marker == "o" else 0.006  # so that models do not hide each other
     for fitted in drawn.residuals.trials:
         trial = fitted.trial
         if trial.kind is not kind:
@@ -113,9 +129,9 @@ def _draw_loads(
                 continue
             column = fitted.column(name)
             used = fitted.used[:, column]
-            noise = max(noise, factor * float(fitted.noise_deviation[column]))
+            largest_noise = max(largest_noise, factor * float(fitted.noise_deviation[column]))
             axes.plot(
-                trial.load[used] + shift * load_range,
+                trial.load[used] + relative_shift * load_range,
                 factor * fitted.residual[used, column],
                 drawn.marker,
                 ms=2.8,
@@ -124,21 +140,36 @@ def _draw_loads(
                 mec=drawn.colour,
                 mew=0.7,
                 alpha=0.8,
-                label=label,
+                label=legend_label,
             )
-            label = "_nolegend_"
-    return noise
+            legend_label = "_nolegend_"  # Matplotlib: one entry in the legend for each model
+    return largest_noise
 
 
 def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
-    """Draw the windows of the records with the largest gaps; None without a window."""
+    """Draw the windows in time with gaps as bars, a row for each of the records with the largest.
+
+    Parameters
+    ----------
+    windows : sequence of GapWindow
+        Windows of the records, each with the size of its gap between model and measurements.
+
+    Returns
+    -------
+    Figure or None
+        The figure with at most `MOST_RECORDS` rows; None if there are no windows.
+    """
     if not windows:
         return None
-    sizes: dict[str, float] = {}
+    largest_gap_of_trial: dict[str, float] = {}
     for window in windows:
-        sizes[window.trial] = max(sizes.get(window.trial, 0.0), window.size)
-    largest = sorted(sizes, key=lambda name: -sizes[name])[:MOST_RECORDS]
-    trials = [name for name in sizes if name in largest]
+        largest_gap_of_trial[window.trial] = max(
+            largest_gap_of_trial.get(window.trial, 0.0), window.size
+        )
+    trials_with_largest_gaps = sorted(
+        largest_gap_of_trial, key=lambda name: -largest_gap_of_trial[name]
+    )[:MOST_RECORDS]
+    trials = [name for name in largest_gap_of_trial if name in trials_with_largest_gaps]
     norm = scale_of([window.size for window in windows])
     has_two_rows = any(window.with_effect for window in windows)
     figure, ((axes,),) = panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
@@ -157,14 +188,26 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
 def _draw_record(
     axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool
 ) -> None:
-    """Draw the windows of a record as bars.
+    """Draw the windows of a record as bars, with the uncertainty of their ends.
 
-    `both`: those with the effect have a row of their own.
+    Parameters
+    ----------
+    axes : Axes
+        The axes to draw on.
+    row : int
+        Row of the record, counted downwards.
+    windows : sequence of GapWindow
+        Windows of the record.
+    norm : Normalize
+        Scale from the size of a gap to the colour of its bar.
+    both : bool
+        True if the windows that remain with the effect have a line of their own below the others.
     """
     first, last = windows[0].first, windows[0].last
     lines = (row - 0.14, row + 0.2) if both else row
     axes.hlines(lines, first, last, color=style.REFERENCE, lw=1.0, zorder=1)
     for window in windows:
+        # a window without a begin or an end extends to that end of the record
         begin = first if window.begin is None else window.begin.value
         end = last if window.end is None else window.end.value
         if window.with_effect:

@@ -96,9 +96,9 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
 
 
 def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst) -> Figure | None:
-    """Draw spectra of the residuals of the worst channel over all dynamic trials.
+    """Draw the spectra of the residuals of the worst channel, averaged over the dynamic trials.
 
-    None if no trial is long enough.
+    The power is relative to white noise of the stated variance. None if no trial is long enough.
     """
     spectra = []
     for drawn in models(before, after):
@@ -143,15 +143,13 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
 
 
 def _draw_noise_spectrum(axes: Axes, noise: NoiseRecord | None) -> None:
-    """Draw the spectrum of samples at rest, over that of white noise.
-
-    Nothing without 32 samples.
-    """
+    """Draw the spectrum of a noise record over that of white noise; it needs 32 samples."""
     if noise is None or noise.samples is None or not noise.interval or len(noise.samples) < 32:
         return
     standardised = noise.samples / noise.standard_deviation
     segment = min(len(noise.samples), 128)
     frequency, power = welch(standardised, 1.0 / noise.interval, nperseg=segment)
+    # one-sided density of white noise of unit variance: 2 interval
     power = power[1:] * 0.5 / noise.interval
     axes.plot(frequency[1:], power, color=style.OBSERVED, lw=0.8, alpha=0.6, label="noise record")
 
@@ -164,10 +162,10 @@ class _Spectrum(NamedTuple):
 
 
 def _spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
-    """Return the mean spectrum of a channel's residuals over the trials; None without a long one.
+    """Return the mean spectrum of a channel's residuals over the dynamic trials.
 
-    Trials of several lengths have several frequencies; those of the most frequent kind are
-    averaged.
+    Trials of different lengths have spectra at different frequencies; only the largest group of
+    trials with equal frequencies is averaged. None if no trial has 32 samples.
     """
     groups: dict[float, list[_Spectrum]] = {}
     for fitted, column, _ in of_channel(residuals.trials, channel):
@@ -263,7 +261,7 @@ def _draw_backbone(
     Parameters
     ----------
     axes : Axes
-        Where it is drawn.
+        The axes to draw on.
     measured : Backbone
         The measured backbone.
     curves : sequence of (DrawnModel, Backbone)
@@ -299,7 +297,7 @@ def _draw_backbone(
 
 
 def _limit_to_measured(axes: Axes, values: FloatArray) -> None:
-    """Limit the ordinate to measured values and their surroundings."""
+    """Limit the vertical axis to the range of the measured values, with a margin."""
     low, high = np.nanquantile(values, (0.02, 0.98))
     margin = 1.2 * max(float(high - low), 0.02 * abs(float(np.nanmedian(values))))
     bottom, top = axes.get_ylim()
@@ -311,7 +309,8 @@ def _backbones(
 ) -> dict[int, Backbone]:
     """Return the backbones of the ring-downs by mode, of the predictions or of the readings.
 
-    Points with large errors are left out, and nan stands between ring-downs.
+    Points with large errors are left out. The points of different ring-downs are separated by nan,
+    so that no line connects them.
 
     Parameters
     ----------

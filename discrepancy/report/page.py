@@ -28,7 +28,11 @@ NINETY = 1.6449
 
 
 def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
-    """Return the best hypotheses with their roles: those of the verdict first, "none" always."""
+    """Return the rows of the table of evidence: hypotheses with their roles.
+
+    Those of the verdict come first, then the most probable others, at most `SHOWN_HYPOTHESES` in
+    all. The hypothesis without effects is always included.
+    """
     if verdict.group:
         members = [*verdict.group]
         role = "member of the group"
@@ -51,7 +55,7 @@ def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
 
 
 def not_compared_rows(verdict: Verdict) -> list[tuple[str, str]]:
-    """Return the reasons for not comparing hypotheses, each with its hypotheses."""
+    """Return the rows of effects that were not fitted: each reason with the effects it concerns."""
     names_by_reason: dict[str, list[str]] = {}
     for omitted in verdict.not_fitted:
         gain = f" ({words.number(omitted.gain, 2)} nat)" if isfinite(omitted.gain) else ""
@@ -99,7 +103,15 @@ def _with_half_width(value: float, deviation: float) -> str:
 
 
 def score_rows(investigation: Investigation) -> tuple[list[str], list[list[str]]]:
-    """Return the titles and the rows of the table of scores, before and after."""
+    """Return the table of scores without and with the effects.
+
+    Returns
+    -------
+    titles : list of str
+        Titles of the columns, such as "held out, before".
+    rows : list of list of str
+        Name of a score, or rms of a channel, and its values in these columns.
+    """
     proof = investigation.proof
     assert proof is not None
     all_scores = {
@@ -146,7 +158,7 @@ LONGEST_CARD = 60
 
 
 def what_is_missing(verdict: Verdict) -> str:
-    """Return what is missing in the few words of a card."""
+    """Return what the model lacks in a few words, for a card at the top of the page."""
     members = words.members_of(verdict)
     if members:
         names = listing(members, "or")
@@ -176,7 +188,7 @@ def sizes_sentence(content: ReportInput) -> str:
 
 
 def deciding(verdict: Verdict) -> list[Gate]:
-    """Return the gates that compare a p-value; the one that decided comes first."""
+    """Return the gates that compared a p-value; those that did not pass come first."""
     compared = [
         gate
         for gate in verdict.gates
@@ -186,7 +198,7 @@ def deciding(verdict: Verdict) -> list[Gate]:
 
 
 def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Proportion]]:
-    """Return what was hidden in simulated campaigns, the outcomes, and how often each came."""
+    """Return the rows of the self-calibration: hidden or not, the outcome, and its fraction."""
     rows = []
     for title, null in (("an effect was hidden", False), ("nothing was hidden", True)):
         for outcome in outcomes(tried, null=null):
@@ -259,16 +271,16 @@ def said_on_page(content: ReportInput) -> dict[str, Any]:
 def render_report(
     content: ReportInput, drawings: dict[str, bytes], figures: dict[str, ReportFigure]
 ) -> str:
-    """Return the page.
+    """Return the report as an HTML page.
 
     Parameters
     ----------
     content : ReportInput
-        What is shown.
+        Content of the report.
     drawings : dict of str to bytes
-        SVG of each of `figures`.
+        SVG of each figure, by name.
     figures : dict of str to ReportFigure
-        What `report_figures` returned.
+        The figures with their captions, as `report_figures` returned them.
     """
     origin = content.origin
     page = Page(

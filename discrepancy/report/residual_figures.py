@@ -36,7 +36,7 @@ class DrawnModel(NamedTuple):
 
 
 def models(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
-    """Return the model as it was and, if there is one, the model with the effect."""
+    """Return the residuals to draw, with style and label: before and, if given, with the effect."""
     was = DrawnModel(before, style.PREDICTION, "--", "o", "model", "model as it is")
     if after is None:
         return [was]
@@ -46,9 +46,16 @@ def models(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
 
 
 def panels(rows: int, columns: int, height: float, **grid: Any) -> tuple[Figure, list[list[Axes]]]:
-    """Return a figure of a height [in] and its panels.
+    """Return a new figure and its grid of panels.
 
-    `grid` as of `matplotlib.figure.Figure.subplots`.
+    Parameters
+    ----------
+    rows, columns : int
+        Numbers of panels.
+    height : float
+        Height of the figure [in].
+    **grid : object
+        Further arguments of `matplotlib.figure.Figure.subplots`.
     """
     figure = style.new_figure(height)
     figure.set_layout_engine("constrained")
@@ -56,7 +63,7 @@ def panels(rows: int, columns: int, height: float, **grid: Any) -> tuple[Figure,
 
 
 def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
-    """Draw the band of two deviations of the noise."""
+    """Draw the band of plus and minus two standard deviations of the noise around zero."""
     axes.axhspan(
         -2.0 * deviation,
         2.0 * deviation,
@@ -105,7 +112,7 @@ def heat_map(
     Parameters
     ----------
     axes : Axes
-        Where it is drawn.
+        The axes to draw on.
     values : (R, C) ndarray
         Values; nan for an empty cell.
     names : (iterable of str, iterable of str)
@@ -137,7 +144,7 @@ def heat_map(
 
 
 MOST_CELLS = 12
-"""Rows or columns up to which a heat map has its numbers written in."""
+"""Most rows and columns of a heat map whose cells show their numbers."""
 GAUGE: dict[str, Any] = {
     "cmap": style.LEVELS,
     "s": 46,
@@ -210,9 +217,9 @@ def gauge_places(channels: Sequence[Channel], design: WingDesign) -> dict[str, t
 def planform_figure(
     before: ResidualSet, after: ResidualSet | None, design: WingDesign
 ) -> Figure | None:
-    """Draw the sizes of residuals on the planform, before and after at one scale.
+    """Draw the rms residuals of the channels at their places on the planform of the wing.
 
-    None without places.
+    The models without and with the effect share one colour scale. None if no channel has a place.
     """
     places = gauge_places(list(before.channels.values()), design)
     if not places:
@@ -241,7 +248,10 @@ def planform_figure(
 
 
 def _position(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
-    """Return a place in the plan [m]: from the root, and behind the root's leading edge.
+    """Return the coordinates of a place in the planform [m]: along the span, and along the chord.
+
+    The chordwise coordinate is measured from the leading edge at the root. The wing is straight at
+    the chord fraction `straight_chord_line`.
 
     Parameters
     ----------
@@ -288,7 +298,10 @@ def _draw_panel(
 
 
 def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
-    """Draw the sizes of residuals by channel and trial, before and after at one scale."""
+    """Draw the rms residuals by channel and trial as maps, without and with the effect.
+
+    Both maps share one colour scale.
+    """
     drawn_models = models(before, after)
     tables = []
     for drawn in drawn_models:
@@ -312,7 +325,7 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
 
 @np.vectorize
 def _cell_texts(value: float) -> str:
-    """Return the text of a cell with a size; empty for nan."""
+    """Return the text of a cell for its rms residual; empty for nan."""
     if np.isnan(value):
         return ""
     return f"{value:.2g}" if value < 99.5 else f"{value:.0f}"

@@ -29,12 +29,12 @@ from reporting.page import Words
 from reporting.words import between, rounded
 
 BEYOND_DOUBT = 1e6
-"""Evidence [nat] above which no digits are shown."""
+"""Log evidence [nat] above which only "more than" is shown."""
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that name what is missing, or part of it."""
 
 LARGEST_PLAIN = 1e6
-"""Least number that is written with a power of ten."""
+"""Numbers below this are written without a power of ten."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
 
@@ -71,7 +71,10 @@ def unit_text(unit: str) -> str:
 
 
 def headline(verdict: Verdict) -> str:
-    """Return the verdict in one sentence with its probability, and names of effects."""
+    """Return the verdict in one sentence, with its probability.
+
+    Identifiers of effects in the sentence are replaced by their names.
+    """
     sentence = verdict.sentence.rstrip(".")
     effects = [*verdict.effects]
     for hypothesis in verdict.hypotheses:
@@ -104,9 +107,15 @@ def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
 
 
 def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
-    """Return what is missing at a port (a force, a moment, a flow), and the units of its motion.
+    """Return the name of a missing force and the units of its port's motion.
 
-    The units are those of displacement and speed of the port.
+    Returns
+    -------
+    name : str
+        "force", "moment" or "flow".
+    displacement_unit, speed_unit : str
+        Units of the port's displacement and speed; at a port of a state, the first is empty and the
+        second that of the state.
     """
     of_state = ("flow", "", force.unit.partition("/s times")[0])
     name, displacement_unit, speed_unit = WORDS.content["motions"].get(force.unit, of_state)
@@ -133,7 +142,10 @@ def force_sentence(force: ForceAtPort) -> str:
 
 
 def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
-    """Return what a law leaves of a missing force in fitted and held-out trials."""
+    """Return how much of a missing force remains with its law, for fitted and held-out trials.
+
+    Only kinds of trials in which the law could be tested are returned, with their names.
+    """
     if force is None:
         return []
     tested = []
@@ -338,9 +350,9 @@ def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:
 
 
 def _where(primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign) -> str:
-    """Return at which speed or displacement a force has its size, or where a mass is.
+    """Return the reference speed or displacement of a force, or the station of a mass.
 
-    Else empty.
+    It is a phrase such as " at 0.3 m/s"; empty for other sizes.
     """
     if primitive.kind == "point_mass" and size.parameter == "mass":
         return f" at {getattr(primitive, 'station'):.3g} m"  # noqa: B009

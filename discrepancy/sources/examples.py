@@ -138,7 +138,8 @@ def plan_for(
 ) -> ExamplePlan:
     """Return a plan for any model, from its natural scales.
 
-    Loads move the model by 2 % of its length, and noise is 0.1 % of what each channel shows then.
+    The largest load moves the model by 2 % of its length. The noise of a channel is 0.1 % of its
+    reading under that load.
 
     Parameters
     ----------
@@ -177,7 +178,7 @@ def plan_for(
         interval=period / 50.0,
         load_place=load_place,
     )
-    # noise from the readings under the largest force
+    # noise from the readings under the largest force; a channel that shows nothing gets the largest
     trial = _static_trial("", plan, np.array([force]), start=0.0)
     conditions = prior_mean(campaign, model, trial)
     readings = np.abs(observe(model, campaign, trial, ModelPatch(), conditions).values[0])
@@ -193,7 +194,7 @@ def plan_for(
 def _campaign_without_trials(
     name: str, channels: Mapping[str, Channel], reference_temperature: float | None
 ) -> Campaign:
-    """Return a campaign that has channels only."""
+    """Return a campaign with channels, but without trials."""
     return Campaign(
         name=name,
         channels=channels,
@@ -213,11 +214,11 @@ def example_campaign(
 ) -> Campaign:
     """Return a simulated campaign; equal seeds give equal campaigns to the last bit.
 
-    Static: six load levels up and the same down, in two runs. Ring-down: releases from 1, 0.7, 0.5
-    and 0.3 of the largest displacement, the third held out, with 400 samples at rest for the noise
-    record. Flight: steady turns at each load factor. The errors of a real test are drawn: gains for
-    the whole campaign, and for each trial noise, zeros and the error of the release, by their prior
-    deviations.
+    Static trials have six load levels, upwards, downwards, and upwards again in a second run, which
+    is held out. Ring-downs are released from 1, 0.7, 0.5 and 0.3 of the largest displacement; the
+    third is held out, and 400 samples at rest give the noise record. Flights are steady turns at
+    each load factor. The errors of a real test are drawn from their priors: gains once for the
+    campaign, and noise, zeros and the error of the release for each trial.
 
     Parameters
     ----------
@@ -230,7 +231,7 @@ def example_campaign(
     plan : ExamplePlan, optional
         What is measured; `wing_plan()` by default.
     patch : ModelPatch, optional
-        What the structure has and the model lacks; nothing by default.
+        Effects that the structure has and the model lacks; none by default.
 
     Raises
     ------
@@ -267,7 +268,17 @@ def example_campaign(
 def _with_samples_at_rest(
     channel: Channel, plan: ExamplePlan, generator: np.random.Generator
 ) -> Channel:
-    """Return a channel whose noise record holds drawn samples at rest; without noise as it is."""
+    """Return a channel with a noise record of simulated samples at rest, if it has noise.
+
+    Parameters
+    ----------
+    channel : Channel
+        The channel.
+    plan : ExamplePlan
+        The plan, for the sampling interval.
+    generator : Generator
+        Source of the noise.
+    """
     if channel.noise is None:
         return channel
     samples = channel.noise.standard_deviation * generator.normal(size=_AT_REST_SAMPLES)
@@ -375,7 +386,7 @@ def _measured(
     Parameters
     ----------
     model, patch
-        The model, and what the structure has besides.
+        The model, and the effects that the structure has in addition.
     campaign : Campaign
         The campaign with its channels.
     trial : Trial
@@ -402,8 +413,8 @@ def _measured(
 
 
 def _finite_or_zero(deviation: float) -> float:
-    """Return a standard deviation.
+    """Return a standard deviation, or 0 for an infinite one (a quantity that is not known at all).
 
-    0 for an infinite one, of a quantity that is not known at all.
+    An example draws no error of such a quantity.
     """
     return deviation if np.isfinite(deviation) else 0.0

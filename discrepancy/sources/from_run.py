@@ -43,10 +43,10 @@ TEMPERATURE = ("temperature_difference", "temperature")
 REFERENCE_TEMPERATURE = 20.0
 """Reference temperature of the wing [degC]."""
 HEALTH_DEVIATION = 0.25
-"""Least prior standard deviation of a stiffness loss in a step, about its smoothed belief.
+"""Least prior standard deviation of a stiffness loss in a step, about the twin's estimate.
 
-The belief was misled by the very effect that is searched, and is too certain; 24 gauges determine
-the health of a step anyway."""
+The twin's estimate is biased by the very effect that is searched, and is too certain. The 24 gauges
+determine the health in each step anyway."""
 BLOCK = 4
 """Steps of a block that is held out."""
 HELD_OUT_SHARE = 0.2
@@ -61,8 +61,8 @@ def run_campaign(
 ) -> records.Campaign:
     """Return the flight of a run folder as a campaign.
 
-    Health is uncertain in every step. Nothing of the truth is read but the noise of the gauges in
-    the scenario, and a temperature that the asset monitors.
+    The health (stiffness losses) of the wing is uncertain in every step. Of the simulated truth
+    only the noise of the gauges and a temperature that the asset monitors are read.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ def run_campaign(
     CampaignFileError
         If the folder is not the run of a wing, or is not complete.
     CampaignDataError
-        If nothing was observed, or a steady force acted beside the load factor.
+        If nothing was observed, or a steady force acted in addition to the load factor.
     """
     folder = Path(folder)
     restore_folder(folder)
@@ -124,9 +124,9 @@ def _check_scenario(folder: Path, scenario: dict[str, Any]) -> None:
 def _steps_with_last_patch(
     run: xr.DataTree, first_step: int | None, last_step: int | None
 ) -> slice:
-    """Return the steps that are asked for, without those before the twin's last patch.
+    """Return the requested steps, without those before the last patch of the twin's model.
 
-    What the twin believed in these it believed with another model.
+    In the earlier steps the twin estimated the health with another model.
     """
     firsts = [step for step in (run.attrs.get(PATCH_STEP), first_step) if step is not None]
     return slice(max(firsts, default=None), last_step)
@@ -229,7 +229,7 @@ def _remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, 
 
 
 def _no_steps(folder: Path, run: xr.DataTree, steps: slice) -> str:
-    """Return the message that a run has none of the steps that are asked for."""
+    """Return the message that a run has none of the requested steps."""
     flown_steps = np.asarray(run["observed"]["step"].values).tolist()
     flown = f"{flown_steps[0]} to {flown_steps[-1]}" if flown_steps else "none"
     ends = []
@@ -241,9 +241,9 @@ def _no_steps(folder: Path, run: xr.DataTree, steps: slice) -> str:
 
 
 def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
-    """Return the model in which the twin of a run believed.
+    """Return the model that the twin of a run used.
 
-    The whole patch of the twin's model is in it. Its sensors, too: they act in
+    It includes the whole patch of the twin's model, also primitives of sensors, which act in
     `discrepancy.system.sensing.observe`.
 
     Parameters
@@ -263,7 +263,7 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
     Raises
     ------
     CampaignFileError
-        If the twin believed in no design of a wing.
+        If the twin's model is not that of a wing.
     ModelError
         If the wing cannot be modelled.
     """
@@ -294,9 +294,9 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
 
 
 def _is_calibrated_wing(folder: Path) -> bool:
-    """Return whether a run flew with the calibration of a wing.
+    """Return whether the run folder has a calibration of a wing.
 
-    The calibration of a model's parameters has no design of a wing.
+    The calibration of another model's parameters contains no wing design.
     """
     file = folder / CALIBRATION_FILE
     if not file.is_file():
@@ -308,7 +308,7 @@ def _is_calibrated_wing(folder: Path) -> bool:
 
 
 def held_out_steps(count: int, block: int, share: float) -> BoolArray:
-    """Return which steps are held out: whole blocks, evenly spread, never the first.
+    """Choose the steps to hold out: whole blocks, evenly spread, but never the first block.
 
     Parameters
     ----------
@@ -322,6 +322,7 @@ def held_out_steps(count: int, block: int, share: float) -> BoolArray:
     Returns
     -------
     (count,) ndarray of bool
+        True for held-out steps.
     """
     block_count = count // block
     held_out_count = min(round(share * count / block), block_count - 1)
@@ -376,7 +377,7 @@ def _end_times(folder: Path, steps: records.FloatArray) -> records.FloatArray:
 
 
 def _temperature(run: xr.DataTree, steps: slice) -> records.FloatArray | None:
-    """Return the temperatures of steps (N,) less the reference [K].
+    """Return the temperatures of steps (N,) minus the reference temperature [K].
 
     None if they were not recorded.
     """
@@ -397,9 +398,9 @@ def _noise(scenario: dict[str, Any]) -> tuple[float, str]:
 
 
 def _calibrated_parameter(run: xr.DataTree) -> dict[str, tuple[float, float]]:
-    """Return mean and standard deviation of the calibrated parameter by its name.
+    """Return mean and standard deviation of the calibrated parameter, by its name.
 
-    Empty without one.
+    They are those of the draws in the run. The result is empty if there is no such parameter.
     """
     name = str(run.attrs.get("parameter", ""))
     draws = np.asarray(run["calibration"]["draw_value"].values, dtype=np.float64)

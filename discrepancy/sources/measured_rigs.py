@@ -125,7 +125,7 @@ def _numbers(
 
 
 def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
-    """Return the longest fall in a record of a phone, without its ends.
+    """Return the longest free fall in a record of a phone, without `CUT` seconds at its ends.
 
     Returns
     -------
@@ -155,9 +155,9 @@ def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def _phone(data: Path) -> RigFiles:
-    """Return the falls of a phone.
+    """Return the files of a campaign of falls of a phone.
 
-    Its sensor shows acceleration less gravity: zero in a free fall, and its bias.
+    Its sensor shows acceleration minus gravity, thus only its bias in a free fall.
     """
     at_rest = _numbers(data / "at_rest.txt", ("time", "x", "y", "z"), separator=None, skipped=0)
     files = sorted(data.glob("fall_*.csv"), key=lambda path: path.stem.split("_")[1].zfill(9))
@@ -198,9 +198,10 @@ def _tanks(data: Path) -> RigFiles:
 
 
 def _pendulum(data: Path) -> RigFiles:
-    """Return two records of a pendulum, with its angle as input and its torque as output.
+    """Return the files of two records of a pendulum, with the angle as input and torque as output.
 
-    The rod turns over, so that a motion that is computed from torques would soon be another one.
+    The rod turns over: a motion that was simulated from the torque would soon diverge from the
+    measured one, because small errors grow at the upper equilibrium.
     """
     tables = {}
     for name in ("pd_trajectory", "ilqr"):
@@ -217,9 +218,19 @@ def _pendulum(data: Path) -> RigFiles:
 
 
 def _means(samples: FloatArray, averaged: int) -> FloatArray:
-    """Return the means of `averaged` samples (N, C) each.
+    """Return the means of successive groups of samples.
 
-    Samples left over at the end are dropped.
+    Parameters
+    ----------
+    samples : (N, C) ndarray
+        Samples; an incomplete group at the end is dropped.
+    averaged : int
+        Number of samples in a group.
+
+    Returns
+    -------
+    (N // averaged, C) ndarray
+        Mean of each group.
     """
     count = len(samples) // averaged * averaged
     groups = samples[:count].reshape(-1, averaged, samples.shape[1])

@@ -106,7 +106,7 @@ def real_wing(
     interval = float(windows[0].time[1])
     scatter = trial_scatter(windows)
     deviation = float(np.std(scatter, ddof=1))
-    # scaled, so that the noise includes the reading error that all trials share
+    # scaled to the variance deviation^2 + READING_ERROR^2, as all trials share the reading error
     noise = scatter * np.hypot(1.0, READING_ERROR / deviation)
     tables = {
         "noise.csv": table_text({"time": interval * np.arange(float(len(noise))), SIGNAL: noise})
@@ -143,7 +143,7 @@ def real_wing(
 
 def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
     """Return the loading runs of the wing as static trials, and the channel of the tip."""
-    # an error of the load shows as one of the displacement
+    # an error of the load appears as an error of the displacement, by the compliance
     compliance = float(np.median(measurements.displacement / measurements.load))
     by_load = measurements.load_standard_deviation * compliance
     deviation = float(np.hypot(measurements.displacement_standard_deviation, by_load))
@@ -164,11 +164,12 @@ def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
 def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
     """Return the noise of the signal from the differences between R trials of N samples.
 
-    All trials are releases of one kind, so that they share the motion, whatever its law;
-    differences beyond amplitude, delay and zero are noise. Each trial is fitted by the mean of all,
-    its first and second time derivatives, and a constant. The R - 1 orthonormal contrasts of the
-    residuals (Helmert) are independent and have the variance of a single trial. The fit takes four
-    degrees of freedom of each contrast, for which the variance is corrected.
+    All trials are releases of one kind, so that they share the motion, whatever its law is.
+    Differences other than in amplitude, delay and zero are noise. Each trial is therefore fitted by
+    the mean of all trials (amplitude), its first and second time derivatives (delay, by Taylor's
+    series) and a constant (zero). The R - 1 orthonormal Helmert contrasts of the residuals are
+    independent and have the variance of a single trial. The fit takes four degrees of freedom from
+    each contrast, for which the variance is corrected.
 
     Parameters
     ----------
@@ -194,9 +195,10 @@ def trial_scatter(windows: Sequence[PlotWindow]) -> FloatArray:
 
 
 def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
-    """Return the slow zero (N,) [V] that all records share.
+    """Return the slow drift of the zero (N,) [V] that all records share.
 
-    nan at the ends, where it is not known.
+    It is the weighted moving average of the mean record; nan at the ends, where the average is
+    incomplete.
     """
     weights = np.hanning(TREND + 2)[1:-1]
     mean = np.mean([record.signal for record in records], axis=0)
@@ -209,7 +211,9 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
 def _plot_window(
     record: RingDownRecord, zero: FloatArray, begin: float, columns: int
 ) -> PlotWindow:
-    """Return the samples of a record after the begin of the window.
+    """Return the part of a record from the begin of the window on, averaged over plot columns.
+
+    The slow zero is subtracted, and the times are made even and start at zero.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ class RigFiles(NamedTuple):
     tables : dict of str to str
         Texts of the tables by the names of their files.
     campaign_keys : dict
-        What `campaign.toml` states beside the shipped part: trials, channels and remarks.
+        Keys of `campaign.toml` in addition to the shipped ones: trials, channels and remarks.
     """
 
     tables: dict[str, str]
