@@ -142,7 +142,11 @@ class ReductionTerms:
         self._set_reference()
 
     def _set_stiffness_terms(self) -> None:
-        """Set the stiffness terms with their factors; the error bound needs a constant one."""
+        """Set the stiffness terms and the parameter and region that each is proportional to.
+
+        The last term has to be constant, as the error bound needs one: if it is not, a constant
+        term of zeros is added.
+        """
         parameters = tuple(self.structure.parameters)
         regions = self.structure.regions
         matrices = [term.matrix for term in self.structure.stiffness_terms]
@@ -158,25 +162,33 @@ class ReductionTerms:
         self.stiffness_factors: IntArray = np.array(factors, dtype=np.int64)
 
     def _set_loads(self) -> None:
-        """Set the loads: the sum of all load terms with the same control and the same free mass."""
+        """Set the load vectors, with load terms of the same control and free mass added up.
+
+        A load term is proportional to a control (such as the load factor), to a free mass, to both
+        or to neither. Sums that are zero are left out.
+        """
         controls = tuple(self.structure.controls)
         masses = tuple(self.structure.masses)
-        vectors: dict[tuple[int, int], FloatArray] = {}
+        load_sums: dict[tuple[int, int], FloatArray] = {}
         for term in self.structure.load_terms:
             control = self.structure.loads[term.load]
-            factors = (
+            control_and_mass = (
                 _number_from_one(controls, control),
                 _number_from_one(masses, term.mass),
             )
-            if factors in vectors:
-                vectors[factors] = vectors[factors] + term.vector
+            if control_and_mass in load_sums:
+                load_sums[control_and_mass] = load_sums[control_and_mass] + term.vector
             else:
-                vectors[factors] = term.vector
-        vectors = {factors: vector for factors, vector in vectors.items() if vector.any()}
-        self.load_factors: IntArray = np.array(list(vectors), dtype=np.int64).reshape(-1, 2)
-        # A column of zeros keeps the shape of a stack of no loads.
-        nothing = np.zeros(self.structure.unknowns)
-        self.loads: FloatArray = np.stack([nothing, *vectors.values()], axis=1)[:, 1:]
+                load_sums[control_and_mass] = term.vector
+        load_sums = {
+            control_and_mass: vector
+            for control_and_mass, vector in load_sums.items()
+            if vector.any()
+        }
+        self.load_factors: IntArray = np.array(list(load_sums), dtype=np.int64).reshape(-1, 2)
+        # np.stack needs an array, also if there is no load: a column of zeros is stacked and cut.
+        zero_column = np.zeros(self.structure.unknowns)
+        self.loads: FloatArray = np.stack([zero_column, *load_sums.values()], axis=1)[:, 1:]
 
     def _set_outputs(self) -> None:
         """Set the outputs and the groups in which they are judged."""
@@ -215,8 +227,10 @@ class ReductionTerms:
     def anchors(self) -> list[list[FloatArray]]:
         """Return, for each anchor, the coefficients (T,) at which dual solutions are wanted.
 
-        With a few regions an anchor is one state in each cell of a grid of losses, of which the
-        last changes first. With many regions the corners of the box surround a single anchor.
+        An anchor is a state around which the error bound is built. With few regions, the range of
+        losses is divided into a grid, and each of its cells has one anchor state; the loss of the
+        last region changes first. With many regions there is a single anchor, with the states at
+        corners of the box of parameters and losses.
         """
         if not self.splits.size:
             corner_states = self.states(cube_corners(self.varied))

@@ -116,17 +116,28 @@ def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatA
 def _lines_between(
     start: MeshLine, end: MeshLine, chords: FloatArray, size: float
 ) -> list[MeshLine]:
-    """Return evenly distributed lines between two, at most `size` [m] apart at the first chord."""
+    """Return evenly spaced mesh lines between two lines, without these.
+
+    Parameters
+    ----------
+    start, end : MeshLine
+        The two lines.
+    chords : (k,) array
+        The chords at which lines are located [m].
+    size : float
+        The largest distance of neighbouring lines at the first of these chords [m].
+    """
     distance = (end.at(chords) - start.at(chords))[0]
-    count = max(1, int(np.ceil(distance / size - 1e-9)))
-    fraction_step = end.fraction - start.fraction
-    offset_step = end.offset - start.offset
+    # 1e-9: a quotient that is an integer but for rounding errors needs no additional cell
+    cell_count = max(1, int(np.ceil(distance / size - 1e-9)))
+    fraction_difference = end.fraction - start.fraction
+    offset_difference = end.offset - start.offset
     return [
         MeshLine(
-            start.fraction + number / count * fraction_step,
-            start.offset + number / count * offset_step,
+            start.fraction + number / cell_count * fraction_difference,
+            start.offset + number / cell_count * offset_difference,
         )
-        for number in range(1, count)
+        for number in range(1, cell_count)
     ]
 
 
