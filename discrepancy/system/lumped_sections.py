@@ -47,7 +47,7 @@ Vector = Annotated[tuple[Number, ...], Field(min_length=1), BeforeValidator(as_l
 Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_rows)]
 Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_matrix)]
 Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
-"""Fraction of critical damping. Above one a mode is overdamped; above three a percentage is meant."""
+"""Fraction of critical damping. Above one a mode is overdamped; a value above three is an error."""
 
 
 class Damping(Section):

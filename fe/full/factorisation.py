@@ -39,7 +39,7 @@ Thin cells make the condition number about 1e10, so that double precision reache
 def _analysed_pattern(
     size: int, row_starts: bytes, columns: bytes
 ) -> tuple[IntArray, tuple[Front, ...]]:
-    """Analyse a pattern; the cache answers for the same pattern with other values, as with damage.
+    """Analyse the pattern of a matrix; cached, since damage changes only the values of a matrix.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class _FrontFactor(NamedTuple):
 
 
 class _SchurComplement(NamedTuple):
-    """What the pivots of a front leave on its boundary.
+    """The Schur complement of a front's pivots, to be added to a later front.
 
     Attributes
     ----------

@@ -249,22 +249,37 @@ class StaticReduction:
         )
 
     def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:
-        """Return loads and images of combinations (N, K) of the basis, in a basis of residuals."""
+        """Return loads and stiffness images in the smallest basis that holds all residuals.
+
+        Parameters
+        ----------
+        directions : (N, K) array
+            Combinations of the N basis vectors that span the reduced model.
+        """
         images = self.residual_stiffness @ directions
-        # A Galerkin solution leaves nothing along the images of the basis under the energy norm.
+        # A Galerkin residual is orthogonal to the basis. In whitened coordinates the reference
+        # stiffness is the identity, so that the images of the basis under it are the basis itself:
+        # their span is projected out of all columns.
         reference_images = np.tensordot(images, self.terms.reference, (1, 0))
-        solved = np.linalg.qr(reference_images)[0]
+        basis_directions = np.linalg.qr(reference_images)[0]
         # The order of columns is: terms that change with health, loads, other terms. A column of
         # the triangular factor is zero below its diagonal, so that this keeps the first ones short.
         _, region_numbers = self.terms.stiffness_factors[:-1].T
         is_constant = region_numbers == 0
         order = np.argsort(is_constant, kind="stable")
         first_load = directions.shape[1] * np.count_nonzero(~is_constant)
-        columns = images[:, order].reshape(len(images), -1)
-        columns = np.concatenate(
-            (columns[:, :first_load], self.residual_load, columns[:, first_load:]), axis=1
+        images_and_loads = images[:, order].reshape(len(images), -1)
+        images_and_loads = np.concatenate(
+            (
+                images_and_loads[:, :first_load],
+                self.residual_load,
+                images_and_loads[:, first_load:],
+            ),
+            axis=1,
         )
-        residual_directions, factor = np.linalg.qr(columns - solved @ (solved.T @ columns))
+        residual_directions, factor = np.linalg.qr(
+            images_and_loads - basis_directions @ (basis_directions.T @ images_and_loads)
+        )
         # read out loads and terms, these in their own order
         loads = slice(first_load, first_load + self.loads.shape[1])
         ordered_terms = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)
@@ -418,7 +433,7 @@ def _most_central(states: list[State]) -> State:
 
 
 def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
-    """Return the states for the next full solutions: bad ones that are far from each other.
+    """Return the states for the next full solutions: with large bounds, and far from each other.
 
     Parameters
     ----------
@@ -429,7 +444,7 @@ def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: floa
     count : int
         The largest number of states.
     least : float
-        After the worst state only those with larger bounds are taken.
+        A state after the first is taken only if its bound is larger than this.
 
     Returns
     -------

@@ -19,11 +19,11 @@ State = tuple[float, ...]
 """Values of the parameters, then the losses of the damage regions."""
 
 LEAST_COSINE = 1e-3
-"""An output is compared with at least this fraction of the largest output that a load of the same
-energy could cause."""
+"""Least output, relative to the largest output that a load of the same energy could cause. Errors
+are relative to no smaller output."""
 UNSEEN_FRACTION = 0.1
-"""A load that no output sees is judged by this fraction of the largest output of the other
-loads, each at its largest coefficient."""
+"""If no output responds to a load, its errors are relative to this fraction of the largest output
+of all loads, each at its largest coefficient."""
 INNER_MODAL_STATES = 10
 """States inside the box at which the working basis of the modes is refined."""
 INNER_TRAINING_STATES = 128
@@ -50,7 +50,9 @@ class ModalState(NamedTuple):
 
 
 def loss_at(ranges: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Return losses at fractions of their ranges, in equal ratios of the remaining stiffness.
+    """Return losses at fractions of their ranges, with the remaining stiffness in equal ratios.
+
+    The remaining stiffness 1 - loss goes from 1 - low to 1 - high as a geometric sequence.
 
     Parameters
     ----------
@@ -248,8 +250,7 @@ class ReductionTerms:
         Parameters
         ----------
         fractions : (B, P + K) array
-            Fractions of the ranges of parameters and losses. A loss goes by equal ratios of the
-            remaining stiffness.
+            Fractions of the ranges of parameters and losses; for losses see `loss_at`.
         """
         first_loss = len(self.parameters)
         low, high = np.concatenate((self.parameters, self.losses)).T
@@ -303,7 +304,10 @@ class ReductionTerms:
         ]
 
     def least_outputs(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:
-        """Return the outputs below which a load counts as unseen, see `LEAST_COSINE`.
+        """Return the least outputs to which errors are relative, see `LEAST_COSINE`.
+
+        In whitened coordinates, an output l responds to a load f by l . f, which is at most |l| |f|
+        (Cauchy and Schwarz).
 
         Parameters
         ----------

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 
 INSTANT = 1e-6
-"""Duration of a step of which only the begin matters [s]."""
+"""Duration of a step from which only the state at its begin is used [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class TransientState:
-    """All that a structure remembers between two time steps.
+    """The complete state of a structure between two time steps.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class TransientState:
         Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force
         [N].
     memory : (J, 5 + E) array
-        Memory of the laws; a column has the forces as the modes that are left out follow them.
+        Memory of the laws, among it the lagged forces that the left-out modes follow.
     """
 
     displacement: FloatArray
@@ -177,7 +177,7 @@ class ModalIntegrator:
     def _with_still_modes(
         self, equilibrium: TransientState, holding: FloatArray | float = 0.0
     ) -> TransientState:
-        """Return an equilibrium with its modes at rest, moved aside by `holding` (M,)."""
+        """Return an equilibrium as a state of resting modes, displaced by `holding` (M,)."""
         q = self._responses.modal_coordinates @ self._static_loads(equilibrium) + holding
         return replace(equilibrium, displacement=q, velocity=np.zeros_like(q))
 
@@ -191,14 +191,13 @@ class ModalIntegrator:
     def state_after_release(
         self, offset: float, load: npt.ArrayLike, holding_load: int
     ) -> TransientState:
-        """Return the state just after a structure that was held aside is let go.
+        """Return the state just after the release of a structure that a force held displaced.
 
         Parameters
         ----------
         offset : float
-            How far the holding force had moved the last static output, of a wing its tip, from its
-            equilibrium under the other loads [m]. It does not count what laws add: the held point
-            is where it would be without them.
+            Displacement of the last static output (of a wing, its tip) by the holding force, from
+            the equilibrium under the other loads [m]. It is that of the structure without laws.
         load : (L,) array_like
             Coefficients of the loads that stay.
         holding_load : int
