@@ -339,7 +339,10 @@ class IdentifiedFmu(FmuRuns):
     def _start_state(
         self, system: FmuStateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
     ) -> FloatArray:
-        """Return the state (n,) at the begin: as released, plus that at rest under the first force."""
+        """Return the state (n,) at the begin of a trial.
+
+        It is the released state, plus equilibrium under the recorded force at the first sample.
+        """
         start: FloatArray = system.release_states @ np.array([*amounts.values()])
         first_force = excitation.first_force
         if first_force:

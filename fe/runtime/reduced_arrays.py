@@ -336,7 +336,8 @@ class CertifiedSolver:
         changes = np.multiply.outer(change, coordinates).ravel()
         residual = self._residual @ np.concatenate((load, changes))
         outside = self._allowance * sqrt(coordinates @ coordinates)
-        # bounds of the outputs
+        # Bounds of the outputs. For affine positive semi-definite terms the coercivity alpha in the
+        # reference norm is at least the smallest ratio of coefficients (min-theta approach).
         dual = self._dual_solution(theta, losses)
         coercivity = min((theta / self._reference).tolist())
         remainder = (sqrt(residual @ residual) + outside) / coercivity
@@ -360,7 +361,7 @@ def _combined(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
     # Galerkin's equations of each output
     stiffness = (theta @ anchor.stiffness).reshape(outputs, functions, functions)
     weights = solve(stiffness, anchor.output).transpose(0, 2, 1)
-    # what they leave of the dual equations
+    # norms of the residuals of the dual equations
     coefficients = (-theta[:, np.newaxis] * weights).reshape(outputs, -1, 1)
     by_output = anchor.residual_factor[:, :, 0]
     by_terms = anchor.residual_factor[:, :, 1:]

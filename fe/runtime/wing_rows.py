@@ -339,7 +339,7 @@ class WingRows:
         Returns
         -------
         (G,) array or None
-            The factors; None where the patch has no local loss.
+            The factors; None if the patch has no local loss.
         """
         skin = remaining_skin(patch, self.arrays.strip_lines)
         if skin is None:
@@ -348,13 +348,15 @@ class WingRows:
         half_length = 0.5 * max(self.arrays.gauge_length, LEAST_GAUGE_LENGTH)
         gauge_begin = self.arrays.gauge_stations[:, None] - half_length
         gauge_end = self.arrays.gauge_stations[:, None] + half_length
-        begin = np.maximum(skin.breaks[:-1], gauge_begin)
-        end = np.minimum(skin.breaks[1:], gauge_end)
-        covered = np.maximum(end - begin, 0.0)
+        covered_begin = np.maximum(skin.breaks[:-1], gauge_begin)
+        covered_end = np.minimum(skin.breaks[1:], gauge_end)
+        covered_lengths = np.maximum(covered_end - covered_begin, 0.0)
         # mean strains
-        exact = self._mean_strain(covered, skin.by_piece)
-        smeared = self._mean_strain(covered, skin.by_strip[skin.strip_of_piece])
-        return np.asarray(exact / smeared)
+        strain_with_local_losses = self._mean_strain(covered_lengths, skin.by_piece)
+        strain_with_averaged_losses = self._mean_strain(
+            covered_lengths, skin.by_strip[skin.strip_of_piece]
+        )
+        return np.asarray(strain_with_local_losses / strain_with_averaged_losses)
 
     def _mean_strain(self, covered: FloatArray, remaining: FloatArray) -> FloatArray:
         """Return relative strains (G,) of gauges over pieces of the skin.

@@ -104,7 +104,11 @@ def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[Me
 
 
 def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatArray) -> bool:
-    """Return whether a line lies between others, crosses none, and is farther than `room` [m]."""
+    """Return whether a line can be added between others.
+
+    It must lie between two lines, cross none, and be farther than `room` [m] from all, at each of
+    the chords.
+    """
     gaps = line.at(chords) - np.array([other.at(chords) for other in lines])
     is_behind = (gaps > 0.0).all(axis=1)
     is_ahead = (gaps < 0.0).all(axis=1)
@@ -142,7 +146,7 @@ def _lines_between(
 
 
 def _lines_beside(design: WingDesign, edges: list[MeshLine]) -> list[OptionalLine]:
-    """Return lines on both sides of the edges of defects, if the design asks for small cells."""
+    """Return optional lines on both sides of edges of defects, if the design has an edge size."""
     if design.mesh.edge_size is None:
         return []
     distance = design.mesh.edge_size / design.mesh.refinement
@@ -210,7 +214,8 @@ def _material_ends(design: WingDesign) -> list[float]:
 def web_faces(design: WingDesign, index: int) -> tuple[MeshLine, MeshLine]:
     """Return the front and the rear mesh line of a web.
 
-    The first web lies behind its chord fraction, the last one before it, the others around it.
+    The first web lies aft of its chord fraction, the last one fore of it, and the others are
+    centred on it.
     """
     web = design.webs[index]
     if index == 0:
@@ -262,7 +267,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
 
 
 def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) -> IntArray:
-    """Return the interval that holds the middle of each cell between lines.
+    """Return the interval in which the middle of each cell between mesh lines lies.
 
     Parameters
     ----------
