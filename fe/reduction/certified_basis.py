@@ -29,22 +29,22 @@ STATES_PER_ROUND = 4
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that the basis can be compressed."""
 INSPECTED_ONE_OF = 6
-"""In each round one of so many states is evaluated, where the bound was largest; in the last round
-all of them are."""
+"""In each round the bound is evaluated at one of this many training states, those with the largest
+latest bounds; in the last round at all states."""
 SOLUTION_TOLERANCE = 1e-6
 """Relative residual of full solutions."""
 FIRST_SOLUTION_TOLERANCE = 1e-10
-"""The same of the first ones, which measure rounding."""
+"""Relative residual of the first full solutions, from which the rounding error is measured."""
 ROUNDING_FACTOR = 8.0
-"""The rounding allowance as a multiple of the difference seen at the first full solutions."""
+"""Ratio of the rounding allowance to the difference measured at the first full solutions."""
 LEAST_ROUNDING = 5e-6
 """Least rounding allowance: with condition numbers of 1e10, full solutions differ by 1e-6."""
 RESIDUAL_ROUNDING = 1e-7
 """Rounding allowance of the residual, per unit length of the reduced coordinates."""
 BASIS_DROP = 1e-7
-"""Shorter directions of full solutions are dropped, relative to the solutions of their round."""
+"""Directions shorter than this fraction of the solutions of their round are dropped."""
 RESIDUAL_DROP = 1e-8
-"""The same for the images of the basis that span the residuals."""
+"""The same for the images of the basis under the stiffness terms, which span the residuals."""
 LEAST_SINGULAR_VALUE = 1e-7
 """Singular directions below this fraction of the largest singular value are not used."""
 
@@ -426,7 +426,7 @@ class StaticReduction:
 
 
 def _most_central(states: list[State]) -> State:
-    """Return the state that is nearest to the mean of all, where the search begins."""
+    """Return the state closest to the mean of all states, at which the search begins."""
     points = np.array(states)
     distance_square = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
     return states[int(distance_square.argmin())]

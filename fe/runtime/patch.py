@@ -1,4 +1,4 @@
-"""Model patches: sets of primitive changes that a missing physical effect consists of.
+"""Model patches: sets of primitive changes that together represent a missing physical effect.
 
 A patch is plain data. The reduced model, the full model, the FMU and the twin understand the same
 primitives; which physical effect a set of them stands for only `discrepancy.catalogue` knows.
@@ -95,7 +95,7 @@ class StiffnessDrift(Primitive):
 
 
 class LoadPlace(Primitive):
-    """Forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
+    """Forces act further outboard (`along_span` [m]) and further aft (`along_chord` [m])."""
 
     along_span: Annotated[float, "m"]
     along_chord: Annotated[float, "m"]
@@ -128,7 +128,7 @@ class InertiaRelief(Primitive):
 
 
 class PortLoad(Primitive):
-    """A `force` [N or N m] pushes a port along its motion, a formula in `time` [s] of the trial."""
+    """A `force` [N or N m] acts on a port, given as a formula in the `time` [s] of the trial."""
 
     can_act_in_windows: ClassVar[bool] = True
     formula_fields: ClassVar[tuple[str, ...]] = ("force",)
