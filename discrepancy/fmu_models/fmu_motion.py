@@ -57,7 +57,7 @@ class FmuSimulator(FmuAtRest):
         Parameters
         ----------
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for its length and name.
         laws : Laws
@@ -118,7 +118,7 @@ class FmuSimulator(FmuAtRest):
         system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for the stamps of its force.
         laws : Laws
@@ -161,7 +161,8 @@ class FmuSimulator(FmuAtRest):
         constant = np.where(is_derivative, 0.0, undisturbed[columns])
         values = states @ rows.T + forces @ direct.T + constant
         if excitation.releases:
-            # the force that holds it until then may be seen at once
+            # the first sample is that of the held FMU: the holding force may act on outputs
+            # directly
             held = [
                 self._answer_to_release(excitation, name)[0] * amount
                 for name, amount in amounts.items()
@@ -188,29 +189,34 @@ class FmuSimulator(FmuAtRest):
         ports: LawPorts,
         amounts: Mapping[str, float],
     ) -> "StartState":
-        """Return the state at the begin: under a force at rest with the laws, else as released.
+        """Return the state at the begin of a trial with laws.
+
+        Under a recorded force it is the equilibrium with the laws under the first force; otherwise
+        it is the released state.
 
         Parameters
         ----------
         system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         laws : Laws
             Internal forces.
         ports : LawPorts
-            Where they act.
+            The ports at which the laws act.
         amounts : mapping of str to float
-            What releases the FMU.
+            The amounts of the variables that release the FMU.
         """
         if not len(laws) or excitation.force is None:
             return StartState(self._start_state(system, excitation, amounts), None)
         first_forces = excitation.first_force * excitation.lever_values
         gain = system.gain
         outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
-        without_laws = outputs[ports.columns]
+        positions_without_laws = outputs[ports.columns]
         compliance = gain[np.ix_(ports.columns, ports.force_numbers)]
-        solution = static_solution(laws, without_laws[None], compliance, kernel=compiled_kernel())
+        solution = static_solution(
+            laws, positions_without_laws[None], compliance, kernel=compiled_kernel()
+        )
         law_forces = np.bincount(ports.force_numbers, solution.forces[0], len(first_forces))
         return StartState(system.state_at_rest(first_forces - law_forces), solution.memory)
 
@@ -230,7 +236,7 @@ class FmuSimulator(FmuAtRest):
         Parameters
         ----------
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for its kind and name.
         end : float

@@ -237,7 +237,7 @@ class IdentifiedFmu(FmuRuns):
         system : FmuStateSpace
             The system.
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         tolerance : float
             Largest error of an output, relative to its largest motion.
         """

@@ -265,7 +265,7 @@ class FmuModel(DescribedModel):
         trial : Trial
             The trial.
         conditions, patch : Conditions, ModelPatch
-            What the motion depends on besides.
+            Parameters, health and initial state, and the primitives that act.
         columns : OutputColumns
             The outputs.
         parts : int

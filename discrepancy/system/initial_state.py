@@ -37,14 +37,14 @@ def state_at_first_stamp(
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     laws : Laws
         Internal forces.
 
     Raises
     ------
     ModelError
-        If the record begins at rest where the system has no rest.
+        If the record begins at rest but the system has no equilibrium.
     """
     mode_count = len(system.angular_frequency)
     displacement_mode_count = system.displacement_modes
@@ -101,9 +101,9 @@ def released_state(
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     point : ReleasePoint
-        How and where the system is let go.
+        The point from which the system is released, and how.
     laws : Laws
         Internal forces.
 

@@ -140,7 +140,7 @@ class Model(ABC):
         trial : Trial
             A dynamic trial.
         conditions : Conditions
-            What the motion depends on besides.
+            Parameters, initial state, clock and health.
         parts : int
             Samples are this many times as dense as those of the trial.
         """
@@ -313,7 +313,7 @@ class Model(ABC):
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         patch : ModelPatch
-            Primitives beside those of the model.
+            Primitives that act in addition to those of the model.
         conditions : Conditions
             Parameters, initial state, clock and health.
 
@@ -363,7 +363,7 @@ class Model(ABC):
         Raises
         ------
         ModelError
-            If sensors are built in: what they make of a missing force is not known here.
+            If the model has sensors built in, whose effect on a missing force is not modelled.
         """
         self.check_outputs(outputs)
         if len(self.sensors):
@@ -393,7 +393,7 @@ class Model(ABC):
             Its sensors name channels of a campaign, or outputs of the model; they come before those
             of a response's patch.
         calibrated : mapping of str to (float, float)
-            Means and standard deviations of parameters, where they are not those of the model.
+            Means and standard deviations of those parameters that differ from the model's.
         """
         parameters = []
         for parameter in self.parameters:

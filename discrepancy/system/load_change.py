@@ -72,7 +72,7 @@ def choose_load_place(
     places : sequence of str
         The load places of the model.
     place : str or (float, float)
-        What the trial names.
+        The load place that the trial names.
     model_name, where : str
         Model and trial as they are called in a sentence.
 

@@ -42,7 +42,7 @@ class Motion:
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     laws : Laws
         J internal forces.
     time : (N,) ndarray
@@ -180,7 +180,7 @@ def motion_of(
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     laws : PortLaws
         Internal forces.
     refinement : int
@@ -245,9 +245,9 @@ def _motion_from_release(
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     point : ReleasePoint
-        How and where the system is let go.
+        The point from which the system is released, and how.
     laws : Laws
         Internal forces.
     refinement : int
@@ -329,7 +329,7 @@ def _advance(
     Parameters
     ----------
     system, excitation, laws
-        What moves, and what acts on it.
+        The system, its loads and prescribed motions, and the internal forces.
     first : float
         Time of the state `begin` [s].
     stamps : (N,) array
@@ -377,7 +377,7 @@ def _advance_in_steps(
     least_parts = SMOOTH_PARTS if follows_curve else 1
     edges = (*laws.switching_times, *excitation.edges)
     boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
-    # what loads add to the ports beyond the modes
+    # displacements of the ports under loads in the modes without inertia
     port_displacements = np.zeros((len(boundaries.time), len(laws)))
     if system.is_truncated and len(laws) and excitation.loads:
         residual = system.residual(system.rows_of_laws(laws).T)
@@ -400,7 +400,7 @@ def _steps(
     Parameters
     ----------
     system, excitation
-        What moves, and what acts on it.
+        The system, its loads and prescribed motions, and the internal forces.
     boundaries : Boundaries
         The K + 1 boundaries of the steps.
     port_displacements : (K + 1, J) array

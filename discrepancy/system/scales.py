@@ -42,7 +42,7 @@ class PortScale:
         The largest motion of the port in all trials, flights too [m or rad]. None: taken as
         `displacement`.
     distribution : tuple of ForceShare
-        Places where a force at the port acts. A force that is spread over the wing acts on the
+        Places where a force at the port acts. A force distributed over the wing acts on the
         motion of each place, and `displacement` is that of the mean.
     free : bool
         Whether nothing holds the port (a body that falls or rolls), so that no position is its
@@ -98,7 +98,7 @@ class Scales:
     campaign_time : float
         Time from the first to the last sample of the campaign [s]; 1 if unknown.
     ports : mapping of str to PortScale
-        By port name; besides those of `Model.ports` the places of forces that are spread over the
+        By port name: those of `Model.ports`, and the places of forces that are distributed over the
         structure.
     """
 

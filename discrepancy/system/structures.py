@@ -315,7 +315,7 @@ class WingModel(SystemModel):
         Mean and standard deviation of the calibrated parameters, by the names of
         `calibration.result.record.STATE`.
     design : WingDesign, optional
-        What the arrays were made of.
+        The design from which the arrays were made.
 
     Notes
     -----

@@ -137,7 +137,7 @@ class SystemModel(Model):
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         excitation : Excitation, optional
-            What acts in a dynamic trial; None for a static trial.
+            The loads and motions in a dynamic trial; None for a static trial.
         """
 
     def distributed_scales(
@@ -219,7 +219,7 @@ class SystemModel(Model):
         Raises
         ------
         ModelError
-            If the motion cannot begin as the trial says, or what acts is not the model's.
+            If the motion cannot begin as the trial says, or the model lacks one of its inputs.
         """
         system, excitation = self.excited_system(case)
         where = f"The trial {case.trial.name!r} of {self.name!r}: "

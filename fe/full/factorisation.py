@@ -1,7 +1,7 @@
 """Sparse Cholesky factors by the multifrontal method; solutions and modes by them.
 
 The unknowns are eliminated front by front, see `fe.full.fronts`. A front is a small dense matrix,
-which LAPACK factorises. What its pivots leave on its boundary, the Schur complement, is added to a
+which LAPACK factorises. The Schur complement of its pivots, on its boundary, is added to a
 later front.
 
 References

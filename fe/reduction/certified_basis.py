@@ -376,7 +376,7 @@ class StaticReduction:
         states : list of State
             The B training states.
         latest : (B,) array
-            The latest bound that is known of each state; updated where it is evaluated.
+            The latest bound of each state; updated for the states that are evaluated.
         target : float
             The evaluation stops early only if a bound is larger than this.
         inspect_all : bool
@@ -385,7 +385,7 @@ class StaticReduction:
         Returns
         -------
         (B,) array
-            The bounds; zero where they were not evaluated.
+            The bounds; zero for states that were not evaluated.
         """
         model = self.model()
         bounds = np.zeros(len(states))

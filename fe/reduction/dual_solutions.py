@@ -32,7 +32,7 @@ class DualSolutions(NamedTuple):
     Attributes
     ----------
     functions : (A, M, O, n) array
-        The functions in whitened coordinates, orthonormal for each output, zero where there are
+        The functions in whitened coordinates, orthonormal for each output; zero if there are
         fewer than M.
     residual : (A, O, R, R) array
         Field `dual_residual` of `ReducedArrays`.

@@ -272,9 +272,9 @@ class ExactSteps(NamedTuple):
     Attributes
     ----------
     transition : (S, 2M, 2M) array
-        New state by the old one.
+        Transition matrix from the old to the new state.
     begin, end : (S, 2M, M) array
-        What the forces at the begin and at the end of a step add to the new state.
+        Change of the new state by unit forces at the begin, and at the end, of a step.
     """
 
     transition: FloatArray

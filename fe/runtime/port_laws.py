@@ -45,7 +45,7 @@ def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> Model
     Parameters
     ----------
     patch : ModelPatch
-        A patch; what acts elsewhere stays, in its order.
+        A patch; its other primitives are kept, in their order.
     area_fractions : (S,) array
         Fraction of the planform's area of each station.
     """
@@ -241,7 +241,7 @@ def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = F
     ------
     InvalidPatchError
         If a law acts on a port that the model does not have, has an impossible number, or acts in a
-        window only where the model cannot follow it.
+        window but the model cannot follow windows.
     """
     forces = []
     for law in patch.of(PortForce):

@@ -231,9 +231,9 @@ class ModalIntegrator:
     ) -> tuple[TransientState, float]:
         """Return the equilibrium of a structure with laws that is held aside, and the force.
 
-        The held point stays where the force moves it without laws, so that the laws change the
-        force: with a, the response of the ports to a unit force there, and a_0, that of the point
-        itself, the positions of the ports are x = x_linear - (C - a a^T / a_0) F.
+        The point is held at the displacement that the force causes without laws, so that laws
+        change the force: with a, the response of the ports to a unit force there, and a_0, that of
+        the point itself, the positions of the ports are x = x_linear - (C - a a^T / a_0) F.
 
         Parameters
         ----------
@@ -267,7 +267,7 @@ class ModalIntegrator:
     ) -> TransientState:
         """Return the state after a time step under loads that are held.
 
-        The step is exact for the kept modes where there are no laws. If the loads differ from those
+        Without laws the step is exact for the kept modes. If the loads differ from those
         of the state, they jump at once, and the structure overshoots.
 
         Parameters
@@ -408,8 +408,8 @@ class ModalIntegrator:
 
         Displacement and velocity of the structure stay what they were; they are projected on the
         new modes with the new mass matrix, exactly in reduced coordinates. What the new modes
-        cannot hold follows the load without delay, as always. The memory of laws stays where they
-        are the same at the same ports; other laws have been loaded from zero to where they are.
+        cannot represent follows the load without delay, as always. The memory of laws is kept if
+        they are the same at the same ports; other laws are loaded from zero to their positions.
 
         Parameters
         ----------

@@ -328,7 +328,7 @@ class WingRows:
         the curvature at its own section. At a given bending moment the strain of a section whose
         skin keeps the fraction r of its stiffness goes as 1 / (1 - s (1 - r)), s the skin's
         fraction of the bending stiffness. The factor is the mean of that over the gauge with the
-        losses where they are, over the same with smeared losses. It is one where losses end at
+        losses where they are, over the same with smeared losses. It is one if losses end at
         edges of strips.
 
         Parameters

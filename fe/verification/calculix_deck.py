@@ -92,7 +92,7 @@ class Grading(NamedTuple):
     temperatures : (nodes,) array
         Temperatures of the nodes.
     cells : (nc,) array of bool
-        The cells where the elasticity changes; elsewhere the factor is one.
+        The cells in which the elasticity changes; in others the factor is one.
     """
 
     course: list[tuple[float, float]]

@@ -222,7 +222,7 @@ class Check:
     limit : float, optional
         Largest allowed value; None for a figure that is only reported.
     note : str
-        Text beside the figure.
+        Text printed after the figure.
     """
 
     group: str

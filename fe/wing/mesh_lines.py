@@ -59,7 +59,7 @@ def _filled(
     Parameters
     ----------
     required : iterable of MeshLine
-        What the design asks for; of two lines at the same position one is kept.
+        Lines that the design requires; of two lines at the same position one is kept.
     optional : iterable of OptionalLine
         Lines that are taken if they have room.
     chords : (k,) array
