@@ -88,7 +88,7 @@ class FmuSimulator(FmuAtRest):
         return sample(stepped.values, stepped.step, readout, readout.derivatives)
 
     def _law_ports(self, excitation: FmuExcitation, laws: PortLaws) -> LawPorts:
-        """Return where laws act on the linear system, with the ports at the undisturbed outputs."""
+        """Return the ports of the laws; positions count from the undisturbed outputs."""
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
         numbers = [excitation.inputs.index(self.port_inputs[port]) for port in ports]

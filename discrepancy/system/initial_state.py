@@ -146,8 +146,8 @@ def _held_state(
 ) -> ReleasedState:
     """Return the state of a structure that is held at rest by a force at its release point.
 
-    The force is the one that moves the release point by the release displacement from where it is
-    under the other loads.
+    The force moves the release point by the release displacement, counted from its position under
+    the other loads.
 
     Parameters
     ----------

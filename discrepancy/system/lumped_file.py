@@ -86,7 +86,7 @@ class LumpedDescription(ModelDescription):
     """Content of a lumped model's file, SI; vectors have n + m entries, displacements first.
 
     `mass` and `stiffness` are matrices (n, n), vectors of a diagonal, or for n = 1 numbers; left
-    out where there are states only. `capacity` T and `conductance` R (m, m) are those of the states
+    out if there are only states. `capacity` T and `conductance` R (m, m) are those of the states
     x, and `coupling` holds F, G, H: M u'' + C u' + K u = F x + ..., T x' + R x = G u' + H u + ...
     With `free` the stiffness may be singular. `characteristic_length` [m] is by default the largest
     station, or 1.

@@ -52,7 +52,7 @@ Prior = Mapping[str, tuple[float, float]]
 
 
 class StructureWithMatrices(SolvedStructure, Protocol):
-    """What the workflow asks of a reduced or a patched structure at one state.
+    """The interface of a reduced or a patched structure at one state.
 
     All matrices and rows are in n coordinates of the structure's own.
     """
@@ -75,12 +75,13 @@ class StructureWithMatrices(SolvedStructure, Protocol):
 
 
 class StructureModel(SystemModel):
-    """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
+    """A structure from a mesh or matrices, by its reduced model.
 
-    A control in N is a force, and where a load of it acts along a displacement output, in either
-    direction, there is a port, which has the name and the sign of that output. Ports of the file
-    come behind these. Other controls are nominal but for the load factor, which is zero where none
-    is recorded; constant loads always act.
+    The prior of its parameters and free masses has the standard deviation `DEVIATION`. A control
+    with the unit N is a force. If its load acts along a displacement output, in either direction,
+    there is a port with the name and the sign of that output; the ports of the file follow these.
+    Other controls are nominal, except for the load factor, which is zero if a trial records none.
+    Constant loads always act.
 
     Parameters
     ----------
@@ -204,7 +205,7 @@ class StructureModel(SystemModel):
     def force_row(
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
+        """Return the load (n,) of 1 N of a force; without forces, that of load factor 1.
 
         Raises
         ------

@@ -312,7 +312,7 @@ class StaticReduction:
         """Return the certified relative bound of a reduced model at a state.
 
         It is the largest of all loads, each relative to its largest strain or displacement, or to
-        `least_outputs` where that is larger.
+        `least_outputs` if that is larger.
         """
         worst = 0.0
         for number, response in enumerate(self.responses(model, state)):

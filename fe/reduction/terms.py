@@ -227,12 +227,12 @@ class ReductionTerms:
         return loss_at(self.losses, np.array(fractions)[:, np.newaxis])
 
     def anchors(self) -> list[list[FloatArray]]:
-        """Return, for each anchor, the coefficients (T,) at which dual solutions are wanted.
+        """Return the states of each anchor, as coefficients (T,) of the stiffness terms.
 
-        An anchor is a state around which the error bound is built. With few regions, the range of
-        losses is divided into a grid, and each of its cells has one anchor state; the loss of the
-        last region changes first. With many regions there is a single anchor, with the states at
-        corners of the box of parameters and losses.
+        An anchor is a group of states whose dual solutions are combined to those of nearby states.
+        With few regions, the range of losses is divided into a grid, and each of its cells has an
+        anchor of one state; the loss of the last region changes first. With many regions there is a
+        single anchor, whose states are the corners of the box of parameters and losses.
         """
         if not self.splits.size:
             corner_states = self.states(cube_corners(self.varied))

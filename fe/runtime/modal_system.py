@@ -289,7 +289,7 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
     Parameters
     ----------
     stiffness : bytes of (M, M) or (M,) array
-        S, or its diagonal where nothing couples the coordinates.
+        S, or its diagonal if nothing couples the coordinates.
     damping : bytes of (M, M) array
         D.
     lengths : bytes of (S,) array

@@ -184,7 +184,7 @@ class PatchedWing(WingRows):
     def _add_root_compliance(self, stiffness: FloatArray, patch: ModelPatch) -> None:
         """Put the root compliances of a patch in series with the spring at the root, in place.
 
-        Raises `InvalidPatchError` where they leave no spring.
+        Raises `InvalidPatchError` if no spring remains.
         """
         spring = self.arrays.flap_spring
         compliance = sum(

@@ -30,8 +30,8 @@ class ReducedStructure:
     """A reduced structure at fixed inputs, as a `StructureInMotion` in Nm + N coordinates.
 
     The first Nm coordinates belong to the modal basis, the others to the static basis. Motion
-    happens in the modal basis; the static basis holds what the modes leave out, and is solved by
-    itself.
+    happens in the modal basis; the static basis represents displacements that the modes leave out,
+    and is solved on its own.
 
     Parameters
     ----------
