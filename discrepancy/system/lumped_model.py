@@ -392,8 +392,8 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the linear system in a state, with its prescribed motions and controllers.
 
         A controller adds to the matrices K, D and M (of z, z', z''): its output on the right-hand
-        side goes to the left with a minus. The integral s of its error, s' = reference - measured, is
-        a further state, the speed of its unknown in z; hence it has a one in M, and the measured
+        side goes to the left with a minus. The integral s of its error, s' = reference - measured,
+        is a further state, the speed of its unknown in z; hence it has a one in M, and the measured
         quantity goes to the left with a plus.
         """
         description = self.description
