@@ -126,7 +126,7 @@ class ReleaseSection(Section):
     output: Name | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of not exactly one way, and of a hold without an output."""
+        """Yield a fault if there is not exactly one way of release, or no output for `hold`."""
         has_none_or_both = (self.displacement is None) == (self.hold is None)
         yield (
             has_none_or_both,
@@ -169,7 +169,7 @@ class FmuParameterSection(ParameterSection):
 
 
 class ScalesSection(Section):
-    """`[scales]`: natural scales that the FMU cannot say, as in `Scales`; all SI."""
+    """`[scales]`: natural scales that cannot be computed with the FMU, as in `Scales`; all SI."""
 
     length: Positive | None = None
     tip_stiffness: Positive | None = None
@@ -221,7 +221,7 @@ class FmuModelDescription(ModelDescription):
     isolated: bool = True
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what does not fit together."""
+        """Yield the contradictions of the file."""
         for kind in ("port", "parameter", "output", "input"):
             yield from self.repeated(kind, [section.name for section in getattr(self, kind)])
         for kind in self.effects:

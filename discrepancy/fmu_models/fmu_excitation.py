@@ -1,4 +1,4 @@
-"""What moves an FMU: its state, a recorded force, a release, and the inputs that laws push."""
+"""Excitation of an FMU: its state, a recorded force, a release, and the inputs of laws."""
 
 from collections.abc import Hashable, Mapping
 from types import MappingProxyType
@@ -12,7 +12,7 @@ from fmu_asset.client.runs import OperatingPoint
 
 
 class FmuExcitation(NamedTuple):
-    """What moves an FMU.
+    """The excitation of an FMU in a dynamic trial.
 
     Attributes
     ----------
@@ -21,11 +21,11 @@ class FmuExcitation(NamedTuple):
     step : float
         Communication step [s].
     record : int
-        Number of steps after which the answer to each input and each release is known.
+        Number of steps of the recorded response to each input and each release.
     inputs : tuple of str
-        Inputs that a recorded force or laws may push.
+        Force inputs on which a recorded force or laws may act.
     levers : mapping of str to float
-        Factor of the recorded force by input.
+        Factor of the recorded force on each input: one for a force, an arm [m] for a moment.
     force : RecordedHistory, optional
         The recorded force.
     releases : mapping of str to float

@@ -1,4 +1,4 @@
-"""Motion of an FMU with laws at its ports: by its system where it is linear, else step by step."""
+"""Motion of an FMU with laws at its ports: by its linear system if it has one, else in steps."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from math import ceil
@@ -24,9 +24,9 @@ from fmu_asset.client.runs import FmuRun
 from fmu_asset.client.state_space import FmuStateSpace
 
 CONVERGED = 1e-4
-"""Largest rms change of a motion with laws when steps are halved, as a share of the motion."""
+"""Largest rms change of a motion with laws if steps are halved, relative to the motion."""
 MOST_REFINEMENT = 64
-"""Steps that do not converge at this refinement are given up."""
+"""Largest number of parts of a step in the search for convergence."""
 
 
 class FmuSimulator(FmuAtRest):
@@ -57,7 +57,7 @@ class FmuSimulator(FmuAtRest):
         Parameters
         ----------
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for its length and name.
         laws : Laws
@@ -70,8 +70,8 @@ class FmuSimulator(FmuAtRest):
         Raises
         ------
         ModelError
-            If the FMU refuses; or, where it is stepped, if a port has no velocity, or the steps do
-            not converge.
+            If the FMU refuses an input, or if it has to be stepped and a port has no velocity
+            output, or the steps do not converge.
         """
         times = readout.times
         end = max(float(times[-1]), float(trial.time[-1]))
@@ -82,13 +82,13 @@ class FmuSimulator(FmuAtRest):
                 system, excitation, trial, laws, ports, readout, end, refinement
             )
         if times[-1] != trial.time[-1]:
-            # a little longer, so that a clock that is being fitted does not ask for another run
+            # slightly longer, so that another clock (in a fit) can use the same cached run
             end += trial.interval
         stepped = self._stepped_motion(excitation, trial, end, laws, readout.columns, refinement)
         return sample(stepped.values, stepped.step, readout, readout.derivatives)
 
     def _law_ports(self, excitation: FmuExcitation, laws: PortLaws) -> LawPorts:
-        """Return where laws act on the linear system, with the ports at the undisturbed outputs."""
+        """Return the ports of the laws; positions count from the undisturbed outputs."""
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
         numbers = [excitation.inputs.index(self.port_inputs[port]) for port in ports]
@@ -118,7 +118,7 @@ class FmuSimulator(FmuAtRest):
         system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for the stamps of its force.
         laws : Laws
@@ -161,7 +161,8 @@ class FmuSimulator(FmuAtRest):
         constant = np.where(is_derivative, 0.0, undisturbed[columns])
         values = states @ rows.T + forces @ direct.T + constant
         if excitation.releases:
-            # the force that holds it until then may be seen at once
+            # the first sample is that of the held FMU: the holding force may act on outputs
+            # directly
             held = [
                 self._answer_to_release(excitation, name)[0] * amount
                 for name, amount in amounts.items()
@@ -188,29 +189,34 @@ class FmuSimulator(FmuAtRest):
         ports: LawPorts,
         amounts: Mapping[str, float],
     ) -> "StartState":
-        """Return the state at the begin: under a force at rest with the laws, else as released.
+        """Return the state at the begin of a trial with laws.
+
+        Under a recorded force it is the equilibrium with the laws under the first force; otherwise
+        it is the released state.
 
         Parameters
         ----------
         system : FmuStateSpace
             The linear system.
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         laws : Laws
             Internal forces.
         ports : LawPorts
-            Where they act.
+            The ports at which the laws act.
         amounts : mapping of str to float
-            What releases the FMU.
+            The amounts of the variables that release the FMU.
         """
         if not len(laws) or excitation.force is None:
             return StartState(self._start_state(system, excitation, amounts), None)
         first_forces = excitation.first_force * excitation.lever_values
         gain = system.gain
         outputs = self._undisturbed_outputs(excitation) + gain @ first_forces
-        without_laws = outputs[ports.columns]
+        positions_without_laws = outputs[ports.columns]
         compliance = gain[np.ix_(ports.columns, ports.force_numbers)]
-        solution = static_solution(laws, without_laws[None], compliance, kernel=compiled_kernel())
+        solution = static_solution(
+            laws, positions_without_laws[None], compliance, kernel=compiled_kernel()
+        )
         law_forces = np.bincount(ports.force_numbers, solution.forces[0], len(first_forces))
         return StartState(system.state_at_rest(first_forces - law_forces), solution.memory)
 
@@ -230,7 +236,7 @@ class FmuSimulator(FmuAtRest):
         Parameters
         ----------
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for its kind and name.
         end : float
@@ -261,7 +267,7 @@ class FmuSimulator(FmuAtRest):
 
         parts = 1
         if len(laws) and fixed_step is None:
-            # an accelerometer that nobody reads would ask for steps many times smaller
+            # only the outputs that are read have to converge: others may need far smaller steps
             watched = sorted({*columns, *self.displacement_columns})
             kind = (*watched, trial.kind, trial.interval)
             parts = self._parts_for(
@@ -272,7 +278,7 @@ class FmuSimulator(FmuAtRest):
         return SteppedOutputs(outputs, fixed_step or longest / parts)
 
     def _settled_with_laws(self, run: FmuRun, laws: PortLaws, trial: str) -> "SettledRun":
-        """Return a run that has settled with laws under its first loads."""
+        """Return a run that begins in equilibrium with laws under its first loads."""
         outputs = self._outputs_at_begin(run)
         columns = [self.displacement_columns[self.ports.index(name)] for name in laws.ports]
         if not run.offsets or not np.any(outputs[:, columns]):
@@ -313,11 +319,14 @@ class FmuSimulator(FmuAtRest):
             )
         first_step, speed_gain = self._speed_gain(run, inputs, speed_columns)
         coupling = PortCoupling(laws, names, speed_gain, run.step, memory)
-        # step by step, with the force of the laws held over each step
-        asset, first, courses = self.start_run(run)
-        outputs = [first]
+        # In each step the ports lose `speed_loss` to the laws, and a force that makes the same
+        # change, speed_gain^-1 speed_loss, is held over the step. Accelerations without laws are
+        # those of the last step, with the loss to the laws added again.
+        asset, first_outputs, courses = self.start_run(run)
+        outputs = [first_outputs]
         forces = np.column_stack([*courses.values()])
         port_columns = [list(courses).index(name) for name in inputs]
+        # speeds before the begin, extrapolated from the first step without laws
         previous_speeds = 2.0 * first_step[0] - first_step[1]
         speed_loss = np.zeros(len(ports))
         for step_forces in forces:
@@ -328,7 +337,7 @@ class FmuSimulator(FmuAtRest):
             previous_speeds = speeds
             step_forces[port_columns] -= np.linalg.solve(speed_gain, speed_loss)
             if not np.isfinite(step_forces).all():
-                return np.full((len(forces) + 1, len(first)), np.nan)
+                return np.full((len(forces) + 1, len(first_outputs)), np.nan)
             load = dict(zip(courses, step_forces.tolist(), strict=True))
             with self.refusal_context():
                 outputs.append(asset.step(load=load).values)
@@ -337,7 +346,9 @@ class FmuSimulator(FmuAtRest):
     def _speed_gain(
         self, run: FmuRun, inputs: Sequence[str], speed_columns: list[int]
     ) -> tuple[FloatArray, FloatArray]:
-        """Return speeds (2, P) around the first step, and what unit forces add in it (P, P).
+        """Return the speeds of the ports at both ends of the first step, and their gains.
+
+        The gains (P, P) are the changes of the speeds (rows) by unit forces (columns) in that step.
 
         Parameters
         ----------
@@ -351,13 +362,13 @@ class FmuSimulator(FmuAtRest):
         first_courses = {name: course[:1] for name, course in run.offsets.items()}
         one_step = run._replace(steps=1, offsets=first_courses)
         undisturbed = self.outputs_of_run(one_step)[:, speed_columns]
-        sizes = np.array([self.probing_amplitude(name) for name in inputs])
-        changes = []
+        amplitudes = np.array([self.probing_amplitude(name) for name in inputs])
+        speed_changes = []
         for name in inputs:
-            push = first_courses.get(name, 0.0) + np.full(1, self.probing_amplitude(name))
-            pushed = one_step._replace(offsets={**first_courses, name: push})
-            changes.append(self.outputs_of_run(pushed)[1, speed_columns] - undisturbed[1])
-        return undisturbed, np.stack(changes, axis=1) / sizes
+            force = first_courses.get(name, 0.0) + np.full(1, self.probing_amplitude(name))
+            pushed_run = one_step._replace(offsets={**first_courses, name: force})
+            speed_changes.append(self.outputs_of_run(pushed_run)[1, speed_columns] - undisturbed[1])
+        return undisturbed, np.stack(speed_changes, axis=1) / amplitudes
 
     def _parts_for(
         self,
@@ -366,21 +377,21 @@ class FmuSimulator(FmuAtRest):
         step: float,
         outputs_by: Callable[[int], FloatArray],
     ) -> int:
-        """Return into how many parts steps are divided for laws.
+        """Return the number of parts of a step at which a motion with laws has converged.
 
-        Steps are halved until that changes nothing that moves by more than `CONVERGED` of its
-        largest motion (rms). What was enough is kept for laws of this kind up to twice as strong.
+        Steps are halved until no output changes by more than `CONVERGED` of its largest motion
+        (rms). The number is kept for laws of the same kind that are at most twice as strong.
 
         Parameters
         ----------
         laws : Laws
             Internal forces.
         kind : hashable
-            What else the number depends on.
+            Key of everything else that the number depends on.
         step : float
             The whole step [s].
         outputs_by : callable
-            Parts of a step to outputs (K, C) at the ends of whole steps.
+            Returns the outputs (K, C) at the ends of whole steps, given the number of parts.
 
         Raises
         ------
@@ -388,7 +399,7 @@ class FmuSimulator(FmuAtRest):
             If the steps do not converge.
         """
         strength = float(np.max(np.abs(laws.parameters[:, 0])))
-        # roughness asks for short steps
+        # the exponents of a law say how rough it is, and rough laws need short steps
         exponents = np.round(np.clip(laws.parameters[:, 1:3], -9.0, 9.0), 1)
         key = (kind, laws.ports, laws.law_numbers.tobytes(), exponents.tobytes())
         refinement = self._refinements.get(key, Refinement(1, 0.0))
@@ -413,7 +424,7 @@ class FmuSimulator(FmuAtRest):
 
 
 class Refinement(NamedTuple):
-    """Parts of a step that were enough for laws of a strength."""
+    """Number of parts of a step that is enough for laws up to a strength."""
 
     parts: int
     strength: float
@@ -427,7 +438,7 @@ class StartState(NamedTuple):
 
 
 class SteppedOutputs(NamedTuple):
-    """Values (K, C) of outputs on an even grid from zero, and its step [s]."""
+    """Values (K, C) of outputs on an even time grid from zero, and the step of the grid [s]."""
 
     values: FloatArray
     step: float
@@ -441,7 +452,7 @@ class SettledRun(NamedTuple):
 
 
 def _relative_change(coarse: FloatArray, fine: FloatArray) -> float:
-    """Return the largest rms difference of two motions (K, C), as a share of the largest motion."""
+    """Return the largest rms difference of two motions (K, C), relative to the largest motion."""
     rows = min(len(fine), len(coarse))
     with np.errstate(all="ignore"):
         largest = np.max(np.abs(fine - fine.mean(axis=0)), axis=0)

@@ -1,4 +1,4 @@
-"""Rest of an FMU under loads, with laws at its ports."""
+"""Static equilibrium of an FMU under loads, with internal forces (laws) at its ports."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,13 +17,13 @@ from fe.runtime.port_laws import PortLaws
 from fmu_asset.client.runs import OperatingPoint
 
 STATIC_ITERATIONS = 30
-"""Iterations after which a law and an FMU at rest are given up."""
+"""Largest number of iterations between the laws and a static FMU."""
 STATIC_TOLERANCE = 1e-9
-"""Change of the ports in an iteration, as a share of their displacement, that ends it."""
+"""The iteration ends if it changes the ports by less than this fraction of their displacement."""
 
 
 class RestWithLaws(NamedTuple):
-    """Outputs (L, C) at rest with laws, and what the laws do then."""
+    """Outputs (L, C) in equilibrium with laws, and the solution of the laws."""
 
     outputs: FloatArray
     solution: StaticSolution
@@ -45,9 +45,11 @@ class FmuAtRest(IdentifiedFmu):
         self._rest_is_linear: dict[tuple[str, ...], bool] = {}
 
     def rest(self, states: Sequence[OperatingPoint], loads: Mapping[str, FloatArray]) -> FloatArray:
-        """Return the outputs (L, C) at rest in states that differ in inputs.
+        """Return the outputs (L, C) at rest, for L states that differ in their inputs.
 
-        Where the FMU has to come to rest and is linear, what loads add is that of its system.
+        An FMU without a static solution is stepped until its motion has decayed (`static.settle`).
+        If it is linear, that is done without loads only: its static gain gives the changes by
+        loads.
 
         Parameters
         ----------
@@ -61,7 +63,7 @@ class FmuAtRest(IdentifiedFmu):
             return self.outputs_at_rest(states, loads, static.step, settle=False)
         names = tuple(sorted(name for name, values in loads.items() if np.any(values)))
         amounts = np.array([loads[name] for name in names]).reshape(-1, len(states)).T
-        # the largest load says whether the FMU is linear
+        # the test for linearity, made at the first row, is the strictest at the largest load
         largest_first = np.argsort(-np.abs(amounts).sum(axis=1), kind="stable")
         outputs = {}
         for row in largest_first.tolist():
@@ -71,16 +73,19 @@ class FmuAtRest(IdentifiedFmu):
     def _settled_outputs(
         self, state: OperatingPoint, amounts: FloatArray, names: tuple[str, ...]
     ) -> FloatArray:
-        """Return the outputs (C,) of the settled FMU under amounts (E,) on some inputs.
+        """Return the outputs (C,) of the FMU at rest under constant loads on some inputs.
+
+        The first time, the sum of static gains is compared with the FMU itself, which decides
+        whether the FMU is linear for these inputs.
 
         Parameters
         ----------
         state : OperatingPoint
             Parameters and constant inputs.
         amounts : (E,) array
-            What is added to the inputs.
+            The load that is added to each of E inputs.
         names : tuple of str
-            These inputs.
+            The names of these inputs.
         """
         excitation = FmuExcitation(
             state, self.description.static.step, RECORD, inputs=names, settles=True
@@ -90,41 +95,43 @@ class FmuAtRest(IdentifiedFmu):
         system = self.system(excitation)
         if system is None:
             return self._stepped_rest(state, amounts, names)
-        unloaded = self._stepped_rest(state, 0.0 * amounts, names)
-        added = system.gain @ amounts
+        unloaded_outputs = self._stepped_rest(state, 0.0 * amounts, names)
+        added_outputs = system.gain @ amounts
         if names not in self._rest_is_linear:
             answers = [self._answer_to_force(excitation, name) for name in names]
-            largest = [np.max(np.abs(answer), axis=0) for answer in answers]
-            tolerance = LINEAR * (np.abs(added) + np.abs(amounts) @ largest)
-            loaded = self._stepped_rest(state, amounts, names)
-            is_linear = bool(np.all(np.abs(loaded - unloaded - added) <= tolerance))
+            largest_answers = [np.max(np.abs(answer), axis=0) for answer in answers]
+            tolerance = LINEAR * (np.abs(added_outputs) + np.abs(amounts) @ largest_answers)
+            loaded_outputs = self._stepped_rest(state, amounts, names)
+            is_linear = bool(
+                np.all(np.abs(loaded_outputs - unloaded_outputs - added_outputs) <= tolerance)
+            )
             self._rest_is_linear[names] = is_linear
         if self._rest_is_linear[names]:
-            return np.asarray(unloaded + added)
+            return np.asarray(unloaded_outputs + added_outputs)
         return self._stepped_rest(state, amounts, names)
 
     def _stepped_rest(
         self, state: OperatingPoint, amounts: FloatArray, names: tuple[str, ...]
     ) -> FloatArray:
-        """Return the outputs (C,) of the FMU itself when it has come to rest."""
+        """Step the FMU itself until it is at rest, and return its outputs (C,)."""
         loads = dict(zip(names, amounts[:, None], strict=True))
         key = (state, names, amounts.tobytes())
         step = self.description.static.step
         return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
     def flexibility(self, state: OperatingPoint) -> FloatArray:
-        """Return the displacements (P, P) of the ports at rest under a unit force at each."""
+        """Return the flexibility (P, P): displacements of ports (rows) per force (columns)."""
         if not self.ports:
-            # loads of zero may be outside of what the FMU takes
+            # without ports nothing is wanted, and the FMU may not accept loads of zero
             return np.zeros((0, 0))
-        pushes = np.diag([self.probing_amplitude(name) for name in self.port_inputs])
+        probing_forces = np.diag([self.probing_amplitude(name) for name in self.port_inputs])
         # the first row is without a force
-        loads = dict.fromkeys(self.port_inputs, np.zeros(len(pushes) + 1))
-        for name, push in zip(self.port_inputs, pushes, strict=True):
-            loads[name] = loads[name] + np.append(0.0, push)
-        outputs = self.rest([state] * (len(pushes) + 1), loads)
+        loads = dict.fromkeys(self.port_inputs, np.zeros(len(probing_forces) + 1))
+        for name, force in zip(self.port_inputs, probing_forces, strict=True):
+            loads[name] = loads[name] + np.append(0.0, force)
+        outputs = self.rest([state] * (len(probing_forces) + 1), loads)
         displacements = outputs[:, self.displacement_columns]
-        return np.asarray((displacements[1:] - displacements[0]).T / np.diag(pushes))
+        return np.asarray((displacements[1:] - displacements[0]).T / np.diag(probing_forces))
 
     def at_rest(
         self,
@@ -133,7 +140,10 @@ class FmuAtRest(IdentifiedFmu):
         laws: PortLaws,
         trial: str,
     ) -> FloatArray:
-        """Return the outputs (L, C) where laws follow the load path; the FMU confirms the result.
+        """Return the outputs (L, C) at rest along a load path, with the forces of laws.
+
+        The forces that solve the equations of the laws are applied to the FMU, whose outputs are
+        then the result.
 
         Parameters
         ----------
@@ -177,7 +187,7 @@ class FmuAtRest(IdentifiedFmu):
     def loads_less_laws(
         self, loads: Mapping[str, FloatArray], laws: PortLaws, forces: FloatArray
     ) -> dict[str, FloatArray]:
-        """Return loads (L,) by input, less the forces (L, J) of laws.
+        """Return the loads (L,) on each input minus the forces of the laws at its port.
 
         Parameters
         ----------
@@ -186,7 +196,7 @@ class FmuAtRest(IdentifiedFmu):
         laws : Laws
             J internal forces.
         forces : (L, J) array
-            What they take.
+            The force of each law in each row.
         """
         remaining = dict(loads)
         for port, force in zip(laws.ports, forces.T, strict=True):
@@ -202,18 +212,21 @@ class FmuAtRest(IdentifiedFmu):
         state: OperatingPoint,
         trial: str,
     ) -> RestWithLaws:
-        """Return the rest with laws, by iterations of laws and FMU.
+        """Return the equilibrium of the FMU with laws, by alternating between both.
+
+        Newton's method with the flexibility of one state: the laws are solved for a linear FMU, the
+        FMU is loaded by their forces, and the linear FMU is moved through the point it reaches.
 
         Parameters
         ----------
         laws : Laws
             J internal forces.
         outputs_under : callable
-            Forces (L, J) of the laws to outputs (L, C) at rest.
+            Returns the outputs (L, C) at rest under forces (L, J) of the laws.
         outputs : (L, C) array
             Outputs without laws.
         state : OperatingPoint
-            State whose flexibility leads to where laws and FMU agree.
+            State whose flexibility is used in all iterations.
         trial : str
             Name of the trial, for sentences.
 
@@ -225,20 +238,22 @@ class FmuAtRest(IdentifiedFmu):
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
         compliance = self.flexibility(state)[np.ix_(ports, ports)]
-        without_laws = outputs[:, columns]
+        positions_without_laws = outputs[:, columns]
         for _ in range(STATIC_ITERATIONS):
-            solution = static_solution(laws, without_laws, compliance, kernel=compiled_kernel())
+            solution = static_solution(
+                laws, positions_without_laws, compliance, kernel=compiled_kernel()
+            )
             outputs = outputs_under(solution.forces)
-            # where the FMU is not linear, the law is solved again about the points that were
-            # reached
-            updated = outputs[:, columns] + solution.forces @ compliance.T
-            change = np.abs(updated - without_laws).max(axis=1)
-            without_laws = updated
-            size = np.maximum(np.abs(updated).max(axis=1), 1e-300)
-            if np.all(change <= STATIC_TOLERANCE * size):
+            # positions that the ports would have without laws, if the FMU were linear about the
+            # positions that it reached
+            updated_positions = outputs[:, columns] + solution.forces @ compliance.T
+            largest_change = np.abs(updated_positions - positions_without_laws).max(axis=1)
+            positions_without_laws = updated_positions
+            largest_position = np.maximum(np.abs(updated_positions).max(axis=1), 1e-300)
+            if np.all(largest_change <= STATIC_TOLERANCE * largest_position):
                 return RestWithLaws(outputs, solution)
         names = ", ".join(dict.fromkeys(laws.ports))
-        level = int(np.argmax(change)) + 1
+        level = int(np.argmax(largest_change)) + 1
         raise ModelError(
             f"The law at {names} and the FMU model {self.description.name!r} did not agree at load "
             f"level {level} of {trial!r} within {STATIC_ITERATIONS} iterations; the force is too "

@@ -26,16 +26,17 @@ from reporting.memory import ResultCache
 LINEAR = 1e-6
 """Largest deviation from superposition of a linear FMU, as a share of the motion."""
 PHASE = 0.1
-"""Longest communication step without laws: radians of the first mode."""
+"""Longest communication step without laws, as a phase of the first mode [rad]."""
 LEAST_RECORD, RECORD = 64, 600
-"""Least and most steps of the answer to a force or a release that are recorded."""
+"""Least and largest number of steps of a recorded response to a force or a release."""
 SAFE_TURN = 0.8 * np.pi
-"""Turn of a mode in a step that stays below half a circle as parameters change [rad]."""
+"""Largest phase of a mode in a step that stays below pi as parameters change [rad]."""
 MOST_PARTS = 16
-"""Parts of an interval up to which the system is looked for."""
+"""Largest number of parts of a sampling interval at which a linear system is looked for."""
 SAME_MOTION = 1e-2
-"""A mode that turns by more than half a circle in a step looks like a slower one there: half the
-step then gives another motion, by more than this share of it."""
+"""Largest difference, relative to the motion, between the linear system and the FMU at half the
+step. A mode whose phase grows by more than pi in a step is aliased to a slower one, and differs
+more."""
 RELEASE = 1e-3
 """Displacement from which an FMU without ports is released to find its first mode [m]."""
 
@@ -164,8 +165,8 @@ class IdentifiedFmu(FmuRuns):
     def system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the FMU as a linear system; None if it is not linear.
 
-        It is linear where one system gives its answers to single forces and releases, and predicts
-        what all of them do together.
+        The system is identified from the responses to single forces and releases. The FMU is linear
+        if such a system exists, and predicts the response to all of them together.
         """
         kind = excitation.kind
         may_be_linear = self.description.superposition and (
@@ -180,29 +181,37 @@ class IdentifiedFmu(FmuRuns):
         return system if self._is_linear.get(kind) else None
 
     def _identify(self, excitation: FmuExcitation) -> FmuStateSpace | None:
-        """Return the linear system of the answers to unit forces and releases, if there is one."""
+        """Return the linear system with the FMU's responses to unit forces and releases, if any."""
         answers = [self._answer_to_force(excitation, name) for name in excitation.inputs]
         answers += [self._answer_to_release(excitation, name) for name in excitation.releases]
         records = np.stack(answers, axis=2)[1:]
         return realise_state_space(records, len(excitation.inputs), excitation.step)
 
     def _answer_to_force(self, excitation: FmuExcitation, name: str) -> FloatArray:
-        """Return the outputs (record + 1, C) after a unit force over the first step."""
-        size = self.probing_amplitude(name)
-        impulse = size * np.eye(1, excitation.record).ravel()
+        """Return the outputs (record + 1, C) after a unit force over the first step.
+
+        The FMU gets a force of the probing amplitude of its input, and the difference of its
+        outputs to those without a force is divided by the amplitude.
+        """
+        amplitude = self.probing_amplitude(name)
+        impulse = amplitude * np.eye(1, excitation.record).ravel()
         run = FmuRun(*excitation.recording, offsets={name: impulse})
         key = (*excitation.recording, name, False)
-        return self.cached(key, lambda: self._motion(excitation, run) / size)
+        return self.cached(key, lambda: self._motion(excitation, run) / amplitude)
 
     def _answer_to_release(self, excitation: FmuExcitation, name: str) -> FloatArray:
-        """Return the outputs (record + 1, C) after a release by one unit."""
-        usual = excitation.releases[name] or 1.0
+        """Return the outputs (record + 1, C) after a release by one unit, relative to no release.
+
+        The FMU is released by a usual amount, which is the same in all later calls, and the outputs
+        are divided by it.
+        """
+        usual_amplitude = excitation.releases[name] or 1.0
         if self._is_input(name):
-            usual = self.probing_amplitude(name)
-        size = self._release_sizes.setdefault(name, usual)
-        run = self._run(excitation._replace(force=None), {name: size})
+            usual_amplitude = self.probing_amplitude(name)
+        amplitude = self._release_sizes.setdefault(name, usual_amplitude)
+        run = self._run(excitation._replace(force=None), {name: amplitude})
         key = (*excitation.recording, name, True)
-        return self.cached(key, lambda: self._motion(excitation, run) / size)
+        return self.cached(key, lambda: self._motion(excitation, run) / amplitude)
 
     def _is_input(self, name: str) -> bool:
         """Return whether a name is an input of the FMU, not a parameter."""
@@ -219,44 +228,47 @@ class IdentifiedFmu(FmuRuns):
         return self.cached((state, step), lambda: self.start_run(run)[1])
 
     def _predicts(self, system: FmuStateSpace, excitation: FmuExcitation, tolerance: float) -> bool:
-        """Return whether a system gives the motion of the FMU under all that moves it at once.
+        """Return whether a linear system predicts the FMU's response to all inputs at once.
 
-        Inputs of laws get random forces.
+        The recorded force and the releases act, and random forces on all inputs.
 
         Parameters
         ----------
         system : FmuStateSpace
             The system.
         excitation : FmuExcitation
-            What moves the FMU.
+            The state, force, releases and inputs of the FMU.
         tolerance : float
-            Largest error of an output, as a share of its largest motion.
+            Largest error of an output, relative to its largest motion.
         """
-        amounts = self._release_amounts_of_system(excitation)
-        run = self._run(excitation, amounts)
-        random = np.random.default_rng(0)
+        release_amounts = self._release_amounts_of_system(excitation)
+        run = self._run(excitation, release_amounts)
+        generator = np.random.default_rng(0)
         forces = {
-            name: self.probing_amplitude(name) * random.uniform(-1.0, 1.0, run.steps)
+            name: self.probing_amplitude(name) * generator.uniform(-1.0, 1.0, run.steps)
             for name in excitation.inputs
         }
         forces |= run.offsets
         motion = self._motion(excitation, run._replace(offsets=forces))
-        # the same by the system
+        # the same motion by the linear system
         time = excitation.step * np.arange(run.steps + 1.0)
         loads = []
         for direction, values in zip(np.eye(len(forces)), forces.values(), strict=True):
             history = RecordedHistory(time, np.append(values, 0.0), Hold.ZERO_ORDER)
             loads.append(Load(direction, history))
-        start = self._start_state(system, excitation, amounts)
+        start = self._start_state(system, excitation, release_amounts)
         states, acting = system_motion(system, Excitation(time, time, loads), start)
-        predicted = motion - states @ system.output_matrix.T - acting @ system.feedthrough.T
-        error = np.max(np.abs(predicted)[1:], axis=0)
-        return bool(np.all(error <= tolerance * np.max(np.abs(motion), axis=0) + 1e-300))
+        prediction_error = motion - states @ system.output_matrix.T - acting @ system.feedthrough.T
+        largest_error = np.max(np.abs(prediction_error)[1:], axis=0)
+        return bool(np.all(largest_error <= tolerance * np.max(np.abs(motion), axis=0) + 1e-300))
 
     # ------------------------------------------------------------ releases
 
     def _release_amounts_of_system(self, excitation: FmuExcitation) -> dict[str, float]:
-        """Return the parameters or the force that displace the release point of a linear FMU."""
+        """Return the release parameters or holding force that give a linear FMU its displacement.
+
+        They are scaled by the displacement of the release point per unit.
+        """
         amounts = dict(excitation.releases)
         column = self.names.columns.get("release")
         if self.description.release is None or column is None or not amounts:
@@ -268,12 +280,14 @@ class IdentifiedFmu(FmuRuns):
         return amounts
 
     def _release_amounts(self, excitation: FmuExcitation) -> dict[str, float]:
-        """Return the parameters or the force that displace the release point of any FMU.
+        """Return the release parameters or holding force that give any FMU its displacement.
+
+        The amount is found by the secant method, with the FMU at the begin of a run.
 
         Raises
         ------
         ModelError
-            If there are none.
+            If no amount gives the displacement.
         """
         amounts = dict(excitation.releases)
         column = self.names.columns.get("release")
@@ -304,7 +318,7 @@ class IdentifiedFmu(FmuRuns):
         return amounts | {name: amount}
 
     def _run(self, excitation: FmuExcitation, amounts: Mapping[str, float]) -> FmuRun:
-        """Return the run by which the FMU follows an excitation, released by amounts."""
+        """Return the run of the FMU under an excitation, with the given release amounts."""
         begin = {name: amount for name, amount in amounts.items() if self._is_input(name)}
         parameters = {name: amount for name, amount in amounts.items() if name not in begin}
         run = FmuRun(
@@ -314,7 +328,7 @@ class IdentifiedFmu(FmuRuns):
             return run
         for name, lever in excitation.levers.items():
             begin[name] = lever * excitation.first_force
-        # inputs are held over steps: the mean of each step
+        # inputs are held constant over a step: they get the mean force of each step
         time = excitation.step * np.arange(excitation.record + 1.0)
         at_begin, at_end = equivalent_ramps(excitation.force.values_at, time)
         courses = {
@@ -325,7 +339,10 @@ class IdentifiedFmu(FmuRuns):
     def _start_state(
         self, system: FmuStateSpace, excitation: FmuExcitation, amounts: Mapping[str, float]
     ) -> FloatArray:
-        """Return the state (n,) at the begin: as released, and at rest under the first force."""
+        """Return the state (n,) at the begin of a trial.
+
+        It is the released state, plus equilibrium under the recorded force at the first sample.
+        """
         start: FloatArray = system.release_states @ np.array([*amounts.values()])
         first_force = excitation.first_force
         if first_force:
@@ -337,8 +354,9 @@ class IdentifiedFmu(FmuRuns):
     def pace(self, trial: Trial, state: OperatingPoint) -> Pace:
         """Return the first mode of the FMU and the communication step of a trial.
 
-        The mode is the one that is most flexible at the first port; without a port, the loudest.
-        The step is a whole part of the sampling interval.
+        The first mode is the one with the largest flexibility at the first port; without a port,
+        the one with the largest line in the spectrum. The step is an integer fraction of the
+        sampling interval.
         """
         interval = trial.interval
         releases = {}
@@ -364,7 +382,11 @@ class IdentifiedFmu(FmuRuns):
     def _system_that_shows_all_modes(
         self, excitation: FmuExcitation, interval: float
     ) -> PacedSystem:
-        """Return the system at a step in which no mode turns by more than half a circle."""
+        """Return the system identified at a step that samples all modes without aliasing.
+
+        The step is halved until no mode turns by more than `SAFE_TURN` in it, and the system also
+        predicts the FMU at half the step.
+        """
         fixed_step = self.description.motion.step
         parts = 1
         while True:

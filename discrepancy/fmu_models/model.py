@@ -1,4 +1,4 @@
-"""An FMU as a model: loads on its inputs, internal forces at its ports, its outputs read."""
+"""An FMU as a model: loads act on its inputs, laws at its ports, and its outputs are read."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -31,13 +31,14 @@ from fmu_asset.client.state_space import FmuStateSpace
 from reporting.words import comma_list
 
 LATEST = 100.0
-"""Lengths of a record after which its stamps count from elsewhere than the trial's start."""
+"""If the first stamp is later than this many lengths of the record, the stamps do not count from
+the begin of the trial."""
 TURN = 0.3
-"""Turn of the first mode in an interval that suits it [rad]."""
+"""Suitable phase of the first mode in a sampling interval [rad]."""
 
 
 class PortStiffness(NamedTuple):
-    """Stiffness of the most flexible mode at a port, and that at rest [N/m or N m/rad]."""
+    """Stiffness of the most flexible mode at a port, and static stiffness [N/m or N m/rad]."""
 
     modal: float
     static: float
@@ -118,31 +119,36 @@ class FmuModel(DescribedModel):
     # ------------------------------------------------------------ scales
 
     def scales(self, campaign: Campaign) -> Scales:
-        """Return the natural scales under a campaign: those of the file, else of the FMU."""
+        """Return the natural scales under a campaign.
+
+        Scales that the file states are taken from there; the others are computed with the FMU.
+        """
         conditions = Conditions(self.prior_mean(campaign))
-        largest = self._largest_displacements(campaign, conditions)
+        largest_displacements = self._largest_displacements(campaign, conditions)
         stiffnesses = self._port_stiffnesses(campaign, conditions)
         frequency = self._first_frequency(campaign, conditions)
         load_point = self._load_point_stiffness(stiffnesses)
         ports = {}
-        for port, displacement, stiffness in zip(self.ports, largest, stiffnesses, strict=True):
+        for port, displacement, stiffness in zip(
+            self.ports, largest_displacements, stiffnesses, strict=True
+        ):
             ports[port] = PortScale(
                 displacement=float(displacement) or 1.0,
                 stiffness=stiffness.modal,
                 angular_frequency=frequency,
                 static_stiffness=stiffness.static,
             )
-        of_file = self.description.scales
-        sizes = campaign.sizes
+        file_scales = self.description.scales
+        campaign_sizes = campaign.sizes
         return Scales(
-            length=of_file.length or 1.0,
-            tip_stiffness=of_file.tip_stiffness or load_point.static,
-            modal_mass=of_file.modal_mass or load_point.modal / frequency**2,
+            length=file_scales.length or 1.0,
+            tip_stiffness=file_scales.tip_stiffness or load_point.static,
+            modal_mass=file_scales.modal_mass or load_point.modal / frequency**2,
             angular_frequency=frequency,
-            force=sizes["force"],
-            load_factor=sizes["load_factor"],
-            duration=sizes["duration"],
-            campaign_time=sizes["campaign_time"],
+            force=campaign_sizes["force"],
+            load_factor=campaign_sizes["load_factor"],
+            duration=campaign_sizes["duration"],
+            campaign_time=campaign_sizes["campaign_time"],
             ports=ports,
         )
 
@@ -151,22 +157,27 @@ class FmuModel(DescribedModel):
         largest = np.zeros(len(self.ports))
         for trial in campaign.trials:
             if trial.is_dynamic:
-                moved = self._motion(trial, conditions, NO_PATCH, self._port_columns()).values
+                port_displacements = self._motion(
+                    trial, conditions, NO_PATCH, self._port_columns()
+                ).values
             else:
                 at_health = replace(conditions, health=trial.health)
                 outputs = self._outputs_at_rest(trial, at_health, NO_PATCH)
-                moved = outputs[:, self.fmu.displacement_columns]
-            largest = np.maximum(largest, np.max(np.abs(moved), axis=0))
+                port_displacements = outputs[:, self.fmu.displacement_columns]
+            largest = np.maximum(largest, np.max(np.abs(port_displacements), axis=0))
         return largest
 
     def _port_stiffnesses(self, campaign: Campaign, conditions: Conditions) -> list[PortStiffness]:
-        """Return the stiffness of each port: of the linear system if there is one, else at rest."""
-        at_rest = first_trial(campaign, is_dynamic=False) or bare_trial(TrialKind.STATIC, 1.0)
-        compliance = np.diag(self.fmu.flexibility(self._state(at_rest, conditions)))
-        in_motion = first_trial(campaign, is_dynamic=True)
-        if in_motion is not None:
-            state = self._state(in_motion, conditions)
-            system = self.fmu.system(self.fmu.excitation(in_motion, state, self.ports))
+        """Return the stiffness of each port, by the linear system if the FMU has one.
+
+        Otherwise the static stiffness stands for both.
+        """
+        static_trial = first_trial(campaign, is_dynamic=False) or bare_trial(TrialKind.STATIC, 1.0)
+        compliance = np.diag(self.fmu.flexibility(self._state(static_trial, conditions)))
+        dynamic_trial = first_trial(campaign, is_dynamic=True)
+        if dynamic_trial is not None:
+            state = self._state(dynamic_trial, conditions)
+            system = self.fmu.system(self.fmu.excitation(dynamic_trial, state, self.ports))
             if system is not None:
                 return self._stiffnesses_of_system(system)
         return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]
@@ -184,13 +195,13 @@ class FmuModel(DescribedModel):
         frequency = self.description.scales.angular_frequency
         if frequency:
             return frequency
-        in_motion = first_trial(campaign, is_dynamic=True)
-        if in_motion is not None:
-            state = self._state(in_motion, conditions)
-            return self.fmu.pace(in_motion, state).angular_frequency or 1.0
+        dynamic_trial = first_trial(campaign, is_dynamic=True)
+        if dynamic_trial is not None:
+            state = self._state(dynamic_trial, conditions)
+            return self.fmu.pace(dynamic_trial, state).angular_frequency or 1.0
         if campaign.trials:
             return 1.0
-        # without a campaign, until the interval suits the mode
+        # without a campaign: adapt the sampling interval to the frequency, in three rounds
         interval = 0.01
         for _ in range(3):
             trial = bare_trial(TrialKind.RINGDOWN, interval)
@@ -213,8 +224,8 @@ class FmuModel(DescribedModel):
     ) -> Response:
         """Return the response of a trial.
 
-        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not
-        zero.
+        The acting force is (1 + gain) times the recorded one, plus the tare at samples whose
+        recorded force is not zero.
         """
         columns = self._output_columns(outputs)
         if trial.is_dynamic:
@@ -254,21 +265,22 @@ class FmuModel(DescribedModel):
         trial : Trial
             The trial.
         conditions, patch : Conditions, ModelPatch
-            What the motion depends on besides.
+            Parameters, health and initial state, and the primitives that act.
         columns : OutputColumns
             The outputs.
         parts : int
-            Samples are so many times as dense as those of the trial.
+            Factor on the number of samples of the trial.
         """
         laws = self._laws(patch)
         times = subdivide(conditions.stamps(trial.time), parts)
-        first = float(trial.time[0])
-        length = float(trial.time[-1]) - first
-        # an FMU begins at zero, and cannot be followed for hours to where a clock of the day begins
-        begins_near_zero = 0.0 <= first <= LATEST * length
+        first_stamp = float(trial.time[0])
+        record_length = float(trial.time[-1]) - first_stamp
+        # An FMU begins at time zero. If the stamps count from elsewhere (a time of day), they are
+        # shifted, since the FMU would have to be simulated from there.
+        begins_near_zero = 0.0 <= first_stamp <= LATEST * record_length
         if trial.kind is not TrialKind.RINGDOWN and not begins_near_zero:
-            trial = replace(trial, time=trial.time - first)
-            times = times - first
+            trial = replace(trial, time=trial.time - first_stamp)
+            times = times - first_stamp
         excitation = self._excitation(trial, conditions, patch, laws)
         readout = Readout(columns.columns, columns.derivatives, times)
         return self.fmu.motion(excitation, trial, laws, readout, conditions.refinement)
@@ -309,12 +321,13 @@ class FmuModel(DescribedModel):
     # ------------------------------------------------------------ ports
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in the state at the prior means.
+        """Return the linear system from missing forces to outputs, in the prior mean's coordinates.
 
         Raises
         ------
         ModelError
-            If the FMU is not linear, or its answers to forces at the ports do not tell its system.
+            If the FMU is not linear, or no system can be identified from its responses to forces at
+            the ports.
         """
         at_mean = self._system_at(trial, self.prior_mean())
         system = self._system_at(trial, parameters)
@@ -368,7 +381,7 @@ class FmuModel(DescribedModel):
         return port_laws(patch.of(PortForce), self.ports)
 
     def _load_change(self, patch: ModelPatch) -> LoadChange:
-        """Return the change of loads by what the FMU does not carry itself."""
+        """Return the change of loads by those primitives that the FMU does not simulate itself."""
         effects = self.description.effects
         return LoadChange.of_patch(item for item in patch if item.kind not in effects)
 
@@ -386,7 +399,11 @@ class FmuModel(DescribedModel):
         return excitation._replace(force=RecordedHistory(trial.time, force, trial.hold))
 
     def _levers(self, trial: Trial, patch: ModelPatch) -> dict[str, float]:
-        """Return the inputs that a force at a place of a patch pushes, each with its lever."""
+        """Return the factor of the recorded force on each input of the FMU.
+
+        It is one for the force input of the load place. If a patch moves the load, its bending
+        moment and torque get the distances [m].
+        """
         inputs = self.description.inputs
         change = self._load_change(patch)
         if change.along_chord and inputs.torque is None:
@@ -406,7 +423,7 @@ class FmuModel(DescribedModel):
     def _state(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH, row: int = 0
     ) -> OperatingPoint:
-        """Return parameters and constant inputs of a row of a trial, with effects of a patch.
+        """Return the parameters and constant inputs of the FMU in a row of a trial.
 
         Parameters
         ----------
@@ -415,7 +432,7 @@ class FmuModel(DescribedModel):
         conditions : Conditions
             Parameters and health.
         patch : ModelPatch
-            Primitives, of which the FMU may carry some itself.
+            Primitives; those that the FMU simulates itself become parameters.
         row : int
             Row of a trial at rest; a dynamic trial is in the state of its first sample.
         """

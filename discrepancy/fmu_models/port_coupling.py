@@ -1,8 +1,9 @@
-"""Laws at the ports of an FMU that is stepped: in a step each port moves as a mass would.
+"""Laws at the ports of an FMU that is stepped: within a step a port is treated as a free mass.
 
-The force of the laws is held over each step of the FMU. In it a port moves as a mass under what
-else accelerates it: what its speed answers to a force is measured beforehand, and the laws act on
-that mass as they do on any structure. Second order in the step.
+The force of the laws is held constant over each step of the FMU. To find it, the step is first
+integrated for a mass at each port, with the laws and with the acceleration that the port has by all
+other forces. The mass is measured beforehand: it is the step times a unit force, divided by the
+change of speed that the force makes. The coupling is of second order in the step.
 """
 
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ class PortCoupling:
     ports : sequence of str
         Names of their ports.
     speed_gain : (P, P) ndarray
-        Speed of each port after a step under a unit force at each input.
+        Change of speed of each port in a step under a unit force at each input.
     step : float
         Step of the FMU [s].
     memory : ndarray, optional
@@ -50,7 +51,7 @@ class PortCoupling:
             dict(zip(ports, np.eye(count), strict=True)),
             actions=dict(zip(ports, speed_gain.T / step, strict=True)),
         )
-        # one step, whose forces are filled in each time
+        # arrays of a single step, whose forces `speed_loss` fills in each time
         self._step = step
         boundaries = Boundaries(np.array([0.0, step]), np.arange(2), np.array([step]))
         no_displacement = np.zeros((2, len(laws)))
@@ -66,7 +67,7 @@ class PortCoupling:
                 self._steps.transition,
             )
         )
-        # state and results of the step
+        # arrays of state and results, which each step overwrites
         self._has_memory = memory is not None
         memory = laws.unloaded_memory() if memory is None else memory
         self._state = ModalState(np.zeros(count), np.zeros(count), memory)

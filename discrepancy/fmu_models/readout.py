@@ -11,7 +11,7 @@ from discrepancy.campaign.records import FloatArray
 
 
 class OutputColumns(NamedTuple):
-    """Columns of outputs of the FMU, and how many times each is differentiated."""
+    """Columns of outputs of the FMU, and how many times each is differentiated in time."""
 
     columns: list[int]
     derivatives: list[int]
@@ -46,7 +46,7 @@ class Readout:
 def sample(
     values: FloatArray, step: float, readout: Readout, still_to_derive: Sequence[int]
 ) -> SampledOutputs:
-    """Return values and rates at the times of a readout, from values on an even grid.
+    """Return values and rates of outputs at given times, by splines through an even time grid.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def sample(
     step : float
         Step of the grid [s].
     readout : Readout
-        Outputs and times; before zero the first value holds.
+        Outputs and times. Before time zero the first value holds, at zero rate.
     still_to_derive : sequence of int
         For each column, how many times the values are still to be differentiated.
     """
@@ -66,7 +66,8 @@ def sample(
     rates = curve(inside, 1)
     for column, order in enumerate(still_to_derive):
         if order > 0:
-            # derivatives of the derivative's own spline keep the order of the first one
+            # A second derivative of a spline is inaccurate. A new spline through the first
+            # derivatives is as accurate as the first one.
             derivative = CubicSpline(grid, curve(grid, 1)[:, column])
             sampled[:, column] = derivative(inside, order - 1)
             rates[:, column] = derivative(inside, order)

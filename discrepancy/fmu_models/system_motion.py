@@ -20,7 +20,7 @@ from fmu_asset.client.state_space import FmuStateSpace
 MOST_SYSTEMS = 64
 """Number of systems that are kept."""
 ROUNDING = 1e-9
-"""Share of the displacement at rest below which what a force moves at once is rounding."""
+"""An instantaneous displacement below this fraction of the static one is a rounding error."""
 NO_INDICES: IntArray = np.zeros(0, dtype=np.int64)
 
 
@@ -35,7 +35,7 @@ class LawPorts:
     force_numbers : (J,) ndarray of int
         Force of the system at each law's port.
     rest_positions : (J,) ndarray
-        Position of each law's port without forces.
+        Position of each law's port at a state of zero and without forces.
     """
 
     columns: IntArray
@@ -64,8 +64,8 @@ def system_motion(
 ) -> SystemMotion:
     """Return the motion of a system at the samples of an excitation, with laws at ports.
 
-    Position and speed of a law's port are coordinates beside the state, from which they follow: so
-    laws act on this system as on any other.
+    The position and speed of each law's port are added to the state as further coordinates,
+    although they follow from it: laws can then act on this system as on any modal system.
 
     Parameters
     ----------
@@ -97,23 +97,23 @@ def system_motion(
         SMOOTH_PARTS if excitation.is_smooth else 1,
         excitation.edges,
     )
-    begin, end = equivalent_ramps(
+    begin_force, end_force = equivalent_ramps(
         lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time
     )
     direct_displacement = excitation.loads_at(boundaries.time, system.feedthrough[ports.columns].T)
-    steps = loaded_steps(modal, boundaries, begin, end, direct_displacement)
-    # ports follow from the state at the begin
+    steps = loaded_steps(modal, boundaries, begin_force, end_force, direct_displacement)
+    # position and speed of the ports at the begin, from the state
     port_rows = system.output_matrix[ports.columns[coupled.first_laws]]
     rest_positions = ports.rest_positions[coupled.first_laws]
     positions = port_rows @ start + rest_positions
     speeds = port_rows @ system.state_matrix @ start
-    first = InitialMotion(
+    initial_motion = InitialMotion(
         q=np.concatenate((positions, 0.0 * start)),
         v=np.concatenate((speeds, start)),
         memory=memory,
     )
-    motion = integrate_motion(modal, laws, steps, first, compiled_kernel())
-    # what acts on the system, laws too
+    motion = integrate_motion(modal, laws, steps, initial_motion, compiled_kernel())
+    # all forces on the system: the excitation minus those of the laws
     forces = excitation.loads_at(excitation.sample_times, np.eye(system.input_matrix.shape[1]))
     np.subtract.at(forces.T, ports.force_numbers, motion.port_forces.T)
     return SystemMotion(motion.v[:, len(positions) :], forces)
@@ -125,7 +125,7 @@ class SystemWithPorts(NamedTuple):
     Attributes
     ----------
     directions : (P + n, E) ndarray
-        What unit forces give to ports and state.
+        Rates of the ports' speeds and of the state under unit forces.
     modal : ModalSystem
         Ports and state; a state is the speed of a coordinate.
     first_laws : (P,) ndarray of int
@@ -155,24 +155,25 @@ def _with_ports(
     columns, force_numbers : tuple of int
         Displacement output and force of each law's port.
     """
-    ports, first_laws = np.unique(names, return_index=True)
-    count = len(first_laws)
-    order = len(system.state_matrix)
-    column = np.array(columns, dtype=np.int64)[first_laws]
-    number = np.array(force_numbers, dtype=np.int64)[first_laws]
+    port_names, first_laws = np.unique(names, return_index=True)
+    port_count = len(first_laws)
+    state_count = len(system.state_matrix)
+    port_columns = np.array(columns, dtype=np.int64)[first_laws]
+    port_forces = np.array(force_numbers, dtype=np.int64)[first_laws]
     # rates of ports and state
-    port_rates = system.output_matrix[column] @ system.state_matrix
+    port_rates = system.output_matrix[port_columns] @ system.state_matrix
     directions = np.vstack((port_rates @ system.input_matrix, system.input_matrix))
-    damping = np.zeros((count + order, count + order))
-    damping[:, count:] = -np.vstack((port_rates @ system.state_matrix, system.state_matrix))
-    # displacement that comes at once with the force
-    at_once = system.feedthrough[column, number]
-    at_rest = system.gain[column, number]
+    damping = np.zeros((port_count + state_count, port_count + state_count))
+    damping[:, port_count:] = -np.vstack((port_rates @ system.state_matrix, system.state_matrix))
+    # Feedthrough: a displacement that appears at once with the force is a residual flexibility of
+    # the port; below rounding it is none.
+    direct_compliance = system.feedthrough[port_columns, port_forces]
+    static_compliance = system.gain[port_columns, port_forces]
     modal = ModalSystem(
-        np.zeros(count + order),
+        np.zeros(port_count + state_count),
         damping,
-        dict(zip(ports, np.eye(count, count + order), strict=True)),
-        np.where(at_once > ROUNDING * at_rest, at_once, 0.0),
-        actions=dict(zip(ports, directions.T[number], strict=True)),
+        dict(zip(port_names, np.eye(port_count, port_count + state_count), strict=True)),
+        np.where(direct_compliance > ROUNDING * static_compliance, direct_compliance, 0.0),
+        actions=dict(zip(port_names, directions.T[port_forces], strict=True)),
     )
     return SystemWithPorts(directions, modal, first_laws)

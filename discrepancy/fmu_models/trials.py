@@ -1,4 +1,4 @@
-"""Trials and patches as an FMU takes them."""
+"""Translation of trials and patches into parameters of an FMU."""
 
 from collections.abc import Collection, Mapping
 
@@ -67,7 +67,13 @@ def bare_trial(kind: TrialKind, interval: float) -> Trial:
 
 
 def release_amounts(fmu: FmuSimulator, trial: Trial, conditions: Conditions) -> dict[str, float]:
-    """Return what releases an FMU, with displacement [m] and velocity [m/s]."""
+    """Return the variables that release an FMU, each with its displacement [m] or velocity [m/s].
+
+    Raises
+    ------
+    ModelError
+        If the FMU has no such variable, or none for the velocity of a release in motion.
+    """
     release = require_release(trial)
     variables = fmu.release_variables
     if not variables:

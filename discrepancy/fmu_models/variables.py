@@ -103,7 +103,10 @@ class FmuVariables:
         return self._parameter_keys.get(name, name)
 
     def _bound_inputs(self) -> dict[str, InputBinding]:
-        """Return the inputs that trials set, by the FMU's names; note factors of `[[input]]`."""
+        """Return the inputs that trials set, by the FMU's names.
+
+        `input_factors` gets the factor from the SI value to the FMU's unit of each `[[input]]`.
+        """
         description = self._description
         inputs = description.inputs
         units: dict[str | None, str] = dict.fromkeys(inputs.force.values(), "N")
@@ -175,7 +178,7 @@ class FmuVariables:
         return observed
 
     def _expanded_outputs(self, section: FmuOutputSection) -> list[ObservedVariable]:
-        """Return the outputs of a section, which may be several; note their quantity."""
+        """Return the outputs of a section, one or several, and store the quantity of each."""
         names = expand(section.name)
         variables = expand(section.variable)
         if len(names) != len(variables):
@@ -192,7 +195,7 @@ class FmuVariables:
         return outputs
 
     def _unit_of_quantity(self, quantity: Quantity, variable: str) -> str:
-        """Return the SI unit of a quantity as FMUs write it, of a signal the variable's own."""
+        """Return the SI unit of a quantity in FMU notation; a signal has its variable's unit."""
         if quantity is Quantity.SIGNAL:
             return self._unit_of_variable(variable)
         return UNITS[quantity].si.replace(" ", ".")

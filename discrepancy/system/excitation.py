@@ -34,14 +34,14 @@ class Load(NamedTuple):
 
 
 class LoadLevels(NamedTuple):
-    """Loads of a trial at rest.
+    """The loads of a static trial.
 
     Attributes
     ----------
     directions : (k, N) ndarray
-        Each load for a value of one.
+        The load on all unknowns for a value of one of each of k loads.
     values : (L, k) ndarray
-        Their values in each row of the trial.
+        The values of these loads in each row of the trial.
     """
 
     directions: FloatArray
@@ -80,7 +80,7 @@ class Excitation:
     prescribed_motions : mapping of str to RecordedHistory
         Prescribed motions by the names of their inputs, in the order of `LinearSystem.drives`.
     begins : Start
-        How a trial begins that is not a release.
+        How the motion begins, unless it is a release.
     initial : (L,) or (R, 2) ndarray
         The unknown state at the first stamp: displacements of the modes, their speeds, then the
         states. Of a release as in `Conditions.initial`; rows beyond the modes are ignored.
@@ -118,7 +118,9 @@ class Excitation:
         return LoadLevels(np.array(directions), np.column_stack(values))
 
     def loads_at(self, time: FloatArray, basis: FloatArray) -> FloatArray:
-        """Return the sum of all loads at times in a basis; at a jump, that of just before it.
+        """Return the sum of all loads at given times, projected on a basis.
+
+        If a load jumps at a time, its value just before the jump is taken.
 
         Parameters
         ----------
@@ -130,11 +132,12 @@ class Excitation:
         Returns
         -------
         (T, B) array
+            The loads times the basis [N, or modal force].
         """
         count = len(self.loads)
         directions = np.array([load.direction for load in self.loads])
         values = np.array([load.values_at(time) for load in self.loads])
-        # shaped also where there are no loads
+        # without loads the arrays are empty, but still need two axes
         directions = directions.reshape(count, len(basis))
         values = values.reshape(count, len(time))
         return values.T @ (directions @ basis)

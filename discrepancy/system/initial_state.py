@@ -13,14 +13,15 @@ from fe.runtime.motion import InitialMotion
 from fe.runtime.port_laws import PortLaws
 
 LEAST_PARTICIPATION = 0.03
-"""A mode that moves the release point by less than this share of what the most moving mode does is
-scaled as if it moved the point by that share."""
+"""Least participation of a mode at the release point, relative to the largest of all modes. A mode
+below it is treated as if it had this participation, since its amplitude is divided by it."""
 LEAST_SPEED = 1e-2
-"""Share of a drive's largest speed below which its spline cannot tell its first speed from rest."""
+"""A drive begins at rest if its first speed is below this fraction of its largest speed: the slope
+of the spline at its end is not more accurate."""
 
 
 class ReleasedState(NamedTuple):
-    """State at a release, and the force (n,) that holds a structure at rest until then."""
+    """State at a release, and the force (n,) that holds the structure until then, if one does."""
 
     begin: InitialMotion
     holding_force: FloatArray | None
@@ -36,48 +37,55 @@ def state_at_first_stamp(
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     laws : Laws
         Internal forces.
 
     Raises
     ------
     ModelError
-        If the record begins at rest where the system has no rest.
+        If the record begins at rest but the system has no equilibrium.
     """
     mode_count = len(system.angular_frequency)
-    count = system.displacement_modes
-    first = excitation.time[:1]
+    displacement_mode_count = system.displacement_modes
+    first_stamp = excitation.time[:1]
     motions = list(excitation.prescribed_motions.values())
-    drive_positions = np.array([float(motion.values_at(first)[0]) for motion in motions])
-    drive_speeds = np.array([float(motion.values_at(first, 1)[0]) for motion in motions])
+    drive_positions = np.array([float(motion.values_at(first_stamp)[0]) for motion in motions])
+    drive_speeds = np.array([float(motion.values_at(first_stamp, 1)[0]) for motion in motions])
     q = np.zeros(mode_count + len(motions))
     v = np.zeros(mode_count + len(motions))
     memory = None
     if excitation.begins is Start.UNKNOWN:
-        # displacement and speed of each mode, and the states
-        initial = np.zeros(mode_count + count)
+        # in this order: displacements of the modes, their speeds, states (the other speeds)
+        initial = np.zeros(mode_count + displacement_mode_count)
         initial[: len(excitation.initial)] = excitation.initial[: len(initial)]
-        q[:count] = initial[:count]
-        v[:mode_count] = initial[count:]
+        q[:displacement_mode_count] = initial[:displacement_mode_count]
+        v[:mode_count] = initial[displacement_mode_count:]
     else:
         largest_speeds = [
             np.max(np.abs(motion.values_at(excitation.time, 1))) for motion in motions
         ]
-        # dry friction is zero at rest
+        # an exact zero, since dry friction acts at any other speed
         drive_speeds[np.abs(drive_speeds) < LEAST_SPEED * np.array(largest_speeds)] = 0.0
     if excitation.begins is Start.SETTLED:
-        load = excitation.loads_at(first, np.eye(system.size))
+        load = excitation.loads_at(first_stamp, np.eye(system.size))
         if load.any() or drive_positions.any():
-            offset = system.drive_shapes @ drive_positions
-            rest = system.static_path(
-                load - system.stiffness @ offset, laws, offset=offset, time=float(first[0])
+            drive_displacement = system.drive_shapes @ drive_positions
+            equilibrium = system.static_path(
+                load - system.stiffness @ drive_displacement,
+                laws,
+                offset=drive_displacement,
+                time=float(first_stamp[0]),
             )
-            memory = rest.memory
-            amplitudes = system.shapes.T @ (system.mass @ (rest.values[0] - offset))
-            q[:count] = amplitudes[:count]
-            v[count:mode_count] = amplitudes[count:]
+            memory = equilibrium.memory
+            # mass-normalised modal amplitudes; those of states are speeds
+            amplitudes = system.shapes.T @ (
+                system.mass @ (equilibrium.values[0] - drive_displacement)
+            )
+            q[:displacement_mode_count] = amplitudes[:displacement_mode_count]
+            v[displacement_mode_count:mode_count] = amplitudes[displacement_mode_count:]
     if motions:
+        # coordinates of drives are mass-normalised like those of modes
         q[mode_count:] = system.root_drive_mass * drive_positions
         v[mode_count:] = system.root_drive_mass * drive_speeds
     return InitialMotion(q, v, memory)
@@ -93,9 +101,9 @@ def released_state(
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     point : ReleasePoint
-        How and where the system is let go.
+        The point from which the system is released, and how.
     laws : Laws
         Internal forces.
 
@@ -105,25 +113,27 @@ def released_state(
         If no mode moves the release point.
     """
     point_shape = np.asarray(point.row @ system.shapes)
-    largest = float(np.max(np.abs(point_shape)))
-    if largest == 0.0:
+    largest_participation = float(np.max(np.abs(point_shape)))
+    if largest_participation == 0.0:
         raise ModelError("The release point of a ring-down does not move in any mode of the model.")
-    # modal amplitudes of the release displacement; no mode that hardly moves the point gets a huge
-    # one
-    least = LEAST_PARTICIPATION * largest
-    moves = np.abs(point_shape) >= least
-    participation = np.where(moves, point_shape, np.where(point_shape < 0.0, -least, least))
+    # `unit_amplitudes`: of each mode, the amplitude that alone moves the point by the release
+    # displacement. A mode that hardly moves the point would need a huge one, hence the least.
+    least_participation = LEAST_PARTICIPATION * largest_participation
+    moves = np.abs(point_shape) >= least_participation
+    participation = np.where(
+        moves, point_shape, np.where(point_shape < 0.0, -least_participation, least_participation)
+    )
     unit_amplitudes = point.release.displacement / participation
-    initial = np.zeros((len(system.angular_frequency), 2))
-    initial[: len(excitation.initial)] = excitation.initial[: len(initial)]
-    displacements, velocities = initial.T
-    load = excitation.loads_at(excitation.time[:1], np.eye(system.size))
+    initial_by_mode = np.zeros((len(system.angular_frequency), 2))
+    initial_by_mode[: len(excitation.initial)] = excitation.initial[: len(initial_by_mode)]
+    relative_displacements, relative_velocities = initial_by_mode.T
+    first_load = excitation.loads_at(excitation.time[:1], np.eye(system.size))
     if point.release.at_rest:
-        return _held_state(system, point, laws, displacements, unit_amplitudes, load)
+        return _held_state(system, point, laws, relative_displacements, unit_amplitudes, first_load)
     frequency = system.angular_frequency
-    under_load = (load @ system.shapes)[0] / frequency**2 if load.any() else 0.0
-    q = displacements * unit_amplitudes + under_load
-    return ReleasedState(InitialMotion(q, velocities * unit_amplitudes * frequency), None)
+    under_load = (first_load @ system.shapes)[0] / frequency**2 if first_load.any() else 0.0
+    q = relative_displacements * unit_amplitudes + under_load
+    return ReleasedState(InitialMotion(q, relative_velocities * unit_amplitudes * frequency), None)
 
 
 def _held_state(
@@ -134,7 +144,10 @@ def _held_state(
     unit_amplitudes: FloatArray,
     load: FloatArray,
 ) -> ReleasedState:
-    """Return the state of a structure that a force at the release point holds at rest.
+    """Return the state of a structure that is held at rest by a force at its release point.
+
+    The force moves the release point by the release displacement, counted from its position under
+    the other loads.
 
     Parameters
     ----------
@@ -149,21 +162,23 @@ def _held_state(
         What else acts [N].
     """
     row = point.row
-    answer = system.flexibility(row)
-    compliance = float(row @ answer)
+    unit_force_displacement = system.flexibility(row)
+    compliance = float(row @ unit_force_displacement)
     deviation = displacements * unit_amplitudes
     deviation[0] = 0.0
-    holding = point.release.displacement * (1.0 + displacements[0]) / compliance
-    memory = system.static_path(holding * row + load, laws, fixed_row=row, time=0.0).memory
-    acting = holding * row + load[0]
+    holding_force = point.release.displacement * (1.0 + displacements[0]) / compliance
+    memory = system.static_path(holding_force * row + load, laws, fixed_row=row, time=0.0).memory
+    total_force = holding_force * row + load[0]
     if memory is not None:
-        # the holding force carries the laws too
-        rows = system.rows_of_laws(laws, 0.0)
-        holding += float(rows @ answer @ memory[:, LAGGED_FORCE]) / compliance
-        acting = holding * row + load[0] - memory[:, LAGGED_FORCE] @ rows
+        # Laws move the point back: the holding force grows by what compensates that.
+        law_rows = system.rows_of_laws(laws, 0.0)
+        holding_force += (
+            float(law_rows @ unit_force_displacement @ memory[:, LAGGED_FORCE]) / compliance
+        )
+        total_force = holding_force * row + load[0] - memory[:, LAGGED_FORCE] @ law_rows
         if system.is_truncated:
             # the part of the port's position that fades after the release
-            memory[:, FADING_POSITION] = holding * (rows @ system.residual(row))
+            memory[:, FADING_POSITION] = holding_force * (law_rows @ system.residual(row))
     frequency = system.angular_frequency
-    q = acting @ system.shapes / frequency**2 + deviation
-    return ReleasedState(InitialMotion(q, np.zeros(len(frequency)), memory), holding * row)
+    q = total_force @ system.shapes / frequency**2 + deviation
+    return ReleasedState(InitialMotion(q, np.zeros(len(frequency)), memory), holding_force * row)

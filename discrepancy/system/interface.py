@@ -1,4 +1,4 @@
-"""What the workflow asks of a model: its response under a patch, before any sensor acts on it."""
+"""The interface of models: the response to a trial under a patch, before sensors act on it."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ class Model(ABC):
     parameters : tuple of ParameterPrior
         Calibrated parameters: the posterior of a calibration is the prior here.
     quantities : mapping of str to Quantity
-        What each output is, by name.
+        The physical quantity of each output, by name.
     ports : tuple of str
         Names of the ports where internal forces can act on one motion; user effects act at these.
     length : float or None
@@ -47,19 +47,19 @@ class Model(ABC):
     regions : tuple of str
         Damage regions.
     kinds : frozenset of TrialKind
-        Kinds of trials that it can follow.
+        Kinds of trials that it can simulate.
     load_places : tuple of str, optional
         Names of the places where forces can act; None: anywhere along the structure.
     largest_force : float
-        Force that it takes there with ease [N].
+        Largest force at these places that is well within the model's range [N].
     holds_inputs : bool
         Whether static trials can hold other inputs than a force.
     follows_windows : bool
         Whether it can follow laws that act in windows only.
     linear : bool
-        Whether the laws that it has at ports are left out.
+        Whether the internal forces that the model has itself (`own_laws`) are left out.
     shows_ports : bool
-        Whether it can say how its ports move (`ported` and `port_motion`).
+        Whether the motion of its ports can be computed (`ported` and `port_motion`).
     """
 
     name: str
@@ -127,7 +127,7 @@ class Model(ABC):
         """
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
-        """Return natural sizes (L,) of the state at the begin of a trial; empty if it is known."""
+        """Return typical magnitudes (L,) of an unknown initial state; empty if it is known."""
         return np.zeros(0)
 
     def port_motion(
@@ -140,18 +140,18 @@ class Model(ABC):
         trial : Trial
             A dynamic trial.
         conditions : Conditions
-            What the motion depends on besides.
+            Parameters, initial state, clock and health.
         parts : int
             Samples are this many times as dense as those of the trial.
         """
         raise NotImplementedError
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces; outputs are checked."""
+        """Return the linear system from missing forces at ports to outputs, which are checked."""
         raise NotImplementedError
 
     def at_ports(self, forces: ModelPatch) -> ModelPatch:
-        """Return forces as they act at the ports of `ported`."""
+        """Return the internal forces of a patch, expressed at the ports of `ported`."""
         return forces
 
     def port_units(self, port: str) -> tuple[str, str]:
@@ -245,10 +245,10 @@ class Model(ABC):
             If a loss that is not zero is of a region that the model does not have.
         """
         losses = np.zeros((len(health), len(self.regions)))
-        for name, column in zip(trial.regions, health.T, strict=False):
+        for name, region_losses in zip(trial.regions, health.T, strict=False):
             if name in self.regions:
-                losses[:, self.regions.index(name)] = column
-            elif np.any(column):
+                losses[:, self.regions.index(name)] = region_losses
+            elif np.any(region_losses):
                 raise ModelError(
                     f"The trial {trial.name!r} gives a loss of the damage region {name!r}, but "
                     f"{self.what} has {comma_list(self.regions)}."
@@ -265,12 +265,21 @@ class Model(ABC):
         return self._unpatched_parameters
 
     def stated(self, campaign: Campaign) -> list[tuple[float, float]]:
-        """Return mean and standard deviation of each parameter, of the campaign or the model."""
-        of_campaign = campaign.parameters
-        return [of_campaign.get(item.name, (item.mean, item.deviation)) for item in self.parameters]
+        """Return mean and standard deviation of each parameter.
+
+        They are those of the campaign; the model's, if the campaign does not state them.
+        """
+        campaign_parameters = campaign.parameters
+        return [
+            campaign_parameters.get(parameter.name, (parameter.mean, parameter.deviation))
+            for parameter in self.parameters
+        ]
 
     def prior_mean(self, campaign: Campaign | None = None) -> FloatArray:
-        """Return the means (P,) of the declared parameters: of the campaign, else of the model."""
+        """Return the means (P,) of the declared parameters.
+
+        The campaign's mean is taken if it states one, else the model's.
+        """
         means = [parameter.mean for parameter in self.declared]
         if campaign is not None:
             for index, parameter in enumerate(self.declared):
@@ -304,7 +313,7 @@ class Model(ABC):
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         patch : ModelPatch
-            Primitives beside those of the model.
+            Primitives that act in addition to those of the model.
         conditions : Conditions
             Parameters, initial state, clock and health.
 
@@ -340,7 +349,7 @@ class Model(ABC):
             return self._respond(trial, outputs, whole_patch, conditions)
 
     def ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces; see `PortedSystem`.
+        """Return the linear system from missing forces at ports to outputs; see `PortedSystem`.
 
         Parameters
         ----------
@@ -354,7 +363,7 @@ class Model(ABC):
         Raises
         ------
         ModelError
-            If sensors are built in: what they make of a missing force is not known here.
+            If the model has sensors built in, whose effect on a missing force is not modelled.
         """
         self.check_outputs(outputs)
         if len(self.sensors):
@@ -384,7 +393,7 @@ class Model(ABC):
             Its sensors name channels of a campaign, or outputs of the model; they come before those
             of a response's patch.
         calibrated : mapping of str to (float, float)
-            Means and standard deviations of parameters, where they are not those of the model.
+            Means and standard deviations of those parameters that differ from the model's.
         """
         parameters = []
         for parameter in self.parameters:

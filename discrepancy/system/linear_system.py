@@ -1,4 +1,4 @@
-"""A linear system with ports, M z'' + C z' + K z = loads: its modes and its rest.
+"""A linear system with ports, M z'' + C z' + K z = loads: its modes and its equilibrium.
 
 Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u' + H u + d(t): a
 state is the speed of a coordinate that has no stiffness, x = s', so that both are one equation in z
@@ -25,11 +25,11 @@ from fe.runtime.motion import static_solution
 from fe.runtime.port_laws import NO_LAWS, PortLaws
 
 HEAVY = 1e12
-"""Mass of a prescribed coordinate over the largest mass of the system."""
+"""Mass of a prescribed coordinate, relative to the largest entry of the mass matrix."""
 LEAST_PIVOT = 1e-9
-"""A system whose equilibrium is determined worse than this has none."""
+"""Relative singular value below which nothing restores a motion (`rcond` of the least squares)."""
 ROUNDING = 1e-10
-"""Share of the largest entry below which the coupling of modes is rounding."""
+"""Entries below this fraction of the largest one are rounding errors."""
 
 
 class Modes(NamedTuple):
@@ -74,12 +74,12 @@ class SolvedStructure(Protocol):
 
 
 class StaticPath(NamedTuple):
-    """Rest under load levels that follow one another.
+    """Equilibrium at successive load levels.
 
     Attributes
     ----------
     values : (L, N) or (L, C) ndarray
-        Displacements and states, or what rows show of them, at each level.
+        Displacements and states at each level, or rows times these.
     memory : ndarray, optional
         Memory of the laws at the last level; None without laws.
     """
@@ -165,7 +165,7 @@ class LinearSystem:
 
     @cached_property
     def modes(self) -> Modes:
-        """Modes of what no drive prescribes."""
+        """Modes of the motions that no drive prescribes."""
         if self.solved is not None:
             frequency = 2.0 * np.pi * self.solved.modes.frequency
             return Modes(frequency, np.ascontiguousarray(self.solved.mode_shapes), len(frequency))
@@ -185,12 +185,12 @@ class LinearSystem:
         n = self.displacement_count
         mass = self.mass[:n, :n]
         stiffness = 0.5 * (self.stiffness[:n, :n] + self.stiffness[:n, :n].T)
-        # motions that the drives leave free
-        free = np.eye(n)
+        # an orthonormal basis of the motions that leave all drives at zero
+        undriven_motions = np.eye(n)
         if len(self.drives):
-            free = null_space(self.drives[:, :n])
-            mass = free.T @ mass @ free
-            stiffness = free.T @ stiffness @ free
+            undriven_motions = null_space(self.drives[:, :n])
+            mass = undriven_motions.T @ mass @ undriven_motions
+            stiffness = undriven_motions.T @ stiffness @ undriven_motions
         # eigenvalue problem
         squares = np.zeros(0)
         shapes = np.zeros((0, 0))
@@ -202,7 +202,7 @@ class LinearSystem:
                 squares, shapes = eigh(stiffness, mass, subset_by_index=subset)
             except np.linalg.LinAlgError as cause:
                 raise ModelError(f"The mass matrix must be positive definite ({cause}).") from cause
-        # rigid motions, or none
+        # rigid motions have an eigenvalue of zero, allowed if no spring need hold the system
         if self.mode_count is None:
             is_rounding = np.abs(squares) <= ROUNDING * np.max(np.abs(squares), initial=0.0)
             squares = np.where(is_rounding, 0.0, squares)
@@ -211,7 +211,7 @@ class LinearSystem:
                 f"The stiffness must be positive definite, but an eigenvalue is {squares[0]:g} "
                 "1/s^2."
             )
-        return squares, free @ shapes
+        return squares, undriven_motions @ shapes
 
     @property
     def angular_frequency(self) -> FloatArray:
@@ -254,10 +254,10 @@ class LinearSystem:
         shapes = self.all_shapes
         damping = shapes.T @ self.damping @ shapes
         stiffness = shapes.T @ self.stiffness @ shapes
-        # nothing moves a drive
+        # the motion of a drive is prescribed: no damping or stiffness acts on it
         damping[mode_count:] = 0.0
         stiffness[mode_count:] = 0.0
-        # a diagonal where the modes are coupled by rounding only
+        # an exact diagonal if only rounding errors couple the modes
         diagonal = np.diag(np.diag(damping))
         if not drive_count and not _differs(damping, diagonal):
             damping = diagonal
@@ -273,18 +273,23 @@ class LinearSystem:
         )
 
     def _port_residuals(self) -> FloatArray | None:
-        """Return the flexibility (P,) of the ports in modes without inertia, if there are any."""
+        """Return the compliance (P,) of ports in modes without inertia, if there are such modes."""
         if not self.is_truncated or not self.ports:
             return None
         rows = np.array(list(self.ports.values()))
-        residual = np.einsum("pn,np->p", rows, self.residual(rows.T))
-        whole = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
+        residual_compliance = np.einsum("pn,np->p", rows, self.residual(rows.T))
+        compliance = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
         is_flexible = [name not in self.on_modes for name in self.ports]
-        is_above_rounding = residual > 1e-9 * whole
-        return np.where(is_above_rounding & is_flexible, residual, 0.0)
+        is_above_rounding = residual_compliance > 1e-9 * compliance
+        return np.where(is_above_rounding & is_flexible, residual_compliance, 0.0)
 
     def modal_forces(self, excitation: Excitation, time: FloatArray) -> FloatArray:
-        """Return modal forces (T, M + P) at times [s]; those of drives accelerate the drives."""
+        """Return the forces (T, M + P) on modes and drives at times (T,) [s].
+
+        Drives accelerate the modes by inertia: with u = modes + shapes of drives times a(t), the
+        mass times these shapes and the accelerations goes to the right-hand side. The force on a
+        drive is the one that gives it the prescribed acceleration.
+        """
         forces = excitation.loads_at(time, self.all_shapes)
         if excitation.prescribed_motions:
             motions = excitation.prescribed_motions.values()
@@ -299,7 +304,7 @@ class LinearSystem:
         """Return the rows (J, N) of the laws' ports; see `Laws.rows`."""
         return laws.port_rows(self.ports, self.size, time)
 
-    # ------------------------------------------------------------ rest
+    # ------------------------------------------------------------ equilibrium
 
     @cached_property
     def _inverse_cholesky(self) -> FloatArray:
@@ -325,12 +330,16 @@ class LinearSystem:
         return np.asarray(inverse.T @ (inverse @ loads))
 
     def residual(self, loads: FloatArray) -> FloatArray:
-        """Return the part of K^-1 loads, for loads (N,) or (N, k), in the modes without inertia."""
+        """Return the displacements of the modes without inertia under loads (N,) or (N, k).
+
+        They are the residual flexibility times the loads: K^-1 loads minus the static displacements
+        of the M modes with inertia, shapes / omega^2 (shapes^T loads).
+        """
         in_modes = (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
         return self.flexibility(loads) - in_modes
 
     def rest_under(self, loads: FloatArray) -> FloatArray:
-        """Return displacements and states (L, N) at rest under loads (L, N).
+        """Return displacements and states (L, N) in equilibrium under constant loads (L, N).
 
         Raises
         ------
@@ -339,24 +348,25 @@ class LinearSystem:
         """
         if self.mode_count is not None:
             return self.flexibility(loads.T).T
-        # least squares, since rigid motions need not be held where no load is
+        # In equilibrium displacements q and states v are constant, so K q + D v = modal loads.
+        # Least squares: rigid motions may be unrestored, if no load acts along them.
         mode_count = len(self.angular_frequency)
-        count = self.displacement_modes
+        displacement_mode_count = self.displacement_modes
         modal_loads = loads @ self.shapes
         restoring = np.hstack(
             (
-                self.modal.full_stiffness[:mode_count, :count],
-                self.modal.damping[:mode_count, count:mode_count],
+                self.modal.full_stiffness[:mode_count, :displacement_mode_count],
+                self.modal.damping[:mode_count, displacement_mode_count:mode_count],
             )
         )
         amplitudes = np.linalg.lstsq(restoring, modal_loads.T, rcond=LEAST_PIVOT)[0]
         unbalanced = np.max(np.abs(restoring @ amplitudes - modal_loads.T), initial=0.0)
         if unbalanced > 1e-6 * np.max(np.abs(modal_loads), initial=1e-300):
-            largest = np.max(np.abs(restoring), initial=0.0)
+            largest_coefficient = np.max(np.abs(restoring), initial=0.0)
             raise ModelError(
                 "the rig has no rest under what acts at the first sample (nothing holds it): "
                 'say `begins` = "still" or "unknown" '
-                f"(its largest restoring coefficient is {largest:.3g})"
+                f"(its largest restoring coefficient is {largest_coefficient:.3g})"
             )
         return np.asarray(amplitudes.T @ self.shapes.T)
 
@@ -373,27 +383,29 @@ class LinearSystem:
         output_rows: FloatArray | None = None,
         time: float | None = None,
     ) -> StaticPath:
-        """Return the rest under load levels that follow one another from zero.
+        """Return the equilibrium at successive load levels, on a path that begins without load.
+
+        The path matters to laws with memory, such as dry friction.
 
         Parameters
         ----------
         directions : (k, N) array
-            Loads of a value of one.
-        laws : Laws
-            Internal forces; ports of states are at no position.
+            The load on all unknowns for a value of one of each of k loads.
+        laws : PortLaws
+            Internal forces; a port of a state counts as undisplaced.
         levels : (L, k) array, optional
             The value of each load at each level; by default each load is a level of its own.
         memory, previous_level : arrays, optional
-            Memory of the laws, and the values (k,) from which the first level is reached; by
-            default the laws were never loaded.
+            Memory of the laws at the end of an earlier path, and the values (k,) of the loads
+            there; by default the laws were never loaded.
         offset : (N,) array, optional
-            Displacements at which drives hold the system.
+            Displacements that drives prescribe, which are added to those under the loads.
         fixed_row : (N,) array, optional
-            Row of a point that laws do not move.
+            Row of a point that is held, so that the forces of laws do not move it.
         output_rows : (C, N) array, optional
             Rows whose values are returned instead of displacements and states.
         time : float, optional
-            Time [s] at which laws in windows act, or do not.
+            Time [s] that decides which of the laws with time windows act.
 
         Returns
         -------
@@ -404,22 +416,23 @@ class LinearSystem:
         ModelError
             If nothing holds the system.
         SolutionError
-            If a law takes more than the system has.
+            If the equations of the laws have no solution.
         """
-        rows = self.rows_of_laws(laws, time)
-        rows[:, self.displacement_count :] = 0.0
+        law_rows = self.rows_of_laws(laws, time)
+        law_rows[:, self.displacement_count :] = 0.0
         if levels is None:
             levels = np.eye(len(directions))
-        # answers to unit loads and to unit forces of the laws
+        # displacements under unit loads, and under unit forces of the laws
         displacements = self.rest_under(directions) + offset
-        flexibility = self.rest_under(rows)
+        flexibility = self.rest_under(law_rows)
         if fixed_row is not None:
-            at_point = self.rest_under(fixed_row[None])
-            flexibility = flexibility - np.outer(flexibility @ fixed_row, at_point) / float(
-                at_point[0] @ fixed_row
-            )
-        port_displacements = displacements @ rows.T
-        port_compliance = rows @ flexibility.T
+            # subtract the displacements under the reaction that holds the point
+            point_force_displacement = self.rest_under(fixed_row[None])
+            flexibility = flexibility - np.outer(
+                flexibility @ fixed_row, point_force_displacement
+            ) / float(point_force_displacement[0] @ fixed_row)
+        port_displacements = displacements @ law_rows.T
+        port_compliance = law_rows @ flexibility.T
         if output_rows is not None:
             displacements = displacements @ output_rows.T
             flexibility = flexibility @ output_rows.T

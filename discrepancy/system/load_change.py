@@ -1,4 +1,4 @@
-"""What a patch changes of recorded loads, and the words of a trial for where loads act."""
+"""Changes of recorded loads by a patch, and the load place and release that a trial names."""
 
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -21,8 +21,8 @@ class LoadChange(NamedTuple):
     Attributes
     ----------
     gain, tare : float
-        The acting force is (1 + gain) times the recorded one, plus the tare [N] where it is not
-        zero.
+        The acting force is (1 + gain) times the recorded one, plus the tare [N] at samples whose
+        recorded force is not zero.
     along_span, along_chord : float
         How far the acting force is moved [m].
     """
@@ -34,7 +34,7 @@ class LoadChange(NamedTuple):
 
     @classmethod
     def of_patch(cls, patch: Iterable[Primitive]) -> "LoadChange":
-        """Return the change by all gains and places of a patch, one applied after the other."""
+        """Return the change of loads by all gains and places of a patch, applied in their order."""
         change = cls()
         for primitive in patch:
             if isinstance(primitive, LoadGain):
@@ -55,9 +55,9 @@ class LoadChange(NamedTuple):
         Parameters
         ----------
         values : (N,) array
-            The recorded values, with a constant that they may lack.
+            The recorded values, plus a constant offset of the recorder if one is fitted.
         recorded : (N,) array
-            The recorded values themselves; where they are zero there is no tare.
+            The recorded values themselves; a sample that is zero gets no tare.
         """
         return np.asarray((1.0 + self.gain) * values + self.tare * (recorded != 0.0))
 
@@ -65,14 +65,14 @@ class LoadChange(NamedTuple):
 def choose_load_place(
     places: Sequence[str], place: Place, model_name: str, where: str = "a trial"
 ) -> str:
-    """Return the load place of a model that a trial means: the only one where the trial names none.
+    """Return the load place of a trial; if the trial names none, the only one of the model.
 
     Parameters
     ----------
     places : sequence of str
         The load places of the model.
     place : str or (float, float)
-        What the trial names.
+        The load place that the trial names.
     model_name, where : str
         Model and trial as they are called in a sentence.
 

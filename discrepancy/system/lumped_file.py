@@ -42,14 +42,15 @@ SYMMETRIC = ("mass", "stiffness", "damping", "capacity")
 
 
 class Block(NamedTuple):
-    """Where a matrix stands in the equation of all unknowns z.
+    """The position of a matrix in the equation of motion of all unknowns z.
 
     Attributes
     ----------
     derivative : int
         The time derivative of z that the matrix multiplies.
     rows_of_states, columns_of_states : bool
-        Whether its rows and its columns are of states, which are the speeds of their coordinates.
+        Whether its rows, and its columns, belong to states; otherwise to displacements. A state
+        is the speed of its coordinate in z.
     """
 
     derivative: int
@@ -85,7 +86,7 @@ class LumpedDescription(ModelDescription):
     """Content of a lumped model's file, SI; vectors have n + m entries, displacements first.
 
     `mass` and `stiffness` are matrices (n, n), vectors of a diagonal, or for n = 1 numbers; left
-    out where there are states only. `capacity` T and `conductance` R (m, m) are those of the states
+    out if there are only states. `capacity` T and `conductance` R (m, m) are those of the states
     x, and `coupling` holds F, G, H: M u'' + C u' + K u = F x + ..., T x' + R x = G u' + H u + ...
     With `free` the stiffness may be singular. `characteristic_length` [m] is by default the largest
     station, or 1.
@@ -145,14 +146,14 @@ class LumpedDescription(ModelDescription):
         return self.displacement_count + self.state_count + len(integrals)
 
     def padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
-        """Return a row of the file with zeros for the integrals of controllers after it."""
-        padded = np.zeros(self.unknown_count)
-        padded[: len(row)] = row
-        return padded
+        """Return a vector of the file, extended by zeros for the integrals of controllers."""
+        padded_row = np.zeros(self.unknown_count)
+        padded_row[: len(row)] = row
+        return padded_row
 
     @cached_property
     def is_plain(self) -> bool:
-        """Whether it is a structure on springs under one force at a time."""
+        """Whether it is a plain structure on springs, without states, drives or controllers."""
         if not self.input or self.free:
             return False
         if self.state_count or self.load or self.damping_part or self.controller:
@@ -164,7 +165,7 @@ class LumpedDescription(ModelDescription):
         return not (prescribes_motion or acts_through_matrix or acts_elsewhere or shows_more)
 
     def matrices_of(self, kind: str) -> dict[str, Rows]:
-        """Return the matrix of a kind, if there is one, and its parts, by name."""
+        """Return the base matrix of a kind, if there is one, and its parts, by their names."""
         base = getattr(self if kind in KINDS else self.coupling, kind)
         if isinstance(base, Damping):
             base = base.matrix
@@ -173,38 +174,48 @@ class LumpedDescription(ModelDescription):
         return matrices | {part.name: part.matrix for part in parts}
 
     def scaled_matrices(self, factors: Mapping[str, float]) -> dict[str, FloatArray]:
-        """Return all matrices (N, N) by kind, with their parts, and the parts by name.
+        """Return the matrices of the equation of motion at given factors, padded to all unknowns.
 
-        Damping by modes is left out.
+        Damping that is given by modal ratios has no matrix and is left out.
 
         Parameters
         ----------
         factors : mapping of str to float
-            Factors by kind and by name of a part; the factor of a kind scales its parts too.
+            The factor of each kind of matrix ("stiffness", "mass", ...) and of each named part; a
+            name that is missing has the factor one.
+
+        Returns
+        -------
+        dict of str to (N, N) array
+            Under the name of a kind: the whole matrix, that is the factor of the kind times the sum
+            of its base matrix and its parts. Under the name of a part: that part times its own
+            factor alone.
         """
         matrices: dict[str, FloatArray] = {}
-        n = self.displacement_count
-        displacements = slice(n)
-        states = slice(n, n + self.state_count)
+        displacement_count = self.displacement_count
+        displacement_rows = slice(displacement_count)
+        state_rows = slice(displacement_count, displacement_count + self.state_count)
         for kind, block in BLOCKS.items():
-            rows = states if block.rows_of_states else displacements
-            columns = states if block.columns_of_states else displacements
-            whole = np.zeros((self.unknown_count, self.unknown_count))
+            rows = state_rows if block.rows_of_states else displacement_rows
+            columns = state_rows if block.columns_of_states else displacement_rows
+            sum_of_parts = np.zeros((self.unknown_count, self.unknown_count))
             for name, matrix in self.matrices_of(kind).items():
-                part = np.zeros_like(whole)
-                part[rows, columns] = matrix
-                part *= 1.0 if name == kind else factors.get(name, 1.0)
-                matrices[name] = part
-                whole += part
-            # a coupling stands on the other side of the equation
+                padded_matrix = np.zeros_like(sum_of_parts)
+                padded_matrix[rows, columns] = matrix
+                padded_matrix *= 1.0 if name == kind else factors.get(name, 1.0)
+                matrices[name] = padded_matrix
+                sum_of_parts += padded_matrix
+            # Couplings stand on the right: M a + D v + K x = coupling states + forces. All matrices
+            # are returned for the left-hand side, so that couplings change their sign. This
+            # assignment also replaces the base matrix, which was stored under the same name.
             sign = -1.0 if block.is_coupling else 1.0
-            matrices[kind] = sign * factors.get(kind, 1.0) * whole
+            matrices[kind] = sign * factors.get(kind, 1.0) * sum_of_parts
         return matrices
 
     # ------------------------------------------------------------ faults of a file
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what does not fit together."""
+        """Yield the contradictions of the file."""
         yield from self._missing_matrices()
         yield from self._wrong_names()
         yield from self._vanishing_matrices()
@@ -226,18 +237,21 @@ class LumpedDescription(ModelDescription):
             )
 
     def _missing_matrices(self) -> Iterator[Fault]:
-        """Yield the matrices that are needed and not there."""
-        n = self.displacement_count
-        m = self.state_count
-        yield not n + m, "mass is missing (or capacity, of states of first order)"
-        lacks_stiffness = n and not self.free and not self.matrices_of("stiffness")
+        """Yield the faults of required matrices that are missing."""
+        displacement_count = self.displacement_count
+        state_count = self.state_count
+        yield (
+            not displacement_count + state_count,
+            "mass is missing (or capacity, of states of first order)",
+        )
+        lacks_stiffness = displacement_count and not self.free and not self.matrices_of("stiffness")
         yield (
             lacks_stiffness,
             "stiffness is missing: give it, or [[stiffness_part]], or say `free = true`",
         )
-        lacks_conductance = m and not self.matrices_of("conductance")
+        lacks_conductance = state_count and not self.matrices_of("conductance")
         yield lacks_conductance, "conductance is missing: give it, or [[conductance_part]]"
-        yield n and not (self.damping or self.free), "'damping' is missing"
+        yield displacement_count and not (self.damping or self.free), "'damping' is missing"
 
     def _wrong_matrices(self, kind: str) -> Iterator[Fault]:
         """Yield the matrices of a kind with a wrong size, symmetry or definiteness."""

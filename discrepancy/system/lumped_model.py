@@ -30,7 +30,7 @@ from fe.runtime.state import Losses
 from reporting.words import comma_list
 
 MOST_MODES = 8
-"""Modes with inertia of a structure on springs; the others follow without inertia."""
+"""Number of modes with inertia of a structure on springs; higher ones deform without inertia."""
 
 
 class LumpedModel(DescribedModel, SystemModel):
@@ -132,24 +132,29 @@ class LumpedModel(DescribedModel, SystemModel):
     def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
         """Return the loads and the prescribed motions in a trial.
 
-        A motion that an input can prescribe and that the trial does not record is zero if an output
-        is its reaction; else it is free.
+        An input may prescribe a motion that the trial does not record. That motion is held at zero
+        if an output measures its reaction force; otherwise it is free.
         """
         trial = case.trial
         rig = self.rig(case.state)
         description = self.description
-        still = RecordedHistory(trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0)
-        motions = {item.reaction: still for item in description.output if item.reaction is not None}
+        zero_motion = RecordedHistory(
+            trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0
+        )
+        motions = {
+            item.reaction: zero_motion for item in description.output if item.reaction is not None
+        }
         # constant loads and references of controllers
-        always = RecordedHistory(trial.time, np.ones(len(trial.time)))
-        constant = [
-            Load(rig.load_direction(item, item.vector), always) for item in description.load
+        constant_history = RecordedHistory(trial.time, np.ones(len(trial.time)))
+        constant_loads = [
+            Load(rig.load_direction(item, item.vector), constant_history)
+            for item in description.load
         ]
         inputs = self._offset_inputs(case)
-        loads = constant + rig.loads_of_references(trial, inputs)
+        loads = constant_loads + rig.loads_of_references(trial, inputs)
         # recorded loads and motions
         references = {loop.section.reference for loop in rig.loops.values()}
-        change = LoadChange.of_patch(case.patch)
+        load_change = LoadChange.of_patch(case.patch)
         for name, offset_input in inputs.items():
             if name in references:
                 continue
@@ -157,8 +162,8 @@ class LumpedModel(DescribedModel, SystemModel):
             if section.quantity.moving:
                 motions[name] = _prescribed_motion(trial, offset_input, rig.factor(name))
             else:
-                direction = self._input_direction(rig, section, change)
-                loads.append(Load(direction, _load_history(trial, offset_input, change)))
+                direction = self._input_direction(rig, section, load_change)
+                loads.append(Load(direction, _load_history(trial, offset_input, load_change)))
         # forces by a formula in time
         for primitive in case.patch:
             if isinstance(primitive, PortLoad):
@@ -243,7 +248,7 @@ class LumpedModel(DescribedModel, SystemModel):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return what each output shows under an excitation; None: at rest."""
+        """Return the equation of each output under an excitation; None for a static trial."""
         equations = []
         for name, quantity in outputs:
             section = self._outputs[name]
@@ -259,7 +264,7 @@ class LumpedModel(DescribedModel, SystemModel):
     def _vector_equation(
         self, section: OutputSection, vector: Sequence[float], quantity: Quantity
     ) -> OutputEquation:
-        """Return what an output shows that is a sum of unknowns, as the quantity that is wanted."""
+        """Return the equation of an output vector . unknowns, differentiated as is wanted."""
         derivatives = 0
         if quantity is not section.quantity:
             derivatives = quantity.derivatives_of(section.quantity)
@@ -276,45 +281,52 @@ class LumpedModel(DescribedModel, SystemModel):
     def _controller_equation(
         self, controller: str, case: PatchedTrial, excitation: Excitation | None
     ) -> OutputEquation:
-        """Return what an output shows that is what a controller puts out."""
+        """Return the equation of an output that is the output of a controller."""
         loop = self.rig(case.state).loops[controller]
-        along = loop.direction / float(loop.direction @ loop.direction)
+        # gives the factor x of a load x direction (pseudo-inverse of a vector)
+        inverse_direction = loop.direction / float(loop.direction @ loop.direction)
         references: list[Load] = []
         if excitation is not None:
             references = loop.reference_loads(case.trial, self._offset_inputs(case))
-        feedthrough = [Feedthrough(float(load.direction @ along), load) for load in references]
+        feedthrough = [
+            Feedthrough(float(load.direction @ inverse_direction), load) for load in references
+        ]
         return OutputEquation(loop.output_rows, feedthrough=feedthrough)
 
     def _reaction_equation(
         self, section: OutputSection, case: PatchedTrial, excitation: Excitation | None
     ) -> OutputEquation:
-        """Return what an output shows that is the force by which a motion is prescribed."""
-        drives = [] if excitation is None else list(excitation.prescribed_motions)
-        if excitation is None or section.reaction not in drives:
+        """Return the equation of an output that is the force by which a motion is prescribed.
+
+        By the equation of motion along the drive it is K u + C u' + M u'' minus the loads, plus the
+        forces of laws there.
+        """
+        drive_names = [] if excitation is None else list(excitation.prescribed_motions)
+        if excitation is None or section.reaction not in drive_names:
             raise ModelError(
                 f"The output {section.name!r} of {self.name!r} is the reaction of "
                 f"{section.reaction!r}, whose motion this trial does not prescribe."
             )
-        system = self.system(case.state._replace(drives=tuple(drives)))
-        along = system.drive_shapes[:, drives.index(section.reaction)]
+        system = self.system(case.state._replace(drives=tuple(drive_names)))
+        drive_shape = system.drive_shapes[:, drive_names.index(section.reaction)]
         rows = [
-            along @ system.stiffness,
-            along @ system.damping,
-            along @ system.mass,
-            0.0 * along,
+            drive_shape @ system.stiffness,
+            drive_shape @ system.damping,
+            drive_shape @ system.mass,
+            0.0 * drive_shape,
         ]
         feedthrough = [
-            Feedthrough(-float(load.direction @ along), load) for load in excitation.loads
+            Feedthrough(-float(load.direction @ drive_shape), load) for load in excitation.loads
         ]
-        return OutputEquation(np.array(rows), feedthrough=feedthrough, law_direction=along)
+        return OutputEquation(np.array(rows), feedthrough=feedthrough, law_direction=drive_shape)
 
     # ------------------------------------------------------------ units of ports
 
     def port_units(self, port: str) -> tuple[str, str]:
-        """Return the units of a force at a port and of what it acts on.
+        """Return the units of the force and of the motion at a port, `EITHER` if not known.
 
-        The port moves or turns as the unknowns of which it is a sum or difference do, and these as
-        what is measured or prescribed of them.
+        A port that is a sum or difference of unknowns has their unit (length or angle), and an
+        unknown has the unit of an output or an input that measures or prescribes it alone.
         """
         row = self.port_rows.get(port)
         if row is None:
@@ -341,7 +353,10 @@ class LumpedModel(DescribedModel, SystemModel):
         return f"{unit}/s times capacity", unit
 
     def _units_by_unknown(self) -> dict[int, set[tuple[str, str]]]:
-        """Return units of force and motion by unknown, of those measured or prescribed alone."""
+        """Return the units of force and motion of unknowns that are measured or prescribed alone.
+
+        More than one pair of units for an unknown means that the file contradicts itself.
+        """
         units: dict[int, set[tuple[str, str]]] = {}
         sections: list[InputSection | OutputSection] = [*self.description.output]
         sections += self.description.input
@@ -374,7 +389,13 @@ class LumpedModel(DescribedModel, SystemModel):
         return lru_cache(self.cache_size)(build)
 
     def build_system(self, state: SystemState) -> LinearSystem:
-        """Return the system in a state, with its prescribed motions and controllers."""
+        """Return the linear system in a state, with its prescribed motions and controllers.
+
+        A controller adds to the matrices K, D and M (of z, z', z''): its output on the right-hand
+        side goes to the left with a minus. The integral s of its error, s' = reference - measured,
+        is a further state, the speed of its unknown in z; hence it has a one in M, and the measured
+        quantity goes to the left with a plus.
+        """
         description = self.description
         rig = self.rig(state)
         count = description.unknown_count
@@ -428,7 +449,7 @@ def _prescribed_motion(trial: Trial, offset_input: OffsetInput, factor: float) -
 
 
 def _load_history(trial: Trial, offset_input: OffsetInput, change: LoadChange) -> RecordedHistory:
-    """Return the course of an input that loads, a force with gain and tare of a patch."""
+    """Return a recorded load over time; to a force, the gain and tare of a patch are applied."""
     recorded = offset_input.recorded
     values = offset_input.values
     if recorded.quantity in (Quantity.FORCE, Quantity.TORQUE):

@@ -15,16 +15,16 @@ from fe.runtime.patch import ModelPatch
 from reporting.toml_file import Fault, Name, NotNegative, Number
 
 GAINS = ("proportional", "derivative", "integral")
-"""Gains of a controller; NAME.proportional is what a parameter scales."""
+"""Gains of a controller; a parameter scales one under the name CONTROLLER.proportional etc."""
 
 
 def as_list(value: object) -> list[object] | tuple[object, ...]:
-    """Return one number as a list: with one unknown nobody needs brackets."""
+    """Return a single number as a list, since a system with one unknown may omit the brackets."""
     return value if isinstance(value, list | tuple) else [value]
 
 
 def _as_rows(value: object) -> object:
-    """Return a matrix by rows, also from its only row or from one number."""
+    """Return a matrix as a list of rows, given the rows, the only row, or one number."""
     entries = as_list(value)
     if entries and isinstance(entries[0], list | tuple):
         return entries
@@ -32,7 +32,7 @@ def _as_rows(value: object) -> object:
 
 
 def _as_matrix(value: object) -> object:
-    """Return a matrix by rows, also from its diagonal or from one number."""
+    """Return a matrix as a list of rows, given the rows, its diagonal, or one number."""
     entries = as_list(value)
     if entries and isinstance(entries[0], list | tuple):
         return entries
@@ -47,7 +47,7 @@ Vector = Annotated[tuple[Number, ...], Field(min_length=1), BeforeValidator(as_l
 Rows = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_rows)]
 Matrix = Annotated[tuple[tuple[Number, ...], ...], BeforeValidator(_as_matrix)]
 Ratio = Annotated[float, Field(allow_inf_nan=False, ge=0.0, le=3.0)]
-"""Share of critical damping; above one a mode is overdamped, far above a percentage was meant."""
+"""Fraction of critical damping. Above one a mode is overdamped; a value above three is an error."""
 
 
 class Damping(Section):
@@ -84,11 +84,12 @@ class LoadSection(NamedVector):
 
 
 class InputSection(LoadSection):
-    """`[[input]]`: what acts along a vector, and how the vector changes along the structure [1/m].
+    """`[[input]]`: a load or a prescribed motion that a trial records.
 
-    A motion (displacement, velocity, acceleration, of an angle too) is prescribed to vector . u;
-    anything else is a load, vector times its value, or with `through` the part of that name times
-    vector times it.
+    A motion (displacement, velocity or acceleration, linear or angular) is prescribed to vector .
+    u. Any other quantity is a load: its value times the vector, or, with `through`, its value times
+    the matrix of that name times the vector. `station_derivative` is the change of the vector if
+    the load moves along the structure [1/m].
     """
 
     quantity: Quantity = Quantity.FORCE
@@ -96,10 +97,11 @@ class InputSection(LoadSection):
 
 
 class OutputSection(NamedSection):
-    """`[[output]]`: what can be measured; velocity and acceleration come from a displacement.
+    """`[[output]]`: a quantity that channels can measure.
 
-    vector . u + constant, or the force by which a prescribed motion is made (`reaction`, an input's
-    name), or what a controller gives (`controller`, its name).
+    It is vector . u + constant, or the force by which a motion is prescribed (`reaction`, the name
+    of its input), or the output of a controller (`controller`, its name). Velocity and acceleration
+    are derived from a displacement.
     """
 
     vector: Vector | None = None
@@ -133,9 +135,9 @@ class CouplingSection(Section):
 class PortSection(NamedVector):
     """`[[port]]`: where an internal force can act, between structure and ground or within it.
 
-    A port sees vector . u or vector . x, and a law there acts against it along the same vector, or
-    along `acts`: what flows out of one store by its own level and into the next has vector [1, 0],
-    acts [1, -1].
+    The position of a port is vector . u, or its value is vector . x for a port of states. A law at
+    the port acts against it along the same vector, or along `acts` if that is given: a flow out of
+    a first tank, by its own level, into a second has the vector [1, 0] and acts along [1, -1].
     """
 
     acts: Vector | None = None
@@ -163,7 +165,7 @@ class LawSection(Section):
             yield True, f"the law {self.name!r}: {cause}"
 
     def scaled_force(self, factor: float) -> PortForce:
-        """Return the law with its force multiplied by a factor."""
+        """Return the law of this table, with its force multiplied by a factor."""
         row = {"kind": self.kind, "port": self.port, **(self.model_extra or {})}
         (law,) = ModelPatch.from_list([row], f"the law {self.name!r}")
         assert isinstance(law, PortForce)  # the kind is checked
@@ -194,19 +196,19 @@ class ControllerSection(NamedSection):
 
 
 class PlaceSection(NamedVector):
-    """`[[place]]`: where a mass can sit; the stations [m] of places make a line."""
+    """`[[place]]`: a place along the structure, by its station [m], where a mass can be added."""
 
     station: Number
 
 
 class RootSection(Section):
-    """`[root]`: motion of the unknowns when the whole turns rigidly about the root [m/rad]."""
+    """`[root]`: motion of the unknowns if the structure rotates rigidly about its root [m/rad]."""
 
     lever: Vector
 
 
 class ScaledParameter(ParameterSection):
-    """`[[parameter]]`: a factor of the terms named."""
+    """`[[parameter]]`: a calibrated factor that scales the terms that it names."""
 
     terms: Annotated[tuple[Name, ...], BeforeValidator(as_list)]
     mean: Number = 1.0

@@ -1,4 +1,4 @@
-"""What the TOML files of models share: how they are read, their tables and kinds of numbers."""
+"""Common parts of the TOML files of models: how they are read, and their tables."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -45,7 +45,7 @@ class ParameterSection(NamedSection):
 
 
 class ModelDescription(Section):
-    """What every model file has: version of the format, name for people, parameters and ports."""
+    """The keys of every model file: version of the format, name, parameters and ports."""
 
     what: ClassVar[str]
     """The model with its article, for sentences."""
@@ -73,7 +73,7 @@ class ModelDescription(Section):
 
     @staticmethod
     def repeated(kind: str, names: list[str]) -> Iterator[Fault]:
-        """Yield the faults of names that are there twice."""
+        """Yield a fault for each name that occurs twice."""
         for name in names:
             yield names.count(name) > 1, f"there are two of {kind} {name!r}"
 

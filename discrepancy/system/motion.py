@@ -1,8 +1,8 @@
 """Motion of a linear system with internal forces at its ports.
 
 A model makes a `LinearSystem` of its parameters and the structural part of a patch, keeps it, and
-asks for a `Motion`, which says what outputs show. Between the stamps the linear part is exact
-(`fe.runtime.motion`).
+asks for a `Motion`, from which the outputs are computed. Between the time stamps the linear part of
+the motion is exact (`fe.runtime.motion`).
 """
 
 from collections.abc import Sequence
@@ -26,9 +26,11 @@ from fe.runtime.port_laws import PortLaws
 from fe.runtime.time_steps import Boundaries, loaded_steps, step_boundaries
 
 LEAST_LEAD = 1e-9
-"""Share of an interval by which a first sample is later than the begin and still is at it."""
+"""A first sample counts as taken at the begin of the motion if it is later by no more than this
+fraction of the mean sampling interval."""
 FADING_LAGS = 40.0
-"""Relaxation times after which the end of a holding force has faded in modes without inertia."""
+"""Number of relaxation times after which a released deflection of the modes without inertia is zero
+to machine precision."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ class Motion:
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     laws : Laws
         J internal forces.
     time : (N,) ndarray
@@ -50,9 +52,10 @@ class Motion:
     port_forces : (N, J) ndarray
         Internal forces.
     lagged_forces : (N, J) ndarray
-        Internal forces as the modes without inertia follow them.
+        Internal forces after the first-order lag (time constant `system.relaxation`) with which the
+        modes without inertia follow them.
     held_samples : int
-        Number of first samples that lie before the release, where the shape is held.
+        Number of samples before the release, at which the structure is held in its shape.
     holding_force : (n,) ndarray, optional
         Force that holds the release point until the release [N].
     """
@@ -85,38 +88,43 @@ class Motion:
         return acceleration
 
     def at_rows(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the positions and the speeds (N, P) of rows (P, n) of the unknowns.
+        """Return the displacements and speeds (N, P) of row . u at all samples, for rows (P, n).
 
-        The position of a row of a state is the state's integral, its speed is the state.
+        A state (such as a temperature) is a speed in this system: the speed that is returned for
+        it is the state, and the position is its integral over time.
         """
         shapes = (rows @ self.system.all_shapes).T
         without_inertia = self._without_inertia(rows) if self.system.is_truncated else 0.0
         return self.q @ shapes + without_inertia, self.velocity @ shapes
 
     def _without_inertia(self, rows: FloatArray) -> FloatArray:
-        """Return what modes without inertia add to row . u, as (N, C) for rows (C, n).
+        """Return the displacements row . u in the modes without inertia, as (N, C) for rows (C, n).
 
-        They follow applied forces without delay, and internal forces and the end of a holding force
-        with the delay of their damping.
+        These high modes deform without inertia: applied forces deform them at once, internal forces
+        and the end of a holding force with the first-order lag of their damping.
         """
         system = self.system
-        residual = system.residual(rows.T)
+        residual_flexibility = system.residual(rows.T)
         displacement = np.zeros((len(self.time), len(rows)))
         if self.excitation.loads:
-            displacement += self.excitation.loads_at(self.time, residual)
+            displacement += self.excitation.loads_at(self.time, residual_flexibility)
         if len(self.laws):
-            displacement -= self.lagged_forces @ (system.rows_of_laws(self.laws) @ residual)
+            displacement -= self.lagged_forces @ (
+                system.rows_of_laws(self.laws) @ residual_flexibility
+            )
         if self.holding_force is not None and system.relaxation > 0.0:
-            last = FADING_LAGS * system.relaxation
-            count = int(np.searchsorted(self.time, last, side="right"))
-            fading = np.exp(-np.maximum(self.time[:count], 0.0) / system.relaxation)
-            displacement[:count] += np.outer(fading, self.holding_force @ residual)
+            fading_end = FADING_LAGS * system.relaxation
+            fading_count = int(np.searchsorted(self.time, fading_end, side="right"))
+            decay = np.exp(-np.maximum(self.time[:fading_count], 0.0) / system.relaxation)
+            displacement[:fading_count] += np.outer(
+                decay, self.holding_force @ residual_flexibility
+            )
         return displacement
 
     def response(self, equations: Sequence[OutputEquation]) -> Response:
-        """Return what outputs show, and the rates of it.
+        """Return the values and rates of outputs at all samples, given their C equations.
 
-        Modes without inertia are only in outputs that are not differentiated.
+        Modes without inertia contribute only to outputs that are not differentiated.
         """
         values, rates = self._of_derivatives(equations)
         if self.system.is_truncated:
@@ -134,45 +142,55 @@ class Motion:
         return Response(values, rates)
 
     def _of_derivatives(self, equations: Sequence[OutputEquation]) -> tuple[FloatArray, FloatArray]:
-        """Return what outputs show of the coordinates and their derivatives, and its rates."""
-        rows = rows_in_coordinates(equations, self.system.all_shapes)
-        is_asked = [bool(np.any(of_derivative)) for of_derivative in rows]
+        """Return the part of outputs that depends on the modal coordinates and their derivatives.
+
+        Returns
+        -------
+        values, rates : (N, C) arrays
+            That part of each output, and its time derivative. The derivative of the third
+            derivative of the coordinates is left out of the rates.
+        """
+        rows_by_derivative = rows_in_coordinates(equations, self.system.all_shapes)
+        is_needed = [bool(np.any(derivative_rows)) for derivative_rows in rows_by_derivative]
         derivatives = [self.q, self.velocity]
-        if any(is_asked[1:]):
+        if any(is_needed[1:]):
             derivatives.append(self.acceleration)
-        if any(is_asked[2:]):
+        if any(is_needed[2:]):
             derivatives.append(np.gradient(self.acceleration, self.time, axis=0))
         values = np.zeros((len(self.time), len(equations)))
         rates = np.zeros((len(self.time), len(equations)))
-        for order, of_derivative in enumerate(rows):
-            if not is_asked[order]:
+        for order, derivative_rows in enumerate(rows_by_derivative):
+            if not is_needed[order]:
                 continue
-            values += derivatives[order] @ of_derivative.T
+            values += derivatives[order] @ derivative_rows.T
             if order < 3:
-                rates += derivatives[order + 1] @ of_derivative.T
+                rates += derivatives[order + 1] @ derivative_rows.T
         return values, rates
 
 
 def motion_of(
     system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int = 1
 ) -> Motion:
-    """Return the motion of a trial, also of one whose clock makes the samples begin late.
+    """Return the motion of a system at the samples of a dynamic trial.
+
+    The samples may begin later than the motion, if the trial's clock is shifted.
 
     Parameters
     ----------
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
-    laws : Laws
+        Its loads, prescribed motions and release.
+    laws : PortLaws
         Internal forces.
     refinement : int
-        Steps are this many times smaller.
+        Time steps are this many times smaller than usual.
 
     Raises
     ------
     ModelError
-        If the motion begins at rest where there is no rest, or the release point cannot be moved.
+        If the motion has to begin at rest but the system has no equilibrium, or if no mode moves
+        the release point.
     """
     laws = replace(laws, drift_start=float(excitation.time[0]))
     if excitation.release is None:
@@ -185,14 +203,14 @@ def _motion_from_record(
 ) -> Motion:
     """Return the motion from the first stamp of a record that is no ring-down."""
     times = excitation.sample_times
-    first = float(excitation.time[0])
+    first_stamp = float(excitation.time[0])
     begin = state_at_first_stamp(system, excitation, laws)
-    motion = _advance(system, excitation, laws, first, times, begin, refinement)
-    starts_at_sample = excitation.begins is not Start.UNKNOWN and times[0] <= first
+    motion = _advance(system, excitation, laws, first_stamp, times, begin, refinement)
+    starts_at_sample = excitation.begins is not Start.UNKNOWN and times[0] <= first_stamp
     if starts_at_sample and len(laws) and len(system.drives):
-        # Laws of speed at ports that only drives move are zero where the drives begin at rest: the
-        # kernel's
-        # force would hold the drive as if it were a mass, and no reading shows that force.
+        # A speed-dependent law at a port that only drives move has no force at the begin if the
+        # drives begin at rest. The kernel instead computes the force that would hold the drive's
+        # coordinate like a free mass, which no reading contains.
         rows = laws.port_rows(system.modal.ports, len(begin.v))
         is_driven = ~np.any(rows[:, : len(system.angular_frequency)], axis=1)
         is_still = rows @ begin.v == 0.0
@@ -218,17 +236,18 @@ def _motion_from_release(
 ) -> Motion:
     """Return the motion after a release at time zero.
 
-    Before a release from rest the shape is held. A release that is not from rest is continued
-    backwards without internal forces where its clock asks for times before zero.
+    Before a release from rest, the structure is held in its shape. If the release is not from rest
+    and the clock puts samples before time zero, the motion is continued backwards in time, without
+    internal forces.
 
     Parameters
     ----------
     system : LinearSystem
         The system that moves.
     excitation : Excitation
-        What acts on it.
+        Its loads, prescribed motions and release.
     point : ReleasePoint
-        How and where the system is let go.
+        The point from which the system is released, and how.
     laws : Laws
         Internal forces.
     refinement : int
@@ -237,17 +256,19 @@ def _motion_from_release(
     times = excitation.sample_times
     released = released_state(system, excitation, point, laws)
     begin = released.begin
-    # samples after the release, at least one interval of them
-    held = int(np.searchsorted(times, 0.0)) if point.release.at_rest else 0
-    stamps = times[held:]
-    if held >= len(times) - 1:
+    # The integration needs two times. If at most one sample follows the release, another time is
+    # appended, which `_with_held_samples` cuts off again.
+    held_count = int(np.searchsorted(times, 0.0)) if point.release.at_rest else 0
+    stamps = times[held_count:]
+    if held_count >= len(times) - 1:
         stamps = np.append(stamps, abs(times[-1]) + 1.0)
     if stamps[0] < 0.0:
-        backwards = system.modal.exact_steps(stamps[:1])[0][0]
-        begin = InitialMotion(*np.split(backwards @ np.concatenate((begin.q, begin.v)), 2))
+        # the transition matrix of the linear system over a negative time step
+        transition_back = system.modal.exact_steps(stamps[:1])[0][0]
+        begin = InitialMotion(*np.split(transition_back @ np.concatenate((begin.q, begin.v)), 2))
     motion = _advance(system, excitation, laws, 0.0, stamps, begin, refinement)
-    if held:
-        motion = _with_held_samples(motion, released.begin, held, len(times))
+    if held_count:
+        motion = _with_held_samples(motion, released.begin, held_count, len(times))
     return Motion(
         system,
         excitation,
@@ -257,7 +278,7 @@ def _motion_from_release(
         velocity=motion.v,
         port_forces=motion.port_forces,
         lagged_forces=motion.lagged_forces,
-        held_samples=held,
+        held_samples=held_count,
         holding_force=released.holding_force,
     )
 
@@ -265,7 +286,17 @@ def _motion_from_release(
 def _with_held_samples(
     motion: ModalMotion, begin: InitialMotion, held: int, count: int
 ) -> ModalMotion:
-    """Return a motion of `count` samples, of which the first `held` show the held shape."""
+    """Return a motion of `count` samples, with the held shape in the first `held` of them.
+
+    Parameters
+    ----------
+    motion : ModalMotion
+        The motion at the samples after the release.
+    begin : InitialMotion
+        The state at the release, which is that of the held shape.
+    held, count : int
+        Number of samples before the release, and of all samples.
+    """
     laws = motion.port_forces.shape[1]
     forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
 
@@ -293,33 +324,35 @@ def _advance(
     begin: InitialMotion,
     refinement: int,
 ) -> ModalMotion:
-    """Return the motion at stamps from a state at a time that may lie before them.
+    """Return the motion at time stamps, from the state at a time at or before the first stamp.
 
     Parameters
     ----------
     system, excitation, laws
-        What moves, and what acts on it.
+        The system, its loads and prescribed motions, and the internal forces.
     first : float
         Time of the state `begin` [s].
     stamps : (N,) array
-        Times at which the motion is asked for [s].
-    begin : Begin
+        Times at which the motion is wanted [s].
+    begin : InitialMotion
         The state at `first`.
     refinement : int
-        Steps are this many times smaller.
+        Time steps are this many times smaller than usual.
     """
     tolerance = LEAST_LEAD * (stamps[-1] - stamps[0]) / max(len(stamps) - 1, 1)
     is_late = stamps[0] - first > tolerance
     is_excited = excitation.loads or excitation.prescribed_motions
+    # a free linear motion has a closed form, without steps
     if not is_excited and laws.linear:
         since_begin = stamps - (first if is_late else stamps[0])
-        free = system.modal.free_motion(begin.q, begin.v, since_begin)
-        if free is not None:
-            q, v = free
+        free_motion = system.modal.free_motion(begin.q, begin.v, since_begin)
+        if free_motion is not None:
+            q, v = free_motion
             no_forces = np.zeros((len(stamps), 0))
             return ModalMotion(q, v, no_forces, no_forces, laws.unloaded_memory())
     if not is_late:
         return _advance_in_steps(system, excitation, laws, stamps, begin, refinement)
+    # integrate from the earlier begin, and leave out the begin itself
     from_begin = np.append(first, stamps)
     motion = _advance_in_steps(system, excitation, laws, from_begin, begin, refinement)
     return motion._replace(
@@ -340,11 +373,11 @@ def _advance_in_steps(
 ) -> ModalMotion:
     """Return the motion at stamps (N,) [s] from a state at the first of them, step by step."""
     modal = system.modal
-    is_smooth = excitation.is_smooth or bool(excitation.prescribed_motions)
-    least_parts = SMOOTH_PARTS if is_smooth else 1
+    follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
+    least_parts = SMOOTH_PARTS if follows_curve else 1
     edges = (*laws.switching_times, *excitation.edges)
     boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
-    # what loads add to the ports beyond the modes
+    # displacements of the ports under loads in the modes without inertia
     port_displacements = np.zeros((len(boundaries.time), len(laws)))
     if system.is_truncated and len(laws) and excitation.loads:
         residual = system.residual(system.rows_of_laws(laws).T)
@@ -359,20 +392,32 @@ def _steps(
     boundaries: Boundaries,
     port_displacements: FloatArray,
 ) -> StepArrays:
-    """Return the steps of all coordinates; drives follow their prescribed motions alone.
+    """Return the linear steps of all coordinates between time boundaries.
 
-    `port_displacements` (K + 1, J) is what loads add to the positions of laws' ports beyond the
-    modes.
+    Modal coordinates are integrated under their forces; the coordinate of a drive takes the
+    values of its prescribed motion.
+
+    Parameters
+    ----------
+    system, excitation
+        The system, its loads and prescribed motions, and the internal forces.
+    boundaries : Boundaries
+        The K + 1 boundaries of the steps.
+    port_displacements : (K + 1, J) array
+        Displacements of the laws' ports under the loads, in the modes without inertia [m].
     """
     time = boundaries.time
-    begin, end = equivalent_ramps(lambda times: system.modal_forces(excitation, times), time)
-    steps = loaded_steps(system.modal, boundaries, begin, end, port_displacements)
+    begin_force, end_force = equivalent_ramps(
+        lambda times: system.modal_forces(excitation, times), time
+    )
+    steps = loaded_steps(system.modal, boundaries, begin_force, end_force, port_displacements)
     motions = list(excitation.prescribed_motions.values())
     if not motions:
         return steps
-    # each drive's position and speed, in place of an integrated one
+    # The position and speed of a drive are prescribed: no transition from the previous step, and
+    # an increment that is the value itself, mass-normalised.
     steps = steps._replace(transition=steps.transition.copy())
-    coordinate_count = begin.shape[1]
+    coordinate_count = begin_force.shape[1]
     first_drive = len(system.angular_frequency)
     for coordinate, motion in enumerate(motions, first_drive):
         for order in (0, 1):

@@ -1,4 +1,4 @@
-"""Natural sizes of an unknown initial state."""
+"""Typical magnitudes of an unknown initial state, which make it dimensionless."""
 
 from collections.abc import Sequence
 
@@ -9,52 +9,67 @@ from discrepancy.system.motion import Motion
 from discrepancy.system.output_equation import OutputEquation
 
 SMALLEST_SIZE = 1e-9
-"""Natural size of a state where nothing moves and nothing is read."""
+"""Magnitude [SI] of all states if nothing moves and all readings are zero."""
 
 
 def natural_state(motion: Motion, equations: Sequence[OutputEquation], trial: Trial) -> FloatArray:
-    """Return natural sizes (L,) of the state at the begin of a trial.
+    """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
 
-    They are the largest of the motion from rest, and of the state that would give the readings.
+    The magnitude of an amplitude is the larger of its largest value in the motion from rest, and
+    of the value that could explain the largest reading of a channel.
 
     Parameters
     ----------
     motion : Motion
-        The motion from rest.
+        The motion of the trial if it begins at rest.
     equations : sequence of OutputEquation
-        What the outputs of the trial's channels show.
+        The equation of the output of each channel.
     trial : Trial
         The trial, with its readings.
 
     Returns
     -------
     (L,) array
-        Displacements of the modes, their speeds, then the states.
+        Magnitudes of the displacements of the modes, of their speeds, then of the states.
     """
     system = motion.system
     mode_count = len(system.angular_frequency)
-    count = system.displacement_modes
-    position_sizes = np.max(np.abs(motion.q[:, :mode_count]), axis=0)
-    speed_sizes = np.max(np.abs(motion.velocity[:, :mode_count]), axis=0)
+    displacement_mode_count = system.displacement_modes
+    position_magnitudes = np.max(np.abs(motion.q[:, :mode_count]), axis=0)
+    speed_magnitudes = np.max(np.abs(motion.velocity[:, :mode_count]), axis=0)
     duration = float(trial.time[-1] - trial.time[0])
-    pace = np.maximum(system.angular_frequency[:count], 1.0 / duration)
+    # rigid motions have no frequency: their changes take the whole record
+    angular_frequency = np.maximum(
+        system.angular_frequency[:displacement_mode_count], 1.0 / duration
+    )
     for column, equation in enumerate(equations):
         is_used = trial.used[:, column]
         readings = trial.values[is_used, column] - equation.constant
         if equation.feedthrough is not None or not readings.size:
             continue
-        largest = float(np.max(np.abs(readings)))
+        largest_reading = float(np.max(np.abs(readings)))
         rows = equation.rows @ system.shapes
-        displacement_rows = rows[:, :count]
-        state_rows = rows[:, count:]
+        displacement_rows = rows[:, :displacement_mode_count]
+        state_rows = rows[:, displacement_mode_count:]
         if np.any(displacement_rows):
+            # order of the time derivative that the output reads; at w each order multiplies it by w
             derivative = np.argmax(np.any(rows, axis=1))
-            amplitude = largest / float(np.linalg.norm(displacement_rows)) / pace**derivative
-            position_sizes[:count] = np.maximum(position_sizes[:count], amplitude)
-            speed_sizes[:count] = np.maximum(speed_sizes[:count], amplitude * pace)
+            amplitude = (
+                largest_reading
+                / float(np.linalg.norm(displacement_rows))
+                / angular_frequency**derivative
+            )
+            position_magnitudes[:displacement_mode_count] = np.maximum(
+                position_magnitudes[:displacement_mode_count], amplitude
+            )
+            speed_magnitudes[:displacement_mode_count] = np.maximum(
+                speed_magnitudes[:displacement_mode_count], amplitude * angular_frequency
+            )
         if np.any(state_rows):
-            level = largest / float(np.linalg.norm(state_rows))
-            speed_sizes[count:] = np.maximum(speed_sizes[count:], level)
-    sizes = np.concatenate((position_sizes[:count], speed_sizes))
-    usual = max(float(sizes.max(initial=0.0)), SMALLEST_SIZE)
-    return np.asarray(np.where(sizes > 0.0, sizes, usual))
+            state_magnitude = largest_reading / float(np.linalg.norm(state_rows))
+            speed_magnitudes[displacement_mode_count:] = np.maximum(
+                speed_magnitudes[displacement_mode_count:], state_magnitude
+            )
+    magnitudes = np.concatenate((position_magnitudes[:displacement_mode_count], speed_magnitudes))
+    default_magnitude = max(float(magnitudes.max(initial=0.0)), SMALLEST_SIZE)
+    return np.asarray(np.where(magnitudes > 0.0, magnitudes, default_magnitude))

@@ -1,4 +1,4 @@
-"""What outputs show of a system: its unknowns, their derivatives, and what acts on it."""
+"""Equations of outputs: what they read of the unknowns, their derivatives, and the loads."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from discrepancy.system.excitation import Load
 
 
 class Feedthrough(NamedTuple):
-    """A load that an output shows directly, `factor` times its value."""
+    """A load whose value, times `factor`, is part of an output."""
 
     factor: float
     load: Load
@@ -19,19 +19,21 @@ class Feedthrough(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class OutputEquation:
-    """What an output shows: sum_k rows[k] . d^k z / dt^k + constant + what acts directly.
+    """The equation of an output y = sum_k rows[k] . d^k z / dt^k + constant + direct loads.
 
     Attributes
     ----------
     rows : (4, N) ndarray
-        Rows of z = (u, s) and its first three time derivatives; a state is x = s'.
+        Coefficients of the unknowns z = (u, s), displacements and integrals of states, and of
+        their first three time derivatives; a state is x = s'.
     constant : float
-        Constant [SI].
+        Constant part of the output [SI].
     feedthrough : sequence of Feedthrough, optional
-        Loads in the output. None for all outputs but the force of a prescribed motion or of a
-        controller.
+        Loads that the output contains directly. None unless the output is the force of a
+        prescribed motion or of a controller.
     law_direction : (N,) ndarray, optional
-        For the force of a prescribed motion: the direction along which it balances forces of laws.
+        For the force of a prescribed motion: the direction of that motion, in which the force
+        balances those of laws.
     """
 
     rows: FloatArray

@@ -1,4 +1,4 @@
-"""Scales of a system and its ports by what acts and moves in the trials of a campaign."""
+"""Scales of a structure and its ports, estimated from the loads and motions of the trials."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -11,10 +11,11 @@ from discrepancy.system.motion import Motion
 from discrepancy.system.scales import PortScale
 
 FORCE_PER_RMS = 5.0
-"""Force scale of a port that no stiffness holds, over the rms of the forces there: friction of 1 to
-25 % of what acts is in the middle of its prior, and drag of as much at the largest speed."""
+"""Ratio of the force scale of a port without stiffness to the rms of the forces that act there.
+With this ratio, a friction of 1 to 25 % of the acting force lies in the middle of its prior, and so
+does a drag of that size at the largest speed."""
 BOTH_WAYS = 1e-3
-"""Share of the largest speed of a port that both directions must reach, for a motion that turns."""
+"""A motion reverses if the speed exceeds this fraction of its largest value in both directions."""
 
 
 class GlobalScales(NamedTuple):
@@ -32,14 +33,14 @@ def moving_scales(
     largest_load: float,
     duration: float,
 ) -> GlobalScales:
-    """Return the scales of a system by what acts and moves in the trials.
+    """Return the scales of a whole structure from the loads and motions of the trials.
 
     Parameters
     ----------
     system : LinearSystem
         The system at the prior mean.
     largest_displacement, largest_speed, largest_load : float
-        Largest values in the trials [SI]; zero where nothing moves or acts.
+        Largest absolute values in the trials [m, m/s, N]; zero if nothing moves or acts.
     duration : float
         Longest dynamic record [s].
     """
@@ -75,14 +76,14 @@ def largest_measured_force(campaign: Campaign, trial: Trial) -> float:
 
 
 class PortScaleEstimator:
-    """Collects what acts and moves at ports in a campaign, one trial after the other.
+    """Collects the forces and motions at ports in a campaign, one trial after the other.
 
-    Where no stiffness of the structure holds a port (that of a controller does not count), its
-    force scale is `FORCE_PER_RMS` times the rms of inertia, damping, own laws and loads there; its
-    displacement and speed scales are the largest ones. Effects are so measured by what acts and
-    moves. The same holds at a port of a state, with flows. Where drives alone move a port, no
-    frequency of the structure says how fast it moves: its force scale is the largest measured
-    force.
+    If no spring of the structure holds a port (the stiffness of a controller does not count), the
+    port has no natural frequency that could set its scales. Its force scale is then
+    `FORCE_PER_RMS` times the rms of the forces there (the largest of inertia, damping and loads),
+    and its displacement and speed scales are the largest displacement and speed. The same holds at
+    a port of a state, with flows in the place of forces. If only drives (prescribed motions) move a
+    port, its force scale is the largest force that a channel measured.
 
     Parameters
     ----------
@@ -105,33 +106,41 @@ class PortScaleEstimator:
         self.follows_drives = np.ones(count, bool)
 
     def add_displacements(self, displacements: FloatArray, *, fitted: bool) -> None:
-        """Add displacements (L, N) at rest, or from which a structure is released."""
+        """Add displacements of the structure at rest, or those from which it is released.
+
+        Parameters
+        ----------
+        displacements : (L, N) array
+            Displacements of all unknowns, one row for each load level [m].
+        fitted : bool
+            Whether the trial is fitted (dynamic and not held out).
+        """
         largest = np.max(np.abs(displacements @ self.rows.T), axis=0)
-        self._add_largest(largest, 0.0 * largest, fitted=fitted)
+        self._add_largest(largest, 0.0 * largest, fitted=fitted)  # at rest all speeds are zero
 
     def add_motion(self, motion: Motion, measured_force: float, *, fitted: bool) -> FloatArray:
-        """Add a motion and the largest force measured in it [N].
-
-        Returns
-        -------
-        (T, N) array
-            The loads in the motion.
+        """Add a motion of the structure, and return the loads in it.
 
         Parameters
         ----------
         motion : Motion
-            Motion in a dynamic trial.
+            Motion in a dynamic trial of T samples.
         measured_force : float
-            Largest force that was measured in it [N].
+            Largest force that a channel measured in it [N].
         fitted : bool
             Whether the trial is fitted.
+
+        Returns
+        -------
+        (T, N) array
+            The loads on all unknowns in the motion [N].
         """
         position, speed = motion.at_rows(self.rows)
         largest_position = np.max(np.abs(position), axis=0, initial=0.0)
         largest_speed = np.max(np.abs(speed), axis=0, initial=0.0)
         self._add_largest(largest_position, largest_speed, fitted=fitted)
-        least = BOTH_WAYS * np.max(np.abs(speed), axis=0)
-        self.turns |= (np.min(speed, axis=0) < -least) & (np.max(speed, axis=0) > least)
+        least_speed = BOTH_WAYS * np.max(np.abs(speed), axis=0)
+        self.turns |= (np.min(speed, axis=0) < -least_speed) & (np.max(speed, axis=0) > least_speed)
         # inertia, damping and loads (N unknowns)
         system = motion.system
         shapes = system.shapes
@@ -142,14 +151,22 @@ class PortScaleEstimator:
             motion.velocity[:, :modes] @ (self.system.damping @ shapes).T,
             loads,
         )
-        # modal force along the port, over what a unit force there gives
+        # The equivalent force at a port p is the one that excites the modes as the loads do, in
+        # projection on the port: p @ shapes @ (modal forces), over the same for a unit force at
+        # the port, which is |p @ shapes|^2 (mobility).
         mobility = np.sum((self.rows @ shapes) ** 2, axis=1)
         is_free_to_move = mobility > 0.0
-        along = shapes @ (shapes.T @ self.rows.T) / np.where(is_free_to_move, mobility, 1.0)
-        mean_squares = [np.mean((force @ along) ** 2, axis=0) for force in forces]
-        largest = np.max(mean_squares, axis=0)
-        measured = (measured_force / FORCE_PER_RMS) ** 2
-        self.force_squares += len(motion.time) * np.where(is_free_to_move, largest, measured)
+        port_forces_per_load = (
+            shapes @ (shapes.T @ self.rows.T) / np.where(is_free_to_move, mobility, 1.0)
+        )
+        mean_squares = [np.mean((force @ port_forces_per_load) ** 2, axis=0) for force in forces]
+        largest_mean_square = np.max(mean_squares, axis=0)
+        # a port that no mode moves is moved by drives: the divisor makes its force scale, which is
+        # FORCE_PER_RMS times the rms, equal to the measured force
+        measured_force_square = (measured_force / FORCE_PER_RMS) ** 2
+        self.force_squares += len(motion.time) * np.where(
+            is_free_to_move, largest_mean_square, measured_force_square
+        )
         self.sample_count += len(motion.time)
         self.follows_drives &= mobility == 0.0
         return loads
@@ -163,27 +180,49 @@ class PortScaleEstimator:
     def port_scales(
         self, static_stiffness: Sequence[float], *, only_driven: bool
     ) -> list[PortScale]:
-        """Return the scale of each port.
+        """Return the scale of each port, after all trials of the campaign have been added.
 
         Parameters
         ----------
         static_stiffness : sequence of float
-            Stiffness at rest of each port [N/m or N m/rad]; zero where the modes tell it.
+            Static stiffness of each port [N/m or N m/rad]; zero if it is not known and has to be
+            computed from the modes.
         only_driven : bool
-            Whether all trials are followed in time from known inputs, so that a motion that was not
-            seen to turn does not turn.
+            Whether every trial is computed in time from recorded inputs. The computed motion is
+            then complete: a port whose speed never changes its sign in it never reverses.
+            Otherwise a port may reverse although no computed motion shows it.
         """
-        rms = np.sqrt(self.force_squares / max(self.sample_count, 1))
-        forces = (FORCE_PER_RMS * rms).tolist()
+        force_rms = np.sqrt(self.force_squares / max(self.sample_count, 1))
+        force_scales = (FORCE_PER_RMS * force_rms).tolist()
         scales = []
-        for number, (stiffness, force) in enumerate(zip(static_stiffness, forces, strict=True)):
-            scales.append(self._port_scale(number, stiffness, force, only_driven=only_driven))
+        for port_number, (stiffness_at_rest, force_scale) in enumerate(
+            zip(static_stiffness, force_scales, strict=True)
+        ):
+            scales.append(
+                self._port_scale(
+                    port_number, stiffness_at_rest, force_scale, only_driven=only_driven
+                )
+            )
         return scales
 
     def _port_scale(
         self, number: int, static_stiffness: float, force: float, *, only_driven: bool
     ) -> PortScale:
-        """Return the scale of one port, given its stiffness at rest and its force scale."""
+        """Return the scale of one port.
+
+        There are three cases: a port that a mode without stiffness moves, or no mode at all, is
+        scaled by the forces and motions of the trials; a port on springs that drives alone move,
+        by the measured force; any other port on springs, by the first mode that moves it.
+
+        Parameters
+        ----------
+        number : int
+            Number of the port.
+        static_stiffness : float
+            Its static stiffness [N/m or N m/rad]; zero if it has to be computed from the modes.
+        force : float
+            Its force scale from the trials [N or N m]; zero if nothing acted there.
+        """
         system = self.system
         fitted = float(self.fitted_displacement[number])
         largest = float(self.largest_displacement[number])
@@ -192,6 +231,7 @@ class PortScaleEstimator:
         # modes that move the port
         frequency = system.angular_frequency[: system.displacement_modes]
         row = self.rows[number]
+        # squared amplitude of the port per unit of each mode (shapes have a modal mass of one)
         participation = (row @ system.shapes)[: system.displacement_modes] ** 2
         moves = participation > 1e-6 * float(participation.sum())
         is_free = not np.any(frequency[moves] > 0.0)
@@ -207,6 +247,7 @@ class PortScaleEstimator:
                 turns=bool(self.turns[number]) or not is_known_not_to_turn,
                 of_state=not np.any(row[: system.displacement_count]),
             )
+        # each mode adds (row @ shape)^2 / omega^2 to the static compliance of the port
         compliance = np.sum(participation[moves] / frequency[moves] ** 2)
         static_stiffness = static_stiffness or 1.0 / float(compliance)
         is_driven = only_driven and self.follows_drives[number]
@@ -221,6 +262,8 @@ class PortScaleEstimator:
             )
         first_frequency = float(frequency[moves][0])
         first_participation = float(participation[moves][0])
+        # the first mode alone has the compliance p / omega^2 at the port, so its stiffness is
+        # omega^2 / p, with p its participation
         return PortScale(
             displacement=displacement,
             stiffness=first_frequency**2 / first_participation,

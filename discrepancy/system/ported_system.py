@@ -1,4 +1,4 @@
-"""The linear system by which outputs see missing forces at ports."""
+"""The linear system from missing forces at ports to outputs."""
 
 from collections.abc import Sequence
 
@@ -13,62 +13,80 @@ from discrepancy.system.response import PortedSystem
 def ported_system(
     system: LinearSystem, equations: Sequence[OutputEquation], shapes: FloatArray
 ) -> PortedSystem:
-    """Return the system by which outputs see missing forces at the ports.
+    """Return the linear system from missing forces g at the P ports to the outputs.
 
-    M q'' + D q' + K q = -sum_p acts_p g_p; of coordinates that are states only the speeds are
-    kept.
+    In the coordinates q it is M q'' + D q' + K q = -sum_p acts_p g_p. It is returned in first
+    order, with the state s = (q, q'). Of a coordinate that stands for a state (its speed is the
+    state, and nothing depends on its position) only the speed is kept.
 
     Parameters
     ----------
     system : LinearSystem
         The system.
     equations : sequence of OutputEquation
-        What each of the C outputs shows.
+        The equation of each of the C outputs.
     shapes : (N, M) array
-        Shapes of the coordinates q.
+        Shapes of the coordinates q, the columns of u = shapes q.
+
+    Returns
+    -------
+    PortedSystem
+        Its matrices; see there for signs.
     """
     names = tuple(system.ports)
     port_rows = np.array([system.ports[name] for name in names]).reshape(len(names), system.size)
-    directions = np.array([system.law_directions[name] for name in names])
-    directions = directions.reshape(len(names), system.size)
-    direct = _direct_forces(system, equations, directions)
+    law_directions = np.array([system.law_directions[name] for name in names])
+    law_directions = law_directions.reshape(len(names), system.size)
+    direct_outputs = _direct_forces(system, equations, law_directions)
     # the system in the coordinates q
     mass = shapes.T @ system.mass @ shapes
     damping = shapes.T @ system.damping @ shapes
     stiffness = shapes.T @ system.stiffness @ shapes
     port_rows = port_rows @ shapes
-    directions = directions @ shapes
-    push = np.linalg.solve(mass, directions.T)
+    law_directions = law_directions @ shapes
+    acceleration_per_force = np.linalg.solve(mass, law_directions.T)
     by_damping = np.linalg.solve(mass, damping)
     by_stiffness = np.linalg.solve(mass, stiffness)
     # first order, s = (q, q'), without the integrals of states
-    coordinates = len(mass)
-    count = system.displacement_modes
-    generator = np.zeros((count + coordinates, count + coordinates))
-    generator[:count, count : 2 * count] = np.eye(count)
-    generator[count:, :count] = -by_stiffness[:, :count]
-    generator[count:, count:] = -by_damping
+    coordinate_count = len(mass)
+    displacement_mode_count = system.displacement_modes
+    generator = np.zeros(
+        (displacement_mode_count + coordinate_count, displacement_mode_count + coordinate_count)
+    )
+    generator[:displacement_mode_count, displacement_mode_count : 2 * displacement_mode_count] = (
+        np.eye(displacement_mode_count)
+    )
+    generator[displacement_mode_count:, :displacement_mode_count] = -by_stiffness[
+        :, :displacement_mode_count
+    ]
+    generator[displacement_mode_count:, displacement_mode_count:] = -by_damping
     # rows of outputs, with accelerations from the equation of motion
-    shown = rows_in_coordinates(equations, shapes)
-    of_position = (shown.position - shown.acceleration @ by_stiffness)[:, :count]
-    of_velocity = shown.velocity - shown.acceleration @ by_damping
-    no_position = np.zeros((len(names), count))
-    no_velocity = np.zeros((len(names), coordinates))
+    output_rows = rows_in_coordinates(equations, shapes)
+    of_position = (output_rows.position - output_rows.acceleration @ by_stiffness)[
+        :, :displacement_mode_count
+    ]
+    of_velocity = output_rows.velocity - output_rows.acceleration @ by_damping
+    no_position = np.zeros((len(names), displacement_mode_count))
+    no_velocity = np.zeros((len(names), coordinate_count))
     return PortedSystem(
         generator=generator,
         ports=names,
-        actions=np.hstack((no_position, push.T)),
-        positions=np.hstack((port_rows[:, :count], no_velocity)),
+        actions=np.hstack((no_position, acceleration_per_force.T)),
+        positions=np.hstack((port_rows[:, :displacement_mode_count], no_velocity)),
         speeds=np.hstack((no_position, port_rows)),
         outputs=np.hstack((of_position, of_velocity)),
-        through=push.T @ shown.acceleration.T - direct,
+        through=acceleration_per_force.T @ output_rows.acceleration.T - direct_outputs,
     )
 
 
 def _direct_forces(
     system: LinearSystem, equations: Sequence[OutputEquation], directions: FloatArray
 ) -> FloatArray:
-    """Return what each output (C,) shows at once of a unit force at each port, as (P, C)."""
+    """Return what a unit force at each port adds to each output at once, as (P, C).
+
+    A force adds to the output that is the reaction of a drive, and to outputs of modes without
+    inertia, which deform at once.
+    """
     direct = np.zeros((len(directions), len(equations)))
     for column, equation in enumerate(equations):
         if equation.law_direction is not None:

@@ -1,4 +1,4 @@
-"""What a model is asked for and what it returns: conditions, response, a system with ports."""
+"""Records that models take and return: conditions, response, a system with ports."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -17,7 +17,7 @@ EITHER = ("N or N m", "m or rad")
 
 @dataclass(frozen=True)
 class Conditions:
-    """All that a response depends on besides trial and patch.
+    """The conditions on which a response depends, in addition to trial and patch.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class Conditions:
 
 
 class Response(NamedTuple):
-    """What perfect sensors would show.
+    """The readings of perfect sensors.
 
     Attributes
     ----------
@@ -80,10 +80,11 @@ class Response(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PortedSystem:
-    """A model in motion as a linear system with ports: what a missing force does to readings.
+    """A model in motion as a linear system, from missing forces at ports to outputs.
 
     s' = A s - sum_p b_p g_p, y = C s - sum_p e_p g_p, in the coordinates s = (q, q') of the modes.
-    What is known to act is in the model's own response; s is what a missing force g adds to it.
+    The known loads are in the model's own response; s is the change of the state by a missing force
+    g.
 
     Attributes
     ----------
@@ -92,13 +93,13 @@ class PortedSystem:
     ports : tuple of str
         Names of the P ports.
     actions : (P, n) ndarray
-        b of each port: what a force there takes from the rate of the state.
+        b of each port: a unit force there lowers the rate of the state by b.
     positions, speeds : (P, n) ndarray
         Rows of the ports' positions and speeds. A port of a state has the state as its speed.
     outputs : (C, n) ndarray
         Rows of the outputs.
     through : (P, C) ndarray
-        e of each port: what an output shows of its force at once.
+        e of each port: a unit force there lowers the outputs by e at once.
     """
 
     generator: FloatArray

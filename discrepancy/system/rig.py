@@ -1,4 +1,4 @@
-"""Matrices and controllers of a lumped model in a state."""
+"""Matrices and controllers of a lumped model at given parameters, patch and temperature."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,18 +24,18 @@ from discrepancy.system.time_history import RecordedHistory
 from fe.runtime.patch import ModelPatch, ModulusTemperature, PointMass, RootCompliance
 
 LEAST_STIFFNESS = 0.05
-"""A temperature that leaves less than this share of the stiffness is refused."""
+"""A temperature that leaves less than this fraction of the stiffness is refused."""
 
 
 class OffsetInput(NamedTuple):
-    """A recorded input, and the constant that its readings lack [SI]."""
+    """A recorded input, and a constant to add to its readings [SI]."""
 
     recorded: RecordedInput
     offset: float
 
     @property
     def values(self) -> FloatArray:
-        """The values (N,) that acted."""
+        """The values (N,) that truly acted."""
         return self.recorded.values + self.offset
 
 
@@ -50,7 +50,7 @@ class ControlLoop:
     proportional, derivative, integral : float
         Gains.
     measured : (4, N) ndarray
-        What it measures, as `OutputEquation.rows`.
+        Rows of the measured quantity, in the form of `OutputEquation.rows`.
     direction : (N,) ndarray
         Load for a controller output of one.
     error_integral : (N,) ndarray
@@ -67,14 +67,18 @@ class ControlLoop:
 
     @property
     def output_rows(self) -> FloatArray:
-        """What the controller puts out without a reference (4, N), as `OutputEquation.rows`."""
+        """Rows (4, N) of the controller's output at a reference of zero.
+
+        They have the form of `OutputEquation.rows`; the error is then minus the measured quantity.
+        """
+        # row k multiplies the k-th time derivative: a shift by one row differentiates
         measured_rate = np.roll(self.measured, 1, axis=0)
         rows = -self.proportional * self.measured - self.derivative * measured_rate
         rows[1] += self.integral * self.error_integral
         return rows
 
     def reference_loads(self, trial: Trial, inputs: Mapping[str, OffsetInput]) -> list[Load]:
-        """Return what the recorded reference of the controller does, as loads.
+        """Return the loads that follow from the recorded reference of the controller.
 
         Raises
         ------
@@ -138,7 +142,7 @@ class Rig:
         return np.asarray(self.factor(section.name) * direction)
 
     def loads_of_references(self, trial: Trial, inputs: Mapping[str, OffsetInput]) -> list[Load]:
-        """Return what the recorded references of all controllers do, as loads."""
+        """Return the loads that follow from the recorded references of all controllers."""
         loads: list[Load] = []
         for loop in self.loops.values():
             loads += loop.reference_loads(trial, inputs)
@@ -174,22 +178,24 @@ def build_rig(
         for primitive in state.structure
         if isinstance(primitive, ModulusTemperature)
     )
-    remaining = 1.0 - softening
-    if remaining < LEAST_STIFFNESS:
+    remaining_stiffness = 1.0 - softening
+    if remaining_stiffness < LEAST_STIFFNESS:
         raise ModelError(
-            f"The temperature leaves {remaining:.2g} of the stiffness, which none has."
+            f"The temperature leaves {remaining_stiffness:.2g} of the stiffness, which none has."
         )
-    warm_factors = {**factors, "stiffness": factors.get("stiffness", 1.0) * remaining}
+    warm_factors = {**factors, "stiffness": factors.get("stiffness", 1.0) * remaining_stiffness}
     matrices = description.scaled_matrices(warm_factors)
-    n = description.displacement_count
-    if n:
+    displacement_count = description.displacement_count
+    if displacement_count:
         # views of the matrices, changed in place
-        mass = matrices["mass"][:n, :n]
-        stiffness = matrices["stiffness"][:n, :n]
+        mass = matrices["mass"][:displacement_count, :displacement_count]
+        stiffness = matrices["stiffness"][:displacement_count, :displacement_count]
         _apply_patch(state.structure, description, places, mass, stiffness)
         if description.damping is not None:
             damping = _damping_matrix(description.damping, mass, stiffness)
-            matrices["damping"][:n, :n] += factors.get("damping", 1.0) * damping
+            matrices["damping"][:displacement_count, :displacement_count] += (
+                factors.get("damping", 1.0) * damping
+            )
     return Rig(factors, matrices, _control_loops(description, factors))
 
 
@@ -218,28 +224,37 @@ def _apply_patch(
             row = _row_at_station(places, primitive.station)[: len(mass)]
             mass += primitive.mass * np.outer(row, row)
         elif isinstance(primitive, RootCompliance) and description.root is not None:
-            # in series: (K^-1 + c l l^T)^-1 by Sherman and Morrison
+            # A rotational spring of compliance c in series with the structure: the flexibility
+            # becomes K^-1 + c l l^T, with the lever l. By Sherman and Morrison its inverse is
+            # K - K l l^T K c / (1 + c l^T K l).
             lever = np.array(description.root.lever)
             moment = stiffness @ lever
-            factor = primitive.compliance / (1.0 + primitive.compliance * float(moment @ lever))
-            stiffness -= np.outer(moment, moment) * factor
+            reduction_factor = primitive.compliance / (
+                1.0 + primitive.compliance * float(moment @ lever)
+            )
+            stiffness -= np.outer(moment, moment) * reduction_factor
 
 
 def _row_at_station(places: Sequence[PlaceSection], station: float) -> FloatArray:
-    """Return the row of the unknowns at a station [m], linear between the places."""
+    """Return the row of the displacement at a station [m], interpolated between the places."""
     stations = [place.station for place in places]
     columns = np.transpose([place.vector for place in places])
     return np.array([np.interp(station, stations, column) for column in columns])
 
 
 def _damping_matrix(damping: Damping, mass: FloatArray, stiffness: FloatArray) -> FloatArray:
-    """Return the damping (n, n) by Rayleigh coefficients, or by ratios of these modes."""
+    """Return the damping (n, n) by Rayleigh coefficients, or by the damping ratios of the modes.
+
+    For mass-normalised shapes S and ratios zeta it is M S diag(2 zeta omega) S^T M.
+    """
     if damping.ratios is None:
         return (damping.alpha or 0.0) * mass + (damping.beta or 0.0) * stiffness
     squares, shapes = eigh(stiffness, mass)
     frequencies = np.sqrt(np.maximum(squares, 0.0))
-    weighted = mass @ shapes
-    return np.asarray((weighted * (2.0 * np.array(damping.ratios) * frequencies)) @ weighted.T)
+    mass_times_shapes = mass @ shapes
+    return np.asarray(
+        (mass_times_shapes * (2.0 * np.array(damping.ratios) * frequencies)) @ mass_times_shapes.T
+    )
 
 
 def _control_loops(

@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 
 class ForceShare(NamedTuple):
-    """A place where a part of a port's force acts.
+    """A place at which part of a distributed force acts.
 
     Attributes
     ----------
     weight : float
-        Share of the force.
+        Fraction of the force that acts there.
     relative_motion : float
-        Motion of the place over that of the port.
+        Ratio of the motion of the place to the weighted mean motion, that of the port.
     """
 
     weight: float
@@ -30,19 +30,19 @@ class PortScale:
         A, the largest motion of the port by the unpatched model in the dynamic trials that are
         fitted; in the other trials if there are none [m or rad].
     stiffness : float
-        k, the stiffness of the first bending mode seen at the port, w1^2 / phi1(port)^2 [N/m or N
+        k, the stiffness of the first bending mode at the port, w1^2 / phi1(port)^2 [N/m or N
         m/rad].
     angular_frequency : float
         w1 [rad/s].
     static_stiffness : float or None
-        1 / (p . K^-1 p), the stiffness at rest seen at the port [N/m or N m/rad]. At a stiff joint
+        1 / (p . K^-1 p), the static stiffness at the port [N/m or N m/rad]. At a stiff joint
         it is a small part of `stiffness`, and no effect can take away more. None: not known, taken
         as `stiffness`.
     largest_displacement : float or None
         The largest motion of the port in all trials, flights too [m or rad]. None: taken as
         `displacement`.
     distribution : tuple of ForceShare
-        Places where a force at the port acts. A force that is spread over the wing acts on the
+        Places where a force at the port acts. A force distributed over the wing acts on the
         motion of each place, and `displacement` is that of the mean.
     free : bool
         Whether nothing holds the port (a body that falls or rolls), so that no position is its
@@ -98,7 +98,7 @@ class Scales:
     campaign_time : float
         Time from the first to the last sample of the campaign [s]; 1 if unknown.
     ports : mapping of str to PortScale
-        By port name; besides those of `Model.ports` the places of forces that are spread over the
+        By port name: those of `Model.ports`, and the places of forces that are distributed over the
         structure.
     """
 

@@ -1,4 +1,4 @@
-"""What the channels of a trial would show: a model's response with the sensors of a patch."""
+"""Readings of the channels of a trial: a model's response, changed by the sensors of a patch."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from fe.runtime.sensors import SensorRecord, apply_sensors, check_channels, cloc
 
 
 class LoggerRates(NamedTuple):
-    """Clock rates, less one, of a trial's inputs and of its channels (C,)."""
+    """Clock errors (rate minus one) of a trial's inputs, and of each of its channels (C,)."""
 
     inputs: float
     channels: FloatArray
@@ -33,15 +33,15 @@ class LoggerRates(NamedTuple):
 
 @dataclass(frozen=True)
 class TurnedGauges:
-    """Channels of a trial whose gauges are turned, and the outputs across them that they see.
+    """Strain channels of a trial, if a patch turns gauges, and the strain components they need.
 
     Attributes
     ----------
     columns : list of int
-        Columns of these channels; empty if the patch turns no gauge.
+        Columns of all strain channels; empty if the patch turns no gauge.
     outputs : tuple of (str, Quantity)
-        All outputs that are asked of the model: those of the channels, then the transverse strain
-        of each turned gauge, then the shear strain of each.
+        All outputs that the model has to give: those of the channels, then the transverse strain
+        of each such channel, then the shear strain of each.
     """
 
     columns: list[int]
@@ -49,30 +49,30 @@ class TurnedGauges:
 
 
 def in_own_clock(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
-    """Return a trial and its patch in a clock that starts at the trial's begin.
+    """Return a trial and its patch with time counted from the first sample, if stamps are far off.
 
-    Stamps of an epoch or of a logger that ran before are far from zero, and models count from the
-    trial's begin. Stamps that begin within the record's length of zero stay, since a release is at
-    zero.
+    Models count time from the begin of the trial, but stamps may count from an epoch, or from the
+    start of a logger. Stamps that begin within the length of the record from zero are kept, since
+    a release happens at zero.
 
     Parameters
     ----------
     trial : Trial
         Trial with the stamps that its user gave.
     patch : ModelPatch
-        Patch whose windows are in these stamps; they move with them.
+        Patch whose time windows are given in these stamps; the windows are shifted too.
     """
     if not trial.is_dynamic or len(trial.time) < 2:
         return trial, patch
-    first = float(trial.time[0])
-    last = float(trial.time[-1])
-    if abs(first) <= last - first:
+    first_stamp = float(trial.time[0])
+    last_stamp = float(trial.time[-1])
+    if abs(first_stamp) <= last_stamp - first_stamp:
         return trial, patch
     primitives = []
     for primitive in patch:
-        windows = tuple(_moved_window(window, first) for window in primitive.windows)
+        windows = tuple(_moved_window(window, first_stamp) for window in primitive.windows)
         primitives.append(replace(primitive, windows=windows) if windows else primitive)
-    return replace(trial, time=trial.time - first), ModelPatch(tuple(primitives))
+    return replace(trial, time=trial.time - first_stamp), ModelPatch(tuple(primitives))
 
 
 def _moved_window(window: Window, first: float) -> Window:
@@ -85,7 +85,7 @@ def _moved_window(window: Window, first: float) -> Window:
 def observe(
     model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch, conditions: Conditions
 ) -> Response:
-    """Return what the channels of a trial would show, without gains and zeros that are fitted.
+    """Return the readings of all channels of a trial, without the gains and zeros that are fitted.
 
     Parameters
     ----------
@@ -116,23 +116,25 @@ def observe(
         return model.respond(trial, campaign.outputs(trial), patch, conditions)
     gauges = _turned_gauges(model, campaign, trial, patch)
     response = _response_in_clocks(model, campaign, trial, patch, conditions, gauges)
-    # the channels, and the strain across turned gauges
-    count = len(trial.channels)
+    # columns: the C channels, transverse strains of strain channels, their shear strains
+    channel_count = len(trial.channels)
     turned_count = len(gauges.columns)
     values = response.values
-    transverse = np.zeros((len(values), count))
-    shear = np.zeros((len(values), count))
-    transverse[:, gauges.columns] = values[:, count : count + turned_count]
-    shear[:, gauges.columns] = values[:, count + turned_count :]
-    rates = response.rates[:, :count] if response.rates is not None else None
-    of_channels = Response(values[:, :count], rates)
-    return observe_response(campaign, trial, patch, conditions, of_channels, (transverse, shear))
+    transverse = np.zeros((len(values), channel_count))
+    shear = np.zeros((len(values), channel_count))
+    transverse[:, gauges.columns] = values[:, channel_count : channel_count + turned_count]
+    shear[:, gauges.columns] = values[:, channel_count + turned_count :]
+    rates = response.rates[:, :channel_count] if response.rates is not None else None
+    channel_response = Response(values[:, :channel_count], rates)
+    return observe_response(
+        campaign, trial, patch, conditions, channel_response, (transverse, shear)
+    )
 
 
 def _turned_gauges(
     model: Model, campaign: Campaign, trial: Trial, patch: ModelPatch
 ) -> TurnedGauges:
-    """Return the gauges that a patch turns, and all outputs that are asked of the model.
+    """Return the strain channels, if a patch turns gauges, and the outputs the model has to give.
 
     Raises
     ------
@@ -166,7 +168,8 @@ def _response_in_clocks(
 ) -> Response:
     """Return the response of all outputs, each sampled by the clock of its own logger.
 
-    Inputs act at their true times; all clocks are right at the first stamp.
+    The recorded inputs are first brought to their true times. All clocks are right at the first
+    stamp; the model is run once for each distinct clock rate.
 
     Parameters
     ----------
@@ -180,33 +183,39 @@ def _response_in_clocks(
     clock_rate = conditions.clock[0] + patch_rate
     clock_zero = conditions.clock[1] + patch_zero
     rates = _logger_rates(campaign, trial, patch)
-    first = float(trial.time[0])
-    stamped = trial
+    first_stamp = float(trial.time[0])
+    trial_in_true_time = trial
     if rates.inputs:
-        stamped = replace(trial, time=trial.time + rates.inputs * (trial.time - first))
-    # outputs across a gauge are sampled with it
+        trial_in_true_time = replace(
+            trial, time=trial.time + rates.inputs * (trial.time - first_stamp)
+        )
+    # transverse and shear strain have the clock of their gauge
     output_rates = np.append(rates.channels, np.tile(rates.channels[gauges.columns], 2))
     values = np.zeros((len(trial.time), len(gauges.outputs)))
-    slopes = np.zeros_like(values)
+    output_slopes = np.zeros_like(values)
     for rate in np.unique(rates.channels).tolist():
+        # Clocks relative to the inputs' time: (1 + rate) / (1 + input rate) times (1 + clock rate),
+        # minus one. At the first stamp all clocks agree.
         relative_rate = (rate - rates.inputs) / (1.0 + rates.inputs) * (
             1.0 + clock_rate
         ) + clock_rate
-        logger_clock = relative_rate, clock_zero - relative_rate * first
-        in_clock = replace(conditions, clock=logger_clock)
-        response = model.respond(stamped, gauges.outputs, without_sensors, in_clock)
+        logger_clock = relative_rate, clock_zero - relative_rate * first_stamp
+        clock_conditions = replace(conditions, clock=logger_clock)
+        response = model.respond(
+            trial_in_true_time, gauges.outputs, without_sensors, clock_conditions
+        )
         is_sampled = output_rates == rate
         values[:, is_sampled] = response.values[:, is_sampled]
         if response.rates is not None:
-            slopes[:, is_sampled] = response.rates[:, is_sampled]
-    return Response(values, slopes if trial.is_dynamic else None)
+            output_slopes[:, is_sampled] = response.rates[:, is_sampled]
+    return Response(values, output_slopes if trial.is_dynamic else None)
 
 
 def _logger_rates(campaign: Campaign, trial: Trial, patch: ModelPatch) -> LoggerRates:
-    """Return by how much the clocks that sampled a trial's inputs and channels run fast.
+    """Return the clock errors (rate minus one) of a trial's inputs and channels.
 
-    A rate of 0.01 means that the clock shows 1 % more time than has passed. Errors of several
-    loggers on one channel multiply. A trial at rest has no clock, so that its rates are zero.
+    By `LoggerClock` an event with time stamp t happened at (1 + error) t. The rates of several
+    loggers of one channel multiply. A static trial has no clock, so that its errors are zero.
 
     Raises
     ------
@@ -241,7 +250,7 @@ def _members_of_logger(campaign: Campaign, trial: Trial, logger: str) -> tuple[s
 
 
 def _by_channels(sensors: ModelPatch, campaign: Campaign) -> ModelPatch:
-    """Return sensor primitives for channels, those that name an output for each channel of it."""
+    """Return sensor primitives by channels: one that names an output, for each of its channels."""
     primitives: list[Primitive] = []
     for primitive in sensors:
         name = getattr(primitive, "channel", EVERY_CHANNEL)
@@ -262,10 +271,10 @@ def observe_response(
     response: Response,
     across: Iterable[FloatArray] = (),
 ) -> Response:
-    """Return what the channels show of a response that is known already; see `observe`.
+    """Return the readings of the channels, given the response of their outputs; see `observe`.
 
-    For callers that keep the response of a structure and try sensors on it. The clock of the patch
-    must be in the response.
+    A caller may so try several sensor faults on one response. The response must already be sampled
+    by the clocks of the patch.
 
     Parameters
     ----------
@@ -274,7 +283,7 @@ def observe_response(
     response : Response
         Values and rates (N, C) of the channels' outputs.
     across : iterable of (N, C) array
-        Transverse and shear strain, which turned gauges see.
+        Transverse and shear strain, on which the reading of a turned gauge depends.
 
     Raises
     ------

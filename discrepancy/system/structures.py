@@ -42,9 +42,9 @@ from reporting.progress import Progress
 LOAD_FACTOR = "load_factor"
 """Control that is the load factor of flights."""
 DEVIATION = 0.25
-"""Standard deviation of a parameter whose calibration is not known, as a share of its range."""
+"""Standard deviation of a parameter that was not calibrated, as a fraction of its range."""
 ROUNDING = 1e-9
-"""Difference of two rows, relative to the largest entry, that is rounding."""
+"""Differences of two rows below this fraction of the largest entry are rounding errors."""
 ROTATING_PORT = "root"
 """Port of the wing at which a force is a moment and a motion an angle."""
 Prior = Mapping[str, tuple[float, float]]
@@ -52,7 +52,7 @@ Prior = Mapping[str, tuple[float, float]]
 
 
 class StructureWithMatrices(SolvedStructure, Protocol):
-    """What the workflow asks of a reduced or a patched structure at one state.
+    """The interface of a reduced or a patched structure at one state.
 
     All matrices and rows are in n coordinates of the structure's own.
     """
@@ -75,12 +75,13 @@ class StructureWithMatrices(SolvedStructure, Protocol):
 
 
 class StructureModel(SystemModel):
-    """A structure from a mesh or matrices; its parameters and free masses have `DEVIATION`.
+    """A structure from a mesh or matrices, by its reduced model.
 
-    A control in N is a force, and where a load of it acts along a displacement output, in either
-    direction, there is a port, which has the name and the sign of that output. Ports of the file
-    come behind these. Other controls are nominal but for the load factor, which is zero where none
-    is recorded; constant loads always act.
+    The prior of its parameters and free masses has the standard deviation `DEVIATION`. A control
+    with the unit N is a force. If its load acts along a displacement output, in either direction,
+    there is a port with the name and the sign of that output; the ports of the file follow these.
+    Other controls are nominal, except for the load factor, which is zero if a trial records none.
+    Constant loads always act.
 
     Parameters
     ----------
@@ -131,12 +132,12 @@ class StructureModel(SystemModel):
 
     def _ports_of_loads(self, displacements: Iterable[str]) -> dict[str, FloatArray]:
         """Return the rows of the displacements along which a force acts, by name."""
-        mean = SystemState(tuple(self.prior_mean().tolist()))
-        pushes = [self._unit_load(mean, force) for force in self.forces]
+        mean_state = SystemState(tuple(self.prior_mean().tolist()))
+        unit_loads = [self._unit_load(mean_state, force) for force in self.forces]
         rows: dict[str, FloatArray] = {}
-        for push in pushes:
+        for unit_load in unit_loads:
             for name in displacements:
-                if _acts_along(push, self._rows[name]):
+                if _acts_along(unit_load, self._rows[name]):
                     rows[name] = self._rows[name]
         return rows
 
@@ -149,7 +150,13 @@ class StructureModel(SystemModel):
         }
 
     def _check_moves_otherwise(self, port: str, row: FloatArray) -> None:
-        """Refuse a port of the file whose row (n,) reads what another port reads."""
+        """Refuse a port of the file that has the same direction (n,) as another port.
+
+        Raises
+        ------
+        ModelError
+            If there is such a port: readings could not distinguish the forces at both.
+        """
         for other, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
@@ -159,7 +166,7 @@ class StructureModel(SystemModel):
                 )
 
     def _values(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:
-        """Return the vector of all that can be chosen; controls that are left out are nominal."""
+        """Return the input vector of the reduced model; controls that are missing are nominal."""
         names = (*self.model.parameters, *self.model.masses)
         parameters = dict(zip(names, state.parameters, strict=True))
         return self.model.vector({**parameters, **controls}, state.losses)
@@ -170,7 +177,7 @@ class StructureModel(SystemModel):
         return np.asarray(self.model.unit_loads @ coefficients)
 
     def _unit_load(self, state: SystemState, control: str) -> FloatArray:
-        """Return what a value of one of a control adds to the load (n,)."""
+        """Return the load (n,) per unit of a control."""
         no_controls = dict.fromkeys(self.model.controls, 0.0)
         unit_control = no_controls | {control: 1.0}
         return self._load_under(state, unit_control) - self._load_under(state, no_controls)
@@ -178,7 +185,7 @@ class StructureModel(SystemModel):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return what outputs show: rows of the reduced model."""
+        """Return the equations of outputs, which are rows of the reduced model."""
         return [
             OutputEquation.of_row(self._rows[output], quantity.order)
             for output, quantity in outputs
@@ -198,7 +205,7 @@ class StructureModel(SystemModel):
     def force_row(
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
-        """Return the load (n,) of 1 N of a force, or, where there is none, of the load factor.
+        """Return the load (n,) of 1 N of a force; without forces, that of load factor 1.
 
         Raises
         ------
@@ -235,7 +242,7 @@ class StructureModel(SystemModel):
 
 
 def _parameter_priors(model: ReducedModel) -> tuple[ParameterPrior, ...]:
-    """Return the priors of a structure's parameters and free masses: nominal, with `DEVIATION`."""
+    """Return the priors of parameters and free masses: nominal means, deviations of `DEVIATION`."""
     nominal = dict(zip(model.input_names, model.nominal.tolist(), strict=True))
     units = dict.fromkeys(model.parameters, "1") | dict.fromkeys(model.masses, "kg")
     priors = []
@@ -252,10 +259,14 @@ def _is_at_port(name: str) -> bool:
 
 
 def _acts_along(push: FloatArray, row: FloatArray) -> bool:
-    """Return whether a load (n,) acts along the row (n,) of a displacement, or against it."""
-    largest = float(np.abs(push).max())
-    amount = float(push @ row) / (float(row @ row) or 1.0)
-    return largest > 0.0 and float(np.abs(push - amount * row).max()) <= ROUNDING * largest
+    """Return whether a load (n,) is a multiple of the row (n,) of a displacement."""
+    largest_entry = float(np.abs(push).max())
+    # least-squares factor of the row; the remaining part of a multiple is rounding
+    projection = float(push @ row) / (float(row @ row) or 1.0)
+    return (
+        largest_entry > 0.0
+        and float(np.abs(push - projection * row).max()) <= ROUNDING * largest_entry
+    )
 
 
 def _linear_system(
@@ -305,7 +316,7 @@ class WingModel(SystemModel):
         Mean and standard deviation of the calibrated parameters, by the names of
         `calibration.result.record.STATE`.
     design : WingDesign, optional
-        What the arrays were made of.
+        The design from which the arrays were made.
 
     Notes
     -----
@@ -386,7 +397,7 @@ class WingModel(SystemModel):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return what outputs show, with strain factors of the patch."""
+        """Return the equations of outputs, with the strain factors of the patch applied."""
         rows = np.array([self._output_row(output) for output, _ in outputs])
         factors = self.wing.strain_factors(case.patch)
         if factors is not None:

@@ -1,4 +1,4 @@
-"""A model by its matrices: a wing, a structure or a lumped rig, at rest and in motion."""
+"""Models that are given by matrices (a wing, a structure, a lumped rig), at rest and in motion."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping
@@ -75,7 +75,7 @@ class SystemModel(Model):
 
     @abstractmethod
     def build_system(self, state: SystemState) -> LinearSystem:
-        """Return the system in a state, made anew."""
+        """Assemble and return the linear system in a state; `system` is the same with a cache."""
 
     @abstractmethod
     def force_row(
@@ -98,9 +98,10 @@ class SystemModel(Model):
         raise NotImplementedError
 
     def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
-        """Return the loads and the prescribed motions in a trial: here a force at a place, or lift.
+        """Return the loads and the prescribed motions in a trial.
 
-        Of a trial at rest, the values of the histories are those of the trial's rows.
+        Here the load is a force at the load place, or the lift of a flight. In a static trial, the
+        samples of a load's history are its values in the rows of the trial.
         """
         if case.trial.kind is TrialKind.FLIGHT:
             return LoadsAndMotions(self._flight_loads(case), {})
@@ -114,7 +115,8 @@ class SystemModel(Model):
     def _flight_loads(self, case: PatchedTrial) -> list[Load]:
         """Return the loads of the load factor and its powers in a flight."""
         trial = case.trial
-        # weight acts where a mass has it; other zeros are read with the mass in place
+        # An added mass has weight in a flight. In other trials the zero readings are taken with the
+        # mass in place, so that its weight does not show.
         primitives = case.patch.of(*LOADS, changes.PointMass)
         loads = []
         for power, direction in enumerate(self.lift_loads(case.state, primitives), start=1):
@@ -126,7 +128,7 @@ class SystemModel(Model):
     def output_equations(
         self, case: PatchedTrial, outputs: Outputs, excitation: Excitation | None
     ) -> list[OutputEquation]:
-        """Return what outputs show under an excitation; None stands for a trial at rest.
+        """Return the equations of outputs under an excitation.
 
         Parameters
         ----------
@@ -135,13 +137,21 @@ class SystemModel(Model):
         outputs : tuple of (str, Quantity)
             Outputs, and the quantity wanted of each.
         excitation : Excitation, optional
-            What acts in a dynamic trial.
+            The loads and motions in a dynamic trial; None for a static trial.
         """
 
     def distributed_scales(
         self, ports: Mapping[str, PortScale], shape: FloatArray
     ) -> dict[str, PortScale]:
-        """Return scales of forces that are spread over the structure, by its first mode (N,)."""
+        """Return the scales of forces distributed over the structure.
+
+        Parameters
+        ----------
+        ports : mapping of str to PortScale
+            The scales of single ports.
+        shape : (N,) array
+            The shape of the first mode.
+        """
         return {}
 
     # ------------------------------------------------------------ trials
@@ -154,7 +164,7 @@ class SystemModel(Model):
     def patched_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
     ) -> PatchedTrial:
-        """Return a trial under a patch, with the state of the matrices at its begin.
+        """Return a trial with its patch and conditions, and the state of the matrices at its begin.
 
         Parameters
         ----------
@@ -165,12 +175,12 @@ class SystemModel(Model):
         patch : ModelPatch
             All primitives that act.
         """
-        rise = float(trial.temperature[0]) if _depends_on_temperature(patch) else 0.0
+        temperature_rise = float(trial.temperature[0]) if _depends_on_temperature(patch) else 0.0
         state = SystemState(
             parameters=tuple(conditions.parameters.tolist()),
             losses=self.losses(trial, conditions.health)[0],
             structure=patch.of(*STRUCTURE),
-            temperature_rise=rise,
+            temperature_rise=temperature_rise,
         )
         return PatchedTrial(trial, conditions, patch, state)
 
@@ -209,7 +219,7 @@ class SystemModel(Model):
         Raises
         ------
         ModelError
-            If the motion cannot begin as the trial says, or what acts is not the model's.
+            If the motion cannot begin as the trial says, or the model lacks one of its inputs.
         """
         system, excitation = self.excited_system(case)
         where = f"The trial {case.trial.name!r} of {self.name!r}: "
@@ -223,8 +233,9 @@ class SystemModel(Model):
     ) -> Response:
         """Return the response of a trial.
 
-        The force of a trial is (1 + gain) times the recorded one, plus the tare where it is not
-        zero. In a dynamic trial the structure is that at its first temperature.
+        The acting force is (1 + gain) times the recorded one, plus the tare at samples whose
+        recorded force is not zero. In a dynamic trial the structure has the temperature of the
+        first sample throughout.
         """
         laws = self.laws(conditions.parameters, patch)
         case = self.patched_trial(trial, conditions, patch)
@@ -234,7 +245,10 @@ class SystemModel(Model):
         return motion.response(self.output_equations(case, outputs, motion.excitation))
 
     def _values_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
-        """Return what outputs show (N, C) in a trial at rest, along its load path."""
+        """Return what outputs show (N, C) in a static trial, row by row along its load path.
+
+        The order matters: dry friction remembers how the present load was reached.
+        """
         trial = case.trial
         if laws.active_spans or len(case.patch.of(PortLoad)):
             raise ModelError(
@@ -258,6 +272,7 @@ class SystemModel(Model):
                         f"The trial {trial.name!r} is at rest, but a channel measures velocity or "
                         "acceleration."
                     )
+            # at rest an output shows displacements (row 0) and the values of states (row 1)
             output_rows = [np.append(item.rows[0, :n], item.rows[1, n:]) for item in equations]
             where = f"The trial {trial.name!r} is at rest, but "
             with ModelError.instead_of(ModelError, FiniteElementError, before=where):
@@ -274,25 +289,41 @@ class SystemModel(Model):
         return values
 
     def _rows_by_state(self, case: PatchedTrial) -> Iterator[RowsAtRest]:
-        """Yield the rows of a trial at rest, those together that follow in the same state."""
-        count = len(case.trial.force)
-        losses = self.losses(case.trial, case.conditions.health)
-        if len(losses) == 1:
-            losses = losses * count
-        rises = [0.0] * count
+        """Yield blocks of consecutive rows of a static trial in which the structure is the same.
+
+        Health and temperature change the structure, so that rows with equal health losses and equal
+        temperature can share one set of matrices.
+
+        Yields
+        ------
+        RowsAtRest
+            A slice of rows, and the state of the structure in all of them.
+        """
+        row_count = len(case.trial.force)
+        losses_of_rows = self.losses(case.trial, case.conditions.health)
+        # a single entry holds for all rows
+        if len(losses_of_rows) == 1:
+            losses_of_rows = losses_of_rows * row_count
+        temperature_rises = [0.0] * row_count
         if _depends_on_temperature(case.patch):
-            rises = case.trial.temperature.tolist()
+            temperature_rises = case.trial.temperature.tolist()
         start = 0
-        for (row_losses, rise), group in groupby(zip(losses, rises, strict=True)):
-            stop = start + len(list(group))
-            state = case.state._replace(losses=row_losses, temperature_rise=rise)
+        for (row_losses, temperature_rise), equal_rows in groupby(
+            zip(losses_of_rows, temperature_rises, strict=True)
+        ):
+            stop = start + len(list(equal_rows))
+            state = case.state._replace(losses=row_losses, temperature_rise=temperature_rise)
             yield RowsAtRest(slice(start, stop), state)
             start = stop
 
     # ------------------------------------------------------------ ports
 
     def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
-        """Return the system by which outputs see missing forces, in modes of the prior means."""
+        """Return the linear system from missing forces to outputs, in the modes at the prior mean.
+
+        These modes are the same for all parameters, so that systems at several parameters have the
+        same coordinates.
+        """
         patch = self.patch.in_trial(trial.name)
         health = trial.health[:1]
         mean_conditions = Conditions(self.prior_mean(), health=health)
@@ -309,8 +340,10 @@ class SystemModel(Model):
         """Return positions and speeds (N, P) of the ports in a dynamic trial, without laws."""
         case = self.patched_trial(trial, conditions, self.patch.in_trial(trial.name))
         system, excitation = self.excited_system(case)
-        denser = replace(excitation, sample_times=subdivide(excitation.sample_times, parts))
-        return motion_of(system, denser, NO_LAWS).at_rows(
+        denser_excitation = replace(
+            excitation, sample_times=subdivide(excitation.sample_times, parts)
+        )
+        return motion_of(system, denser_excitation, NO_LAWS).at_rows(
             self._rows_of_ports(tuple(self.port_rows))
         )
 
@@ -321,10 +354,9 @@ class SystemModel(Model):
     # ------------------------------------------------------------ natural sizes and scales
 
     def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
-        """Return natural sizes (L,) of the state at the begin of a trial.
+        """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
 
-        They are the largest of the motion from rest, and of the state that alone would give the
-        readings.
+        See `natural_state`; the motion from rest is that of the prior mean.
         """
         parameters = self.prior_mean(campaign)
         case = self.patched_trial(replace(trial, begins=Start.STILL), Conditions(parameters))
@@ -337,8 +369,8 @@ class SystemModel(Model):
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, at the prior mean and without a patch.
 
-        A structure that springs hold, and that only forces move from rest, has scales of its own;
-        for other systems what acts and moves is the measure.
+        If springs hold the structure and only forces move it, from rest, its stiffness and first
+        mode give the scales. Otherwise the loads and motions of the trials do.
         """
         trials = campaign.trials
         parameters = self.prior_mean(campaign)
@@ -347,7 +379,7 @@ class SystemModel(Model):
         uncontrolled = self.system(state._replace(controlled=False))
         port_rows = self._rows_of_ports(self.ports).reshape(len(self.ports), uncontrolled.size)
         is_held = system.mode_count is not None and all(_begins_at_rest(trial) for trial in trials)
-        # what acts and moves in the trials
+        # loads and motions of the trials
         estimator = PortScaleEstimator(uncontrolled, port_rows)
         largest_displacement = 0.0
         largest_speed = 0.0
@@ -357,8 +389,8 @@ class SystemModel(Model):
             is_fitted = trial.is_dynamic and not trial.held_out
             if trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN:
                 motion = self._motion_under_inputs(campaign, trial)
-                measured = largest_measured_force(campaign, trial)
-                loads = estimator.add_motion(motion, measured, fitted=is_fitted)
+                measured_force = largest_measured_force(campaign, trial)
+                loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
                 shapes = motion.system.all_shapes[: motion.system.displacement_count].T
                 largest_displacement = larger(largest_displacement, motion.q @ shapes)
                 largest_speed = larger(largest_speed, motion.velocity @ shapes)
@@ -368,30 +400,36 @@ class SystemModel(Model):
                 if is_held:
                     case = self.patched_trial(trial, Conditions(parameters))
                     estimator.add_displacements(self._held_displacements(case), fitted=is_fitted)
-        # the structure as a whole
-        sizes = campaign.sizes
+        # scales of the whole structure
+        campaign_sizes = campaign.sizes
         if is_held:
-            overall = self._held_scales(system, state, campaign)
+            global_scales = self._held_scales(system, state, campaign)
             first_shape = system.shapes[:, 0]
-            static = [1.0 / float(row @ system.rest_under(row[None])[0]) for row in port_rows]
+            static_stiffness = [
+                1.0 / float(row @ system.rest_under(row[None])[0]) for row in port_rows
+            ]
         else:
-            overall = moving_scales(
-                system, largest_displacement, largest_speed, largest_load, sizes["duration"]
+            global_scales = moving_scales(
+                system,
+                largest_displacement,
+                largest_speed,
+                largest_load,
+                campaign_sizes["duration"],
             )
             first_shape = np.zeros(0)
-            static = [0.0] * len(self.ports)
-        port_scales = estimator.port_scales(static, only_driven=only_driven)
+            static_stiffness = [0.0] * len(self.ports)
+        port_scales = estimator.port_scales(static_stiffness, only_driven=only_driven)
         ports = dict(zip(self.ports, port_scales, strict=True))
         farthest_station = max(map(abs, self.stations or (0.0,)))
         return Scales(
             length=self.length or farthest_station or 1.0,
-            tip_stiffness=overall.stiffness,
-            modal_mass=overall.mass,
-            angular_frequency=overall.angular_frequency,
-            force=sizes["force"] or largest_load,
-            load_factor=sizes["load_factor"],
-            duration=sizes["duration"],
-            campaign_time=sizes["campaign_time"],
+            tip_stiffness=global_scales.stiffness,
+            modal_mass=global_scales.mass,
+            angular_frequency=global_scales.angular_frequency,
+            force=campaign_sizes["force"] or largest_load,
+            load_factor=campaign_sizes["load_factor"],
+            duration=campaign_sizes["duration"],
+            campaign_time=campaign_sizes["campaign_time"],
             ports=ports | self.distributed_scales(ports, first_shape),
         )
 
@@ -400,17 +438,22 @@ class SystemModel(Model):
     ) -> GlobalScales:
         """Return the scales of a structure that springs hold, at its reference load place."""
         places = [*(trial.load_place for trial in campaign.trials), *(self.load_places or ())]
-        row = self.force_row(self.reference or places[0], state)
-        participation = float(row @ system.shapes[:, 0]) ** 2
-        mass = 1.0 / participation if participation else float(np.trace(system.mass))
+        load_row = self.force_row(self.reference or places[0], state)
+        participation = float(load_row @ system.shapes[:, 0]) ** 2
+        # mass of the first mode, referred to the load point
+        modal_mass = 1.0 / participation if participation else float(np.trace(system.mass))
         return GlobalScales(
-            stiffness=1.0 / float(row @ system.rest_under(row[None])[0]),
-            mass=mass,
+            stiffness=1.0 / float(load_row @ system.rest_under(load_row[None])[0]),
+            mass=modal_mass,
             angular_frequency=float(system.angular_frequency[0]),
         )
 
     def _motion_under_inputs(self, campaign: Campaign, trial: Trial) -> Motion:
-        """Return the motion of a trial under its recorded inputs, as far as these tell it."""
+        """Return the motion of a trial under its recorded inputs, at the prior mean.
+
+        The trial begins at rest if its own begin has no equilibrium. If the inputs cause no motion
+        at all, it begins with the typical magnitudes of an unknown initial state.
+        """
         conditions = Conditions(self.prior_mean(campaign))
         laws = self.laws(conditions.parameters)
         try:
@@ -419,7 +462,7 @@ class SystemModel(Model):
             from_rest = replace(trial, begins=Start.STILL)
             motion = self.motion(self.patched_trial(from_rest, conditions), laws)
         if not np.any(motion.q) and not np.any(motion.velocity):
-            # nothing drives it: it was let go
+            # no input moves it: the structure was released
             initial = self.initial_sizes(campaign, trial)
             let_go = self.patched_trial(trial, replace(conditions, initial=initial))
             motion = self.motion(let_go, laws)

@@ -1,4 +1,4 @@
-"""What the matrices of a system depend on, and a trial with what acts in it."""
+"""States on which the matrices of a system depend, and records of a trial and its loads."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from fe.runtime.state import Losses
 
 
 class SystemState(NamedTuple):
-    """What the matrices of a system depend on.
+    """All values on which the matrices of a system depend.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class SystemState(NamedTuple):
     structure : ModelPatch
         The primitives of a patch that change the structure.
     temperature_rise : float
-        Temperature above the reference [K], zero where the structure does not depend on it.
+        Temperature above the reference [K], zero if the structure does not depend on it.
     drives : tuple of str
         Inputs whose motion is prescribed.
     controlled : bool

@@ -13,15 +13,16 @@ from discrepancy.campaign.records import FloatArray, Hold
 from fe.runtime.expression import Expression
 
 SMOOTH_PARTS = 8
-"""Steps of an interval under a spline; straight lines on them err by 1e-6 of the input."""
+"""Time steps in a sampling interval if an input is a spline. Straight lines over these steps
+approximate it to 1e-6 of its size."""
 
 
 class LoadHistory(Protocol):
-    """What a load asks of its course in time."""
+    """The values of a load over time."""
 
     @property
     def hold(self) -> Hold | None:
-        """How the load continues between samples."""
+        """How the load is interpolated between samples."""
 
     @property
     def edges(self) -> tuple[float, ...]:
@@ -82,6 +83,7 @@ class RecordedHistory:
             # the slopes of the straight lines between the samples
             rises = np.diff(self.values, append=self.values[-1])
             step_values = rises / np.diff(self.time, append=np.inf)
+        # at a jump the value before it is wanted: look it up slightly earlier
         just_before = time - 1e-9 * (self.time[-1] - self.time[0]) / len(self.time)
         next_sample = np.searchsorted(self.time, just_before)
         return np.asarray(step_values[np.maximum(next_sample - 1, 0)])
@@ -137,15 +139,17 @@ def equivalent_ramps(
         The values of the lines at the begin and at the end of each step.
     """
     middle = 0.5 * (time[1:] + time[:-1])
-    half = 0.5 * np.diff(time)
-    at_first_point = values_at(middle + -1.0 * half / sqrt(3.0))
-    at_second_point = values_at(middle + 1.0 * half / sqrt(3.0))
+    half_step = 0.5 * np.diff(time)
+    # The two points lie at a distance of half / sqrt(3) from the middle, so that a line rises over
+    # half a step by sqrt(3) / 2 times its rise between them.
+    at_first_point = values_at(middle + -1.0 * half_step / sqrt(3.0))
+    at_second_point = values_at(middle + 1.0 * half_step / sqrt(3.0))
     mean = 0.5 * (at_first_point + at_second_point)
     half_rise = 0.5 * sqrt(3.0) * (at_second_point - at_first_point)
     return mean - half_rise, mean + half_rise
 
 
 def subdivide(time: FloatArray, parts: int) -> FloatArray:
-    """Return times (N,) with each interval between them divided into so many equal parts."""
+    """Return times (N,) with each interval between them divided into `parts` equal parts."""
     position = np.arange((len(time) - 1) * parts + 1) / parts
     return np.interp(position, np.arange(len(time)), time)

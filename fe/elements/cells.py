@@ -127,6 +127,7 @@ def stiffness_blocks(
     B_transposed = B.reshape(n, q * 6, width).swapaxes(1, 2)
     stress_matrix = (elasticity.reshape(-1, 1, 6, 6) @ B) * measure[..., None, None]
     blocks = B_transposed @ stress_matrix.reshape(n, q * 6, width)
+    # symmetric but for rounding errors, which this removes
     return np.asarray(0.5 * (blocks + blocks.swapaxes(1, 2)))
 
 
@@ -217,13 +218,14 @@ class CellMesh:
         faces = []
         for face in self.kind.faces:
             corners = np.sort(self.cells[:, list(face)], axis=1)
-            missing_corners = 4 - len(face)
+            missing_corners = 4 - len(face)  # one for a triangle
             faces.append(np.pad(corners, ((0, 0), (missing_corners, 0)), constant_values=-1))
         all_faces = np.vstack(faces)
-        _, first, count = np.unique(all_faces, axis=0, return_index=True, return_counts=True)
-        outer = np.sort(first[count == 1])
-        number, cell = np.divmod(outer, len(self.cells))
-        return OuterFaces(cell, number, all_faces[outer])
+        _, first_index, count = np.unique(all_faces, axis=0, return_index=True, return_counts=True)
+        outer_index = np.sort(first_index[count == 1])
+        # `all_faces` holds face 0 of all cells, then face 1 of all cells, ...
+        number, cell = np.divmod(outer_index, len(self.cells))
+        return OuterFaces(cell, number, all_faces[outer_index])
 
     def unknowns_of(self, cells: IntArray, components: int = 3) -> IntArray:
         """Return the unknowns (n, components k) of cells (n,), for one or three components."""
@@ -271,35 +273,42 @@ class CellMesh:
         local: FloatArray,
         direction: FloatArray,
     ) -> sparse.csr_array:
-        """Return weighted sums of strains at p points, as rows on the displacements.
+        """Return the matrix that maps nodal displacements to weighted sums of normal strains.
+
+        The strain at a point in the direction d is d . grad(u . d): the sum over the nodes a of a
+        cell of (grad N_a . d) (d . u_a), with the gradients in space dN_a/dX dX/dx.
 
         Parameters
         ----------
         row : (p,) array of int
-            The row that each strain is added to; every row from 0 on occurs.
+            The row of the result that each of p strains is added to; all rows from 0 to the
+            largest one occur.
         weight : (p,) array
-            The weight of each strain in its row.
+            The weight of each strain in the sum.
         cells : (p,) array of int
-            The cell of each point.
+            The cell that contains each point.
         local : (p, 3) array
             The local position of each point in its cell.
         direction : (p, 3) array
-            Unit vectors along which the strains are.
+            The direction of each normal strain, a unit vector.
 
         Returns
         -------
         csr (rows, 3 nn)
-            The rows [1/m].
+            The sums per displacement [1/m].
         """
         _, local_gradients = self.kind.shape_functions(local)
-        inverse = np.linalg.inv(self.jacobians_at(cells, local))
-        directional = np.einsum("pai,pij,pj->pa", local_gradients, inverse, direction)
-        weighted = np.asarray(weight)[:, None] * directional
-        values = weighted[:, :, None] * direction[:, None, :]
-        rows = np.repeat(row, 3 * self.kind.node_count)
-        entries = (rows, self.unknowns_of(cells).ravel())
-        shape = (int(rows.max(initial=-1)) + 1, self.unknowns)
-        return sparse.coo_array((values.ravel(), entries), shape).tocsr()
+        inverse_jacobians = np.linalg.inv(self.jacobians_at(cells, local))
+        # dN_a/dX_i dX_i/dx_j d_j, for the node a of the cell at the point p
+        gradient_along_direction = np.einsum(
+            "pai,pij,pj->pa", local_gradients, inverse_jacobians, direction
+        )
+        weighted_gradient = np.asarray(weight)[:, None] * gradient_along_direction
+        values = weighted_gradient[:, :, None] * direction[:, None, :]
+        row_of_entry = np.repeat(row, 3 * self.kind.node_count)
+        rows_and_columns = (row_of_entry, self.unknowns_of(cells).ravel())
+        shape = (int(row_of_entry.max(initial=-1)) + 1, self.unknowns)
+        return sparse.coo_array((values.ravel(), rows_and_columns), shape).tocsr()
 
     def stiffness(
         self, cells: IntArray, elasticity: FloatArray, factor: FloatArray | float = 1.0
@@ -359,16 +368,21 @@ class CellMesh:
     def _assembled(
         self, cells: IntArray, blocks: Callable[[slice], FloatArray], components: int
     ) -> sparse.csr_array:
-        """Sum element arrays, many at once, with a limit of memory.
+        """Return the sparse sum of element matrices, in batches that limit the memory.
 
         Parameters
         ----------
         cells : (n,) array of int
             The cells.
         blocks : callable
-            Returns the element arrays of a slice of the cells.
+            Returns the element matrices of a slice of the cells.
         components : int
-            Unknowns of a node, 1 or 3.
+            Number of unknowns of a node, 1 or 3.
+
+        Returns
+        -------
+        csr (components nn, components nn)
+            The assembled matrix.
         """
         size = components * len(self.points)
         total = sparse.csr_array((size, size))

@@ -176,9 +176,13 @@ class ElementKind:
 
     @cached_property
     def _coefficients(self) -> FloatArray:
-        """Coefficients (k, k) of the monomials in the shape functions, each one at its own node."""
+        """Coefficients (k, k) of the monomials in the shape functions.
+
+        Each function is one at its own node and zero at the others, so that the coefficients are
+        the inverse of the matrix of the monomials at the nodes.
+        """
         monomials = self.node_positions[:, None, :] ** np.array(self.exponents)
-        # They are whole numbers on these reference cells.
+        # they are integers on these reference cells: rounding removes the error of the inverse
         return np.rint(np.linalg.inv(np.prod(monomials, axis=2)))
 
     @cached_property

@@ -1,7 +1,7 @@
 """Sparse Cholesky factors by the multifrontal method; solutions and modes by them.
 
 The unknowns are eliminated front by front, see `fe.full.fronts`. A front is a small dense matrix,
-which LAPACK factorises. What its pivots leave on its boundary, the Schur complement, is added to a
+which LAPACK factorises. The Schur complement of its pivots, on its boundary, is added to a
 later front.
 
 References
@@ -39,7 +39,7 @@ Thin cells make the condition number about 1e10, so that double precision reache
 def _analysed_pattern(
     size: int, row_starts: bytes, columns: bytes
 ) -> tuple[IntArray, tuple[Front, ...]]:
-    """Analyse a pattern; the cache answers for the same pattern with other values, as with damage.
+    """Analyse the pattern of a matrix; cached, since damage changes only the values of a matrix.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class _FrontFactor(NamedTuple):
 
 
 class _SchurComplement(NamedTuple):
-    """What the pivots of a front leave on its boundary.
+    """The Schur complement of a front's pivots, to be added to a later front.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Bases that are orthonormal in the energy norm of a stiffness X = L L', and solutions near it.
+"""Bases that are orthonormal in the energy norm of a stiffness X = L L', and nearby solutions.
 
 Everything is held in whitened coordinates, in which X is the identity: a displacement u as L' u, a
 load f as L^-1 f. Both are equal if u = X^-1 f. The energy norm of a displacement, and the dual norm
@@ -96,6 +96,7 @@ def solve_near(
         vectors = factors.unwhitened(flat.reshape(shape))
         return factors.whitened(affine_product(terms, coefficients, vectors)).ravel()
 
+    # right-hand sides of length one, so that the tolerance is relative
     length = np.linalg.norm(right_hand_sides, axis=0)
     length = np.where(length > 0.0, length, 1.0)
     unknowns = right_hand_sides.size

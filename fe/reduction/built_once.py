@@ -28,7 +28,7 @@ def built_once(
     build: Callable[[], Result],
     keep: Callable[[Result], object],
 ) -> Result:
-    """Return the result that a file holds, or build it and write the file.
+    """Return the result stored in a file, or build it and write the file.
 
     Of several processes that need the same result one builds it, and the others wait.
 
@@ -72,7 +72,7 @@ def built_once(
 
 @contextmanager
 def _locked(lock_file: Path, result_file: Path) -> Iterator[None]:
-    """Hold a lock while a result is built; without a writable folder there is nothing to guard."""
+    """Hold a lock while a result is built; without a writable folder nothing is locked."""
     try:
         lock_file.parent.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT, 0o644)

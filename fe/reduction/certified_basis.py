@@ -29,22 +29,22 @@ STATES_PER_ROUND = 4
 SEARCH_MARGIN = 0.5
 """The search goes on to this fraction of the tolerance, so that the basis can be compressed."""
 INSPECTED_ONE_OF = 6
-"""In each round one of so many states is evaluated, where the bound was largest; in the last round
-all of them are."""
+"""In each round the bound is evaluated at one of this many training states, those with the largest
+latest bounds; in the last round at all states."""
 SOLUTION_TOLERANCE = 1e-6
 """Relative residual of full solutions."""
 FIRST_SOLUTION_TOLERANCE = 1e-10
-"""The same of the first ones, which measure rounding."""
+"""Relative residual of the first full solutions, from which the rounding error is measured."""
 ROUNDING_FACTOR = 8.0
-"""The rounding allowance as a multiple of the difference seen at the first full solutions."""
+"""Ratio of the rounding allowance to the difference measured at the first full solutions."""
 LEAST_ROUNDING = 5e-6
 """Least rounding allowance: with condition numbers of 1e10, full solutions differ by 1e-6."""
 RESIDUAL_ROUNDING = 1e-7
 """Rounding allowance of the residual, per unit length of the reduced coordinates."""
 BASIS_DROP = 1e-7
-"""Shorter directions of full solutions are dropped, relative to the solutions of their round."""
+"""Directions shorter than this fraction of the solutions of their round are dropped."""
 RESIDUAL_DROP = 1e-8
-"""The same for the images of the basis that span the residuals."""
+"""The same for the images of the basis under the stiffness terms, which span the residuals."""
 LEAST_SINGULAR_VALUE = 1e-7
 """Singular directions below this fraction of the largest singular value are not used."""
 
@@ -249,22 +249,37 @@ class StaticReduction:
         )
 
     def _residual_factors(self, directions: FloatArray) -> _ResidualFactors:
-        """Return loads and images of combinations (N, K) of the basis, in a basis of residuals."""
+        """Return loads and stiffness images in the smallest basis that holds all residuals.
+
+        Parameters
+        ----------
+        directions : (N, K) array
+            Combinations of the N basis vectors that span the reduced model.
+        """
         images = self.residual_stiffness @ directions
-        # A Galerkin solution leaves nothing along the images of the basis under the energy norm.
+        # A Galerkin residual is orthogonal to the basis. In whitened coordinates the reference
+        # stiffness is the identity, so that the images of the basis under it are the basis itself:
+        # their span is projected out of all columns.
         reference_images = np.tensordot(images, self.terms.reference, (1, 0))
-        solved = np.linalg.qr(reference_images)[0]
+        basis_directions = np.linalg.qr(reference_images)[0]
         # The order of columns is: terms that change with health, loads, other terms. A column of
         # the triangular factor is zero below its diagonal, so that this keeps the first ones short.
         _, region_numbers = self.terms.stiffness_factors[:-1].T
         is_constant = region_numbers == 0
         order = np.argsort(is_constant, kind="stable")
         first_load = directions.shape[1] * np.count_nonzero(~is_constant)
-        columns = images[:, order].reshape(len(images), -1)
-        columns = np.concatenate(
-            (columns[:, :first_load], self.residual_load, columns[:, first_load:]), axis=1
+        images_and_loads = images[:, order].reshape(len(images), -1)
+        images_and_loads = np.concatenate(
+            (
+                images_and_loads[:, :first_load],
+                self.residual_load,
+                images_and_loads[:, first_load:],
+            ),
+            axis=1,
         )
-        residual_directions, factor = np.linalg.qr(columns - solved @ (solved.T @ columns))
+        residual_directions, factor = np.linalg.qr(
+            images_and_loads - basis_directions @ (basis_directions.T @ images_and_loads)
+        )
         # read out loads and terms, these in their own order
         loads = slice(first_load, first_load + self.loads.shape[1])
         ordered_terms = np.delete(factor, loads, axis=1).reshape(len(factor), len(order), -1)
@@ -297,7 +312,7 @@ class StaticReduction:
         """Return the certified relative bound of a reduced model at a state.
 
         It is the largest of all loads, each relative to its largest strain or displacement, or to
-        `least_outputs` where that is larger.
+        `least_outputs` if that is larger.
         """
         worst = 0.0
         for number, response in enumerate(self.responses(model, state)):
@@ -361,7 +376,7 @@ class StaticReduction:
         states : list of State
             The B training states.
         latest : (B,) array
-            The latest bound that is known of each state; updated where it is evaluated.
+            The latest bound of each state; updated for the states that are evaluated.
         target : float
             The evaluation stops early only if a bound is larger than this.
         inspect_all : bool
@@ -370,7 +385,7 @@ class StaticReduction:
         Returns
         -------
         (B,) array
-            The bounds; zero where they were not evaluated.
+            The bounds; zero for states that were not evaluated.
         """
         model = self.model()
         bounds = np.zeros(len(states))
@@ -411,14 +426,14 @@ class StaticReduction:
 
 
 def _most_central(states: list[State]) -> State:
-    """Return the state that is nearest to the mean of all, where the search begins."""
+    """Return the state closest to the mean of all states, at which the search begins."""
     points = np.array(states)
     distance_square = ((points - points.mean(axis=0)) ** 2).sum(axis=1)
     return states[int(distance_square.argmin())]
 
 
 def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: float) -> list[State]:
-    """Return the states for the next full solutions: bad ones that are far from each other.
+    """Return the states for the next full solutions: with large bounds, and far from each other.
 
     Parameters
     ----------
@@ -429,7 +444,7 @@ def _next_states(states: FloatArray, bounds: FloatArray, count: int, least: floa
     count : int
         The largest number of states.
     least : float
-        After the worst state only those with larger bounds are taken.
+        A state after the first is taken only if its bound is larger than this.
 
     Returns
     -------

@@ -32,7 +32,7 @@ class DualSolutions(NamedTuple):
     Attributes
     ----------
     functions : (A, M, O, n) array
-        The functions in whitened coordinates, orthonormal for each output, zero where there are
+        The functions in whitened coordinates, orthonormal for each output; zero if there are
         fewer than M.
     residual : (A, O, R, R) array
         Field `dual_residual` of `ReducedArrays`.
@@ -157,7 +157,8 @@ def _project_batch(
     forces_by_output = forces.reshape(size, count, -1).swapaxes(0, 1)
     projections = []
     for output, projected, force in zip(outputs.T, projected_terms, forces_by_output, strict=True):
-        # A dropped direction is zero; a one on the diagonal keeps the system solvable.
+        # A dropped direction is zero; a one on its diagonal keeps the system solvable. It is added
+        # to the last term, which is constant.
         is_dropped = np.diagonal(projected.sum(axis=0)) == 0.0
         projected[-1] += np.diag(is_dropped)
         projections.append((_residual_factor(output, force), projected))

@@ -106,7 +106,7 @@ def modal_reduction(terms: ReductionTerms, count: int, stage: Stage) -> ModalRed
 def _start_basis(terms: ReductionTerms, mode_count: int) -> ProjectedBasis:
     """Return a working basis from a few inverse iterations on a block of vectors.
 
-    The iterations are not converged: the refinement corrects what they leave.
+    The iterations need not converge, since the refinement corrects the modes.
     """
     structure = terms.structure
     factors = terms.factors

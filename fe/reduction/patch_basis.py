@@ -61,7 +61,7 @@ OTHER_STRAIN_WEIGHT = 0.4
 """Weight of the solutions under strains across a gauge, and under shear strains, as loads."""
 MODE_WEIGHTS = np.array([3.0, 3.0, 6.0, 3.0, 1.5, 1.0, 0.5, 0.3])
 UNCHANGED_WEIGHT = 10.0
-"""Weight of the wing as it was; a patched state has one."""
+"""Weight of the snapshots of the unchanged wing; those of a patched state have a weight of one."""
 
 
 class _ChangeProbabilities(NamedTuple):
@@ -112,7 +112,11 @@ def reduce_patches(operators: AffineOperators, progress: Progress | None = None)
 
 
 def _working_basis(full: PatchOperators) -> FloatArray:
-    """Return a basis (n, N) that holds the snapshots of both states, orthonormal in the energy."""
+    """Return a basis (n, N) of the snapshots of the healthy and the damaged wing.
+
+    The columns are orthonormal in the energy norm (method of snapshots): with the eigenpairs of the
+    Gram matrix S^T K S v = w v, they are S v / sqrt(w).
+    """
     snapshots = np.concatenate((_snapshots(full, 0.0), _snapshots(full, DAMAGED_LOSS)), axis=1)
     gram = snapshots.T @ (full.operators.stiffness() @ snapshots)
     squares, vectors = np.linalg.eigh(gram)
@@ -183,7 +187,7 @@ def _snapshot_loads(full: PatchOperators, modes: FloatArray) -> FloatArray:
 
 
 def _skin_forces(full: PatchOperators, solutions: FloatArray) -> list[FloatArray]:
-    """Return the forces (n, s) of each part of the skin in main solutions, and in those of gauges.
+    """Return the elastic forces (n, s) of each part of the skin in the snapshot solutions.
 
     Parameters
     ----------
@@ -201,7 +205,7 @@ def _skin_forces(full: PatchOperators, solutions: FloatArray) -> list[FloatArray
     )
     main_modes = solutions[:, -MODES:][:, :INERTIA_SHAPES]
     main_solutions = np.concatenate((of_main_loads, main_modes), axis=1)
-    # a local change matters to the gauges near its strip
+    # the solutions of a gauge's loads matter only for changes in strips close to the gauge
     edges = layout["strip_lines"]
     strip_middles = 0.5 * (edges[1:] + edges[:-1])
     part_middles = strip_middles[layout["strip_of"], np.newaxis]
@@ -284,7 +288,8 @@ class _SnapshotLoads(NamedTuple):
 def _kept_directions(arrays: PatchArrays) -> FloatArray:
     """Return the directions (N, n) of the working basis that are kept.
 
-    They are the largest eigenvectors of the weighted sum of all snapshots' outer products.
+    Proper orthogonal decomposition: the eigenvectors with the largest eigenvalues of the weighted
+    sum of the outer products of all snapshots, at random patched states.
     """
     wing = PatchedWing(arrays)
     loads = _weighted_loads(wing)

@@ -73,7 +73,7 @@ def reduce_structure(
     Raises
     ------
     ReductionError
-        If the structure has nothing that a twin needs, or the accuracy is not reached.
+        If the structure lacks regions, loads, outputs or mass, or the accuracy is not reached.
     SolutionError
         If the full model cannot be solved.
     """
@@ -101,7 +101,7 @@ def reduce_structure(
 
 
 def _check_reducible(terms: ReductionTerms) -> None:
-    """Raise `ReductionError` if a twin could do nothing with the structure."""
+    """Raise `ReductionError` if the structure lacks regions, loads, outputs or mass."""
     structure = terms.structure
     name = structure.design.name
     if not structure.regions:

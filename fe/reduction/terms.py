@@ -19,11 +19,11 @@ State = tuple[float, ...]
 """Values of the parameters, then the losses of the damage regions."""
 
 LEAST_COSINE = 1e-3
-"""An output is compared with at least this fraction of the largest output that a load of the same
-energy could cause."""
+"""Least output, relative to the largest output that a load of the same energy could cause. Errors
+are relative to no smaller output."""
 UNSEEN_FRACTION = 0.1
-"""A load that no output sees is judged by this fraction of the largest output of the other
-loads, each at its largest coefficient."""
+"""If no output responds to a load, its errors are relative to this fraction of the largest output
+of all loads, each at its largest coefficient."""
 INNER_MODAL_STATES = 10
 """States inside the box at which the working basis of the modes is refined."""
 INNER_TRAINING_STATES = 128
@@ -50,7 +50,9 @@ class ModalState(NamedTuple):
 
 
 def loss_at(ranges: FloatArray, fraction: FloatArray) -> FloatArray:
-    """Return losses at fractions of their ranges, in equal ratios of the remaining stiffness.
+    """Return losses at fractions of their ranges, with the remaining stiffness in equal ratios.
+
+    The remaining stiffness 1 - loss goes from 1 - low to 1 - high as a geometric sequence.
 
     Parameters
     ----------
@@ -142,7 +144,11 @@ class ReductionTerms:
         self._set_reference()
 
     def _set_stiffness_terms(self) -> None:
-        """Set the stiffness terms with their factors; the error bound needs a constant one."""
+        """Set the stiffness terms and the parameter and region that each is proportional to.
+
+        The last term has to be constant, as the error bound needs one: if it is not, a constant
+        term of zeros is added.
+        """
         parameters = tuple(self.structure.parameters)
         regions = self.structure.regions
         matrices = [term.matrix for term in self.structure.stiffness_terms]
@@ -158,25 +164,33 @@ class ReductionTerms:
         self.stiffness_factors: IntArray = np.array(factors, dtype=np.int64)
 
     def _set_loads(self) -> None:
-        """Set the loads: the sum of all load terms with the same control and the same free mass."""
+        """Set the load vectors, with load terms of the same control and free mass added up.
+
+        A load term is proportional to a control (such as the load factor), to a free mass, to both
+        or to neither. Sums that are zero are left out.
+        """
         controls = tuple(self.structure.controls)
         masses = tuple(self.structure.masses)
-        vectors: dict[tuple[int, int], FloatArray] = {}
+        load_sums: dict[tuple[int, int], FloatArray] = {}
         for term in self.structure.load_terms:
             control = self.structure.loads[term.load]
-            factors = (
+            control_and_mass = (
                 _number_from_one(controls, control),
                 _number_from_one(masses, term.mass),
             )
-            if factors in vectors:
-                vectors[factors] = vectors[factors] + term.vector
+            if control_and_mass in load_sums:
+                load_sums[control_and_mass] = load_sums[control_and_mass] + term.vector
             else:
-                vectors[factors] = term.vector
-        vectors = {factors: vector for factors, vector in vectors.items() if vector.any()}
-        self.load_factors: IntArray = np.array(list(vectors), dtype=np.int64).reshape(-1, 2)
-        # A column of zeros keeps the shape of a stack of no loads.
-        nothing = np.zeros(self.structure.unknowns)
-        self.loads: FloatArray = np.stack([nothing, *vectors.values()], axis=1)[:, 1:]
+                load_sums[control_and_mass] = term.vector
+        load_sums = {
+            control_and_mass: vector
+            for control_and_mass, vector in load_sums.items()
+            if vector.any()
+        }
+        self.load_factors: IntArray = np.array(list(load_sums), dtype=np.int64).reshape(-1, 2)
+        # np.stack needs an array, also if there is no load: a column of zeros is stacked and cut.
+        zero_column = np.zeros(self.structure.unknowns)
+        self.loads: FloatArray = np.stack([zero_column, *load_sums.values()], axis=1)[:, 1:]
 
     def _set_outputs(self) -> None:
         """Set the outputs and the groups in which they are judged."""
@@ -213,10 +227,12 @@ class ReductionTerms:
         return loss_at(self.losses, np.array(fractions)[:, np.newaxis])
 
     def anchors(self) -> list[list[FloatArray]]:
-        """Return, for each anchor, the coefficients (T,) at which dual solutions are wanted.
+        """Return the states of each anchor, as coefficients (T,) of the stiffness terms.
 
-        With a few regions an anchor is one state in each cell of a grid of losses, of which the
-        last changes first. With many regions the corners of the box surround a single anchor.
+        An anchor is a group of states whose dual solutions are combined to those of nearby states.
+        With few regions, the range of losses is divided into a grid, and each of its cells has an
+        anchor of one state; the loss of the last region changes first. With many regions there is a
+        single anchor, whose states are the corners of the box of parameters and losses.
         """
         if not self.splits.size:
             corner_states = self.states(cube_corners(self.varied))
@@ -234,8 +250,7 @@ class ReductionTerms:
         Parameters
         ----------
         fractions : (B, P + K) array
-            Fractions of the ranges of parameters and losses. A loss goes by equal ratios of the
-            remaining stiffness.
+            Fractions of the ranges of parameters and losses; for losses see `loss_at`.
         """
         first_loss = len(self.parameters)
         low, high = np.concatenate((self.parameters, self.losses)).T
@@ -289,7 +304,10 @@ class ReductionTerms:
         ]
 
     def least_outputs(self, loads: FloatArray, outputs: FloatArray) -> FloatArray:
-        """Return the outputs below which a load counts as unseen, see `LEAST_COSINE`.
+        """Return the least outputs to which errors are relative, see `LEAST_COSINE`.
+
+        In whitened coordinates, an output l responds to a load f by l . f, which is at most |l| |f|
+        (Cauchy and Schwarz).
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""Formulas that users write: texts that are checked to hold nothing but arithmetic.
+"""Formulas that users write: their text is checked to contain only arithmetic, and evaluated.
 
 An expression has one value for one value of each name, or a value at each of many times. NumPy and
 relative imports only: this file is copied into the FMU.
@@ -191,7 +191,7 @@ class Expression:
     def with_numbers(self, values: Mapping[str, float]) -> str:
         """Return the text with numbers in the place of names.
 
-        A negative number stands in brackets, so that a power of it stays what it is.
+        A negative number is put in brackets: -2 ** 2 would be -(2 ** 2).
         """
 
         def number_for(match: re.Match[str]) -> str:

@@ -154,7 +154,7 @@ class ModalSystem:
 
     @cached_property
     def motion_rates(self) -> FloatArray:
-        """How fast the system can move: nonzero frequencies or magnitudes of eigenvalues [1/s]."""
+        """Angular frequencies, or magnitudes of the eigenvalues, that are not zero [1/s]."""
         if self.stiffness_matrix is None and np.all(self.angular_frequency > 0.0):
             return self.angular_frequency
         magnitude = np.abs(self._eigenvectors.rates)
@@ -162,15 +162,16 @@ class ModalSystem:
 
     @cached_property
     def _free_modes(self) -> "_FreeModes | None":
-        """The free motion as damped oscillations; None where eigenvectors are nearly parallel.
+        """The free motion as damped oscillations; None if eigenvectors are nearly parallel.
 
-        That is the case near critical damping.
+        They are nearly parallel close to critical damping.
         """
         speed_unit, rates, vectors = self._eigenvectors
         if not np.linalg.cond(vectors) < LARGEST_CONDITION:
             return None
         scale = np.concatenate((np.ones_like(speed_unit), speed_unit))
-        # of a conjugate pair the one with positive frequency counts twice
+        # The two of a conjugate pair add to twice the real part of one: only that with a positive
+        # imaginary part is kept, and counted twice.
         chosen = rates.imag >= 0.0
         multiplicity = np.where(rates.imag > 0.0, 2.0, 1.0)
         amplitudes = np.linalg.inv(vectors) / scale * multiplicity[:, None]
@@ -191,14 +192,14 @@ class ModalSystem:
         Returns
         -------
         q, v : (N, M) array
-            The motion, or None where it cannot be written so (near critical damping); time steps
-            must give it then.
+            The motion; None close to critical damping, where such a sum is inaccurate and time
+            steps have to be used.
         """
         if self._free_modes is None:
             return None
         rates, shapes, amplitudes = self._free_modes
-        # At evenly spaced times e^(r (t_i + s_j)) = e^(r t_i) e^(r s_j): blocks of the square root
-        # of N times, of which only the first is computed by exponentials.
+        # At evenly spaced times e^(r (t_i + s_j)) = e^(r t_i) e^(r s_j). With blocks of sqrt(N)
+        # times, only 2 sqrt(N) exponentials are needed for each r.
         block_begin = time
         offset = np.zeros(1)
         even_time = np.linspace(time[0], time[-1], len(time))
@@ -210,7 +211,7 @@ class ModalSystem:
         at_offsets = np.exp(np.outer(offset, rates))[:, None] * at_begin
         in_block = at_offsets.reshape(-1, len(rates)).T
         wave = np.exp(np.outer(block_begin, rates))
-        # real part of the product of complex matrices
+        # Re(a b) = Re a Re b - Im a Im b, as one real matrix product
         motion = np.hstack((wave.real, -wave.imag)) @ np.vstack((in_block.real, in_block.imag))
         motion = motion.reshape(-1, 2 * len(q))[: len(even_time)]
         return motion[:, : len(q)], motion[:, len(q) :]
@@ -235,7 +236,7 @@ class _Eigenvectors(NamedTuple):
     Attributes
     ----------
     speed_unit : (M,) array
-        Units in which the vectors have their speeds, which balances the matrix [1/s].
+        Units of the speeds in the eigenvectors, chosen to balance the matrix [1/s].
     rates : (2M,) array
         Eigenvalues [1/s].
     vectors : (2M, 2M) array
@@ -271,9 +272,9 @@ class ExactSteps(NamedTuple):
     Attributes
     ----------
     transition : (S, 2M, 2M) array
-        New state by the old one.
+        Transition matrix from the old to the new state.
     begin, end : (S, 2M, M) array
-        What the forces at the begin and at the end of a step add to the new state.
+        Change of the new state by unit forces at the begin, and at the end, of a step.
     """
 
     transition: FloatArray
@@ -288,7 +289,7 @@ def _exact_steps(stiffness: bytes, damping: bytes, lengths: bytes) -> ExactSteps
     Parameters
     ----------
     stiffness : bytes of (M, M) or (M,) array
-        S, or its diagonal where nothing couples the coordinates.
+        S, or its diagonal if nothing couples the coordinates.
     damping : bytes of (M, M) array
         D.
     lengths : bytes of (S,) array

@@ -60,9 +60,10 @@ def static_solution(
     start: FloatArray | None = None,
     kernel: Kernel | None = None,
 ) -> StaticSolution:
-    """Return the forces of laws at rest, for load levels that follow one another from zero.
+    """Return the forces of laws in static equilibrium, at successive load levels.
 
-    The response of the structure is the linear response minus the response to these forces.
+    The displacement of the structure is then that of the linear structure under the loads minus
+    that under these forces.
 
     Parameters
     ----------
@@ -138,9 +139,9 @@ def integrate_motion(
 ) -> ModalMotion:
     """Return the motion of a system with laws, at the samples of prepared time steps.
 
-    Where a law begins or ends to act, a new section of the motion begins. Modes and the laws that
-    go on keep their state; a law that begins has been loaded from zero to where its port is. A
-    stamp at such a time belongs to the new section.
+    If a law begins or ends to act at a time, a new section of the motion begins there. Modes keep
+    their state, and so do laws that continue to act. A law that begins to act is loaded from zero
+    to the position of its port. A sample at that time belongs to the new section.
 
     Parameters
     ----------

@@ -12,8 +12,8 @@ RecordFields = tuple[Any, ...]
 """The fields of one of the records below, as a plain tuple, which numba compiles faster."""
 
 SPEED_LAW, IMMOVABLE = -1, -2
-"""In the place of a leader: a law of speed that acts on the modes; a law whose port does not
-move."""
+"""Values of `PortArrays.leader` for a law of speed that acts on the modes, and for a law whose port
+cannot move."""
 
 
 class StepArrays(NamedTuple):
@@ -22,17 +22,18 @@ class StepArrays(NamedTuple):
     Attributes
     ----------
     transition : (S, 2M, 2M) array
-        New state (q, v) by the old one, for each of S distinct lengths.
+        Transition matrix of the state (q, v) over a step, for each of S distinct lengths.
     length : (S,) array
         Distinct lengths of steps [s].
     length_of_step : (K,) array of int
         Number of the length of each step.
     increment : (K, 2M) array
-        What the applied forces add to (q, v) in each step.
+        Change of the state (q, v) by the applied forces in each step.
     begin_force, end_force : (K, M) array
         Applied modal forces at the begin and at the end of each step.
     residual_position : (K + 1, J) array
-        What loads add to the positions of the laws' ports beyond the modes, at each boundary.
+        Displacements of the laws' ports under the loads in the modes that are left out, at each
+        boundary.
     time : (K + 1,) array
         Times of the boundaries [s].
     sample_boundary : (N,) array of int
@@ -64,12 +65,12 @@ class PortArrays(NamedTuple):
     motion_rows : (J, M) array
         Modal row of the motion of each law's port.
     force_rows : (J, M) array
-        Modal row along which each law acts. It is the motion row, but for flows from one store into
-        another.
+        Modal row along which each law acts. It equals the motion row, except for a law that moves
+        something from one state into another (such as a flow between tanks).
     inverse_mass : (J,) array
         Speed of the law's port after a unit impulse of the law: motion row . force row.
     leader : (J,) array of int
-        The first law at the same position of a port, which settles the position for all of them;
+        The first of the laws that share a port position, which is solved once for all of them;
         or `SPEED_LAW`, or `IMMOVABLE`.
     impulse_response : (S, J, 2M) array
         State (q, v) at the end of a step of each length after a unit impulse of the law at its
@@ -111,22 +112,22 @@ class ModalState(NamedTuple):
 
 
 class StepWorkspace(NamedTuple):
-    """What a step needs to know of its begin, and room for a new state.
+    """Values at the begin of a step that are needed at its end, and a buffer for the new state.
 
     Attributes
     ----------
     q, v : (M,) array
         Modal coordinates and speeds at the begin.
     new_state : (2M,) array
-        Room for (q, v).
+        Buffer for (q, v).
     forces : (J,) array
         Forces of the laws at the begin.
     speed : (J,) array
         Speed of the port of each law of speed at the begin.
     speed_lost : (J,) array
-        What the first half of the law's impulse took of it.
+        Decrease of that speed by the first half of the law's impulse.
     broke_loose : (J,) array
-        1 where dry friction let its port go in this step.
+        1 if dry friction that held the port gave way in this step, else 0.
     """
 
     q: FloatArray
@@ -148,7 +149,7 @@ class ModalMotion(NamedTuple):
     port_forces : (N, J) array
         Forces of the laws [N or N m].
     lagged_forces : (N, J) array
-        The forces as the residual position follows them.
+        The forces after the first-order lag with which the residual position follows them.
     memory : (J, 5 + E) array
         Memory of the laws after the last sample.
     """

@@ -1,4 +1,4 @@
-"""Model patches: sets of primitive changes that a missing physical effect consists of.
+"""Model patches: sets of primitive changes that together represent a missing physical effect.
 
 A patch is plain data. The reduced model, the full model, the FMU and the twin understand the same
 primitives; which physical effect a set of them stands for only `discrepancy.catalogue` knows.
@@ -95,7 +95,7 @@ class StiffnessDrift(Primitive):
 
 
 class LoadPlace(Primitive):
-    """Forces act `along_span` [m] further outboard, `along_chord` [m] further aft than recorded."""
+    """Forces act further outboard (`along_span` [m]) and further aft (`along_chord` [m])."""
 
     along_span: Annotated[float, "m"]
     along_chord: Annotated[float, "m"]
@@ -128,7 +128,7 @@ class InertiaRelief(Primitive):
 
 
 class PortLoad(Primitive):
-    """A `force` [N or N m] pushes a port along its motion, a formula in `time` [s] of the trial."""
+    """A `force` [N or N m] acts on a port, given as a formula in the `time` [s] of the trial."""
 
     can_act_in_windows: ClassVar[bool] = True
     formula_fields: ClassVar[tuple[str, ...]] = ("force",)
@@ -157,7 +157,7 @@ SENSORS = (
     DecayingLine,
     RunOffset,
 )
-"""Primitives that change what is read, not what happens."""
+"""Primitives that change readings of sensors, but not the motion of the structure."""
 _PRIMITIVE_TYPES: tuple[type[Primitive], ...] = (
     *STRUCTURE,
     StiffnessDrift,
@@ -194,8 +194,15 @@ class ModelPatch:
     def in_trial(self, trial: str) -> "ModelPatch":
         """Return the part of the patch that acts in a trial.
 
-        A primitive keeps its windows of this trial only. It has none left where a window spans the
-        whole trial, and it drops out where all its windows lie in other trials.
+        A primitive without windows acts always, in all trials; one with windows acts only in these.
+        Of its windows, a primitive keeps those of this trial. If one of them spans the whole trial,
+        the primitive acts always in it, and so is returned without windows. If all windows lie in
+        other trials, the primitive is left out.
+
+        Parameters
+        ----------
+        trial : str
+            Name of the trial.
         """
         if not self.has_windows:
             return self
@@ -262,7 +269,7 @@ class ModelPatch:
 
 
 _ACCEPTED_TYPES: dict[type, tuple[type, ...]] = {float: (float, int), int: (int,), str: (str,)}
-"""Types in a file that stand for a value's type."""
+"""The types that a value may have in a file, by the type that it is converted to."""
 _WINDOW_TYPES: dict[str, type] = {"trial": str, "begin": float, "end": float}
 
 

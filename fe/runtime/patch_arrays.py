@@ -26,8 +26,8 @@ class PatchArrays(StoredArrays):
     validity_box : (K + 5, 2) array
         Least and largest value of each of `fe.runtime.state.wing_input_names`, SI units.
     largest_loss, largest_compliance, largest_mass : float
-        Stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] up to which
-        the basis was made; the accuracy falls slowly beyond.
+        Largest stiffness loss of a strip [1], root compliance [rad/(N m)] and point mass [kg] for
+        which the basis was made; beyond them the accuracy decreases slowly.
     stiffness : (K + 2, n, n) array
         Stiffness terms: the skin, the K damage regions, the rest.
     mass : (3, n, n) array
@@ -62,7 +62,7 @@ class PatchArrays(StoredArrays):
     load_lift : (n,) array
         Load of load factor 1 [N].
     lift_rows : (P, n) array
-        The same without the weight, by stations.
+        The lift of load factor 1 without the weight, as one load for each station [N].
     weight : (n,) array
         Weight, downwards [N].
     strain_rows : (3, G, n) array

@@ -1,4 +1,4 @@
-"""The wing with changes, online: what the primitives of `patch` do to structure, loads and outputs.
+"""The wing under a patch: stiffness, mass, loads and outputs with the changes of its primitives.
 
 NumPy and relative imports only: this file is copied into the FMU. The arrays are those of
 `fe.runtime.wing_rows`; the equations are in `docs/patches.md`.
@@ -23,10 +23,10 @@ from .wing_rows import NO_PATCH, STATIC_TEST_LOAD, WingRows
 ITERATIONS = 3
 """Steps of the subspace iteration for the modes of a patched wing."""
 NEGLIGIBLE_REMAINDER = 1e-7
-"""Size of what a basis leaves out of a static shape, relative to the shape, below which it is
-held."""
+"""A basis contains a static shape if the remainder outside of the basis is smaller than this
+fraction of the shape."""
 MODE_COUNT = 6
-"""Number of modes that move."""
+"""Number of modes with inertia."""
 HOLDING_LOAD = 3
 """Number of the load that holds the wing before a release."""
 
@@ -76,23 +76,23 @@ def motion_basis(
     start : (n, r) array
         Modes of a similar structure.
     static_shapes : (n, s) array
-        Static shapes that the basis holds as well.
+        Static shapes that the basis must contain as well.
 
     Returns
     -------
     (n, r + s) array
-        Orthonormal columns; fewer where the modes, or other shapes, hold a static shape already.
+        Orthonormal columns; fewer if the span of the others already contains a static shape.
     """
     basis = start
     for _ in range(ITERATIONS):
         basis = np.linalg.qr(static(mass @ basis))[0]
     for shape in (static_shapes / np.linalg.norm(static_shapes, axis=0)).T:
-        # Gram and Schmidt in two passes, because the basis holds the shape but for a small
-        # remainder
+        # Gram-Schmidt in two passes: the first leaves rounding errors in the basis' directions,
+        # which matter if the remainder is small
         remainder = shape - basis @ (basis.T @ shape)
         remainder = remainder - basis @ (basis.T @ remainder)
         size = float(np.linalg.norm(remainder))
-        # a shape that is held already, or given twice, would add a direction of rounding
+        # the remainder of a shape that the basis contains is only rounding, and must not be added
         if size > NEGLIGIBLE_REMAINDER:
             basis = np.concatenate((basis, remainder[:, np.newaxis] / size), axis=1)
     return np.asarray(basis)
@@ -184,7 +184,7 @@ class PatchedWing(WingRows):
     def _add_root_compliance(self, stiffness: FloatArray, patch: ModelPatch) -> None:
         """Put the root compliances of a patch in series with the spring at the root, in place.
 
-        Raises `InvalidPatchError` where they leave no spring.
+        Raises `InvalidPatchError` if no spring remains.
         """
         spring = self.arrays.flap_spring
         compliance = sum(
@@ -277,8 +277,8 @@ class PatchedStructure:
 
     holding_load = HOLDING_LOAD
     mode_count = MODE_COUNT
-    # Beyond the modes neighbouring stations move one another half as much as themselves, which a
-    # residual flexibility of each port by itself cannot represent.
+    # The residual flexibility couples neighbours (a force moves the next station half as far
+    # as its own station), which one flexibility for each port cannot represent.
     rigid_ports = frozenset(STATION_PORTS)
 
     def __init__(

@@ -23,10 +23,10 @@ from .primitive import Primitive
 # ---------------------------------------------------------------- forces spread over a planform
 
 PLANFORM = "planform"
-"""The port of a force that is spread over a planform, such as that of air, which resists where a
-wing moves, not its mean motion. The law acts at every station on the motion of that station, with a
-force in proportion to the station's fraction of the area. The stations are those of the integral of
-Gauss and Legendre along the span."""
+"""The port of a force that is distributed over a planform, such as aerodynamic damping, which
+depends on the local motion and not on the mean motion of the wing. The law acts at every station on
+the motion of that station, with a force in proportion to the station's fraction of the area. The
+stations are the points of Gauss-Legendre integration along the span."""
 STATION_COUNT = 6
 """Stations of the integral: ring-downs under quadratic drag are within 1e-3 microstrain of those
 with 24 stations."""
@@ -45,7 +45,7 @@ def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> Model
     Parameters
     ----------
     patch : ModelPatch
-        A patch; what acts elsewhere stays, in its order.
+        A patch; its other primitives are kept, in their order.
     area_fractions : (S,) array
         Fraction of the planform's area of each station.
     """
@@ -65,7 +65,7 @@ def spread_over_stations(patch: ModelPatch, area_fractions: FloatArray) -> Model
 # ---------------------------------------------------------------- laws of a patch
 
 Span = tuple[float, float]
-"""Begin and end of a stretch of time [s]."""
+"""Begin and end of a time interval [s]."""
 
 
 @dataclass(frozen=True)
@@ -83,8 +83,8 @@ class PortLaws:
     stiffness_rate : float
         Drift of the whole structure's stiffness [1/s].
     active_spans : tuple of tuple of (float, float)
-        Stretches of time in which each law acts [s], none for a law that always acts; empty where
-        all laws always act.
+        Time intervals in which each law acts [s]; an empty tuple for a law that always acts. The
+        whole is empty if all laws always act.
     drift_start : float
         Time at which the stiffness begins to drift [s].
     """
@@ -116,7 +116,7 @@ class PortLaws:
         width : int
             Number of coordinates.
         time : float, optional
-            A time [s] at which the rows of laws that do not act are zero.
+            A time [s]: rows of laws that do not act then are set to zero.
 
         Returns
         -------
@@ -241,7 +241,7 @@ def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = F
     ------
     InvalidPatchError
         If a law acts on a port that the model does not have, has an impossible number, or acts in a
-        window only where the model cannot follow it.
+        window but the model cannot follow windows.
     """
     forces = []
     for law in patch.of(PortForce):
@@ -260,7 +260,7 @@ def port_laws(patch: ModelPatch, ports: Collection[str], *, in_windows: bool = F
     stiffness_rate = sum((drift.rate for drift in drifts), 0.0)
     if not forces:
         return replace(NO_LAWS, stiffness_rate=stiffness_rate) if stiffness_rate else NO_LAWS
-    # rows of one length, with zeros after shorter ones
+    # pad the parameters of all laws to one length
     rows = [law.parameter_row for law in forces]
     longest = max(map(len, rows))
     spans = tuple(tuple(window.span for window in law.windows) for law in forces)
@@ -286,16 +286,15 @@ def _check_port(law: PortForce, ports: Collection[str]) -> None:
 
 
 LEAST_RESIDUAL = 0.1
-"""Fraction of a port's flexibility that modes must leave out for damping there to act through
-it."""
+"""If the modes leave out less than this fraction of a port's flexibility, laws of speed there act
+on the modes, else on the residual flexibility."""
 
 
 def port_flexibility(system: ModalSystem, laws: PortLaws) -> FloatArray:
     """Return the residual flexibility (J,) of the laws' ports.
 
-    It is zero for damping at ports where the modes give nearly all of the flexibility: friction
-    there acts on the modes themselves, which needs no small steps. Forces at other ports do not
-    count.
+    It is set to zero for a law of speed at a port whose flexibility is nearly all in the modes: the
+    law then acts on the modes themselves, which needs no small time steps.
     """
     flexibility = np.zeros(len(laws))
     if system.flexibility is None or not len(laws):
@@ -304,7 +303,8 @@ def port_flexibility(system: ModalSystem, laws: PortLaws) -> FloatArray:
     residual = system.flexibility[[port_names.index(name) for name in laws.ports]]
     rows = laws.port_rows(system.ports, len(system.angular_frequency))
     with np.errstate(divide="ignore", invalid="ignore"):
-        of_modes = np.nansum(rows**2 / system.angular_frequency**2, axis=1)
-    nearly_rigid = residual < LEAST_RESIDUAL * (residual + of_modes)
+        # a unit force at the port moves it by the sum of row^2 / omega^2 in the modes
+        modal_compliance = np.nansum(rows**2 / system.angular_frequency**2, axis=1)
+    nearly_rigid = residual < LEAST_RESIDUAL * (residual + modal_compliance)
     acts_on_modes = (laws.depends_on_speed == 1) & nearly_rigid
     return np.where(acts_on_modes | (residual <= 0.0), 0.0, residual)

@@ -17,9 +17,9 @@ from .expression import Expression
 
 
 class Window(NamedTuple):
-    """A stretch of one trial, from `begin` to `end` in the trial's time [s].
+    """A time interval in one trial, from `begin` to `end` in the trial's time [s].
 
-    Without a begin it starts with the first sample; without an end it lasts to the last one.
+    Without a begin it starts at the first sample; without an end it lasts to the last sample.
     """
 
     trial: str
@@ -28,7 +28,7 @@ class Window(NamedTuple):
 
     @property
     def span(self) -> tuple[float, float]:
-        """Begin and end [s], infinite where the window is open."""
+        """Begin and end [s]; infinite if the window has none."""
         begin = -inf if self.begin is None else self.begin
         end = inf if self.end is None else self.end
         return begin, end
@@ -56,8 +56,8 @@ class Primitive:
     Attributes
     ----------
     windows : tuple of Window
-        The primitive acts within these only, and in no trial that they do not name; without
-        windows it acts always.
+        Time intervals in which the primitive acts. It does not act in trials without a window.
+        If the tuple is empty, it acts always, in all trials.
 
     Raises
     ------
@@ -66,7 +66,7 @@ class Primitive:
     """
 
     kind: ClassVar[str]
-    """Name of the class in a file: the class name in lower case, words apart by underscores."""
+    """Name of the class in a file: the class name in lower case with underscores (`point_mass`)."""
     units: ClassVar[dict[str, str]] = {}
     """Unit of each real number, from the annotation of its type. At a port "N or N m" and the like:
     the unit for a port that is displaced, then the unit for one that turns."""
@@ -100,7 +100,7 @@ class Primitive:
             time_formula(getattr(self, name), self.kind)
 
     def _check_windows(self) -> None:
-        """Raise `InvalidPatchError` for windows where there can be none, or an empty window."""
+        """Raise `InvalidPatchError` if the primitive cannot have windows, or a window is empty."""
         if self.windows and not self.can_act_in_windows:
             raise InvalidPatchError(f"The primitive {self.kind!r} cannot act in a window only.")
         for window in self.windows:

@@ -30,8 +30,8 @@ class ReducedStructure:
     """A reduced structure at fixed inputs, as a `StructureInMotion` in Nm + N coordinates.
 
     The first Nm coordinates belong to the modal basis, the others to the static basis. Motion
-    happens in the modal basis; the static basis holds what the modes leave out, and is solved by
-    itself.
+    happens in the modal basis; the static basis represents displacements that the modes leave out,
+    and is solved on its own.
 
     Parameters
     ----------
@@ -206,16 +206,27 @@ class ReducedModel(ReducedArrays):
 
     @staticmethod
     def _factor_columns(factors: IntArray, first: int, second: int) -> IntArray:
-        """Return columns of factors (k, 2) that are counted from one, after these two columns.
+        """Return the columns (2, k) of the two factors of each of k terms, see `_products`.
 
-        Zero stays zero: the column of ones.
+        Parameters
+        ----------
+        factors : (k, 2) array of int
+            The two factors of each term, each counted from one within its kind; zero for none.
+        first, second : int
+            Number of columns before those of the kind of the first, and of the second factor.
+
+        Returns
+        -------
+        (2, k) array of int
+            The columns. A factor that is none has column zero, whose values are one.
         """
         return np.where(factors > 0, factors + np.array((first, second)), 0).T
 
     def _products(self, vectors: FloatArray, columns: IntArray) -> FloatArray:
-        """Return the products (..., k) of two columns (2, k) at inputs (..., V).
+        """Return the coefficients (..., k) of k terms at inputs (..., V): products of two factors.
 
-        Column 0 is one, then come the inputs, then the healthy fractions 1 - loss of the regions.
+        The factors are taken from columns of values: column 0 is one, then come the V inputs, then
+        the healthy fractions 1 - loss of the damage regions.
         """
         healthy = 1.0 - vectors[..., self._loss_inputs]
         values = np.concatenate((np.ones_like(vectors[..., :1]), vectors, healthy), axis=-1)

@@ -74,10 +74,12 @@ class ReducedArrays(StoredArrays):
         Stiffness terms times static basis vectors, in the same basis. The residual is that of the
         loads minus the changes of the coefficients from `bound_reference` times these.
     residual_allowance : float
-        Bound of the residual outside of that basis, per unit length of the reduced coordinates.
+        Bound of the part of the residual outside of that basis, per unit length of the reduced
+        coordinates.
     rounding_allowance : float
         Fraction of the norm of the strains, and of displacements, that is added to the bounds for
-        rounding: a multiple of the difference seen where the reduced model holds the full solution.
+        rounding: a multiple of the difference measured at states whose full solutions are in the
+        basis.
     dual_split : (K,) or (0,) array
         Value of each loss at which the second of two anchors along it takes over; A = 2^K anchors,
         or one. At each, M dual functions of an output are combined to its approximate dual
@@ -270,7 +272,8 @@ class CertifiedSolver:
         self.stiffness = np.ascontiguousarray(stiffness.reshape(term_count, -1))
         self._load = arrays.static_load
         self._output = arrays.static_output
-        # times (the loads, the changes of the coefficients times the coordinates): the residual
+        # this matrix gives the residual from the loads, followed by the products of changes of
+        # coefficients and coordinates
         residual_terms = arrays.residual_stiffness.reshape(len(arrays.residual_load), -1)
         self._residual = np.concatenate((arrays.residual_load, -residual_terms), axis=1)
         self._allowance = arrays.residual_allowance
@@ -300,7 +303,7 @@ class CertifiedSolver:
         losses : tuple of float
             Stiffness losses of the damage regions.
         """
-        # many loads in turn act on a structure in the same state of health
+        # successive loads often act on a structure in the same state: the latest solution is kept
         key = (theta.tobytes(), losses)
         if self._latest_dual is not None and self._latest_dual[0] == key:
             return self._latest_dual[1]
@@ -336,7 +339,8 @@ class CertifiedSolver:
         changes = np.multiply.outer(change, coordinates).ravel()
         residual = self._residual @ np.concatenate((load, changes))
         outside = self._allowance * sqrt(coordinates @ coordinates)
-        # bounds of the outputs
+        # Bounds of the outputs. For affine positive semi-definite terms the coercivity alpha in the
+        # reference norm is at least the smallest ratio of coefficients (min-theta approach).
         dual = self._dual_solution(theta, losses)
         coercivity = min((theta / self._reference).tolist())
         remainder = (sqrt(residual @ residual) + outside) / coercivity
@@ -360,7 +364,7 @@ def _combined(anchor: _Anchor, theta: FloatArray) -> _DualSolution:
     # Galerkin's equations of each output
     stiffness = (theta @ anchor.stiffness).reshape(outputs, functions, functions)
     weights = solve(stiffness, anchor.output).transpose(0, 2, 1)
-    # what they leave of the dual equations
+    # norms of the residuals of the dual equations
     coefficients = (-theta[:, np.newaxis] * weights).reshape(outputs, -1, 1)
     by_output = anchor.residual_factor[:, :, 0]
     by_terms = anchor.residual_factor[:, :, 1:]

@@ -18,7 +18,7 @@ from .primitive import Primitive, time_formula
 EVERY_CHANNEL = "*"
 """Name that stands for every channel of the primitive's quantity."""
 CHANNEL_UNIT = "channel's unit"
-"""Unit of numbers in the unit of the channel that they act on."""
+"""Stands for the unit of the channel that the primitive acts on."""
 PER_RELEASE = f"{CHANNEL_UNIT} per release amplitude"
 """Unit of amplitudes that are relative to the amplitude of a ring-down."""
 
@@ -67,7 +67,7 @@ class SensorRecord:
 
 
 class SensorError(NamedTuple):
-    """What a sensor adds to its readings, (N,) or one number, and the time derivative of it."""
+    """What a sensor adds to its readings, and its time derivative; (N,) arrays or numbers."""
 
     value: FloatArray | float
     rate: FloatArray | float
@@ -78,10 +78,10 @@ NO_ERROR = SensorError(0.0, 0.0)
 
 
 class Sensor(Primitive):
-    """A primitive that changes what is read, not what happens.
+    """A primitive that changes the readings of channels, but not the motion of the structure.
 
-    A subclass says what it adds to its channels (`error`), or else changes their readings in
-    another way (`readings`).
+    A subclass either adds something to its channels (it defines `error`), or changes their
+    readings in another way (it defines `readings`).
     """
 
     strain_only: ClassVar[bool] = False
@@ -184,7 +184,9 @@ class SensorDrift(Sensor):
             return SensorError(
                 self.amplitude * ratio, np.full_like(ratio, self.amplitude / self.time)
             )
-        drifting = ratio > 0.0  # at and before the start there is no drift, whatever the exponent
+        drifting = (
+            ratio > 0.0
+        )  # no drift at and before the start, where 0^exponent may be 1 or infinite
         safe_ratio = np.where(drifting, ratio, 1.0)
         value = np.where(drifting, self.amplitude * safe_ratio**self.exponent, 0.0)
         rate = np.where(drifting, self.exponent * value / (safe_ratio * self.time), 0.0)
@@ -210,7 +212,8 @@ class ChannelOffset(Sensor):
 class SensorRotation(Sensor):
     """A strain gauge is turned by `angle` [rad] in the skin, from spanwise towards the tip's rear.
 
-    `fe.runtime.sensors` turns the gauge, because that takes strains which the gauge does not read.
+    `fe.runtime.sensors` turns the gauge, because a turned gauge needs strain components that are
+    not among the readings.
     """
 
     strain_only: ClassVar[bool] = True
@@ -246,8 +249,8 @@ class HighPass(Sensor):
 class SensorLag(Sensor):
     """A channel shows now what it should have shown `lag` [s] earlier: a late filter or logger.
 
-    With a negative lag the recorded force is the late one. Ring-downs have no force that a reading
-    could follow late, so that a lag changes forced and driven trials alone.
+    A negative lag means that the recorded force is late. A ring-down has no recorded force that a
+    reading could lag behind, so a lag changes only forced and driven trials.
     """
 
     channel: str
@@ -257,31 +260,40 @@ class SensorLag(Sensor):
     def readings(
         self, record: SensorRecord, values: FloatArray, rates: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the readings (N, C) of earlier moments, and their rates; see `Sensor.readings`.
+        """Return the readings (N, C) delayed by `lag`, and their rates; see `Sensor.readings`.
 
-        Before the first sample a settled record stood still; another one had its first rate. After
-        the last sample the readings go on with their last rate.
+        Outside of the record, the readings are extrapolated linearly. Before the first sample the
+        rate is zero if the structure was at rest at the begin (`record.settled`), else the rate at
+        the first sample; after the last sample it is the rate at the last one.
         """
+        # only forced and driven trials have a recorded input that a reading can lag behind; a
+        # single sample has no interval to interpolate in
         if record.kind not in ("forced", "driven") or len(record.time) == 1:
             return values, rates
-        earlier = record.time - self.lag
-        shown, shown_rates = interpolated_by_cubics(record.time, values, rates, earlier)
+        delayed_time = record.time - self.lag
+        delayed_values, delayed_rates = interpolated_by_cubics(
+            record.time, values, rates, delayed_time
+        )
         first_rate = np.zeros_like(rates[0]) if record.settled else rates[0]
-        before = earlier < record.time[0]
-        shown[before] = values[0] + np.outer(earlier[before] - record.time[0], first_rate)
-        shown_rates[before] = first_rate
-        after = earlier > record.time[-1]
-        shown[after] = values[-1] + np.outer(earlier[after] - record.time[-1], rates[-1])
-        shown_rates[after] = rates[-1]
-        return shown, shown_rates
+        is_before_record = delayed_time < record.time[0]
+        delayed_values[is_before_record] = values[0] + np.outer(
+            delayed_time[is_before_record] - record.time[0], first_rate
+        )
+        delayed_rates[is_before_record] = first_rate
+        is_after_record = delayed_time > record.time[-1]
+        delayed_values[is_after_record] = values[-1] + np.outer(
+            delayed_time[is_after_record] - record.time[-1], rates[-1]
+        )
+        delayed_rates[is_after_record] = rates[-1]
+        return delayed_values, delayed_rates
 
 
 def interpolated_by_cubics(
     time: FloatArray, values: FloatArray, rates: FloatArray, moments: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return columns and their rates at other moments, by a Hermite cubic over each interval.
+    """Return columns and their rates at other times, by cubic Hermite interpolation.
 
-    The cubic has the given values and rates at both ends of its interval.
+    The cubic of an interval has the given values and rates at both ends of the interval.
 
     Parameters
     ----------
@@ -290,12 +302,13 @@ def interpolated_by_cubics(
     values, rates : (N, C) array
         The columns at these times, and their time derivatives.
     moments : (M,) array
-        The times that are asked for [s]; outside of the record the cubics at its ends go on.
+        The times of interpolation [s]; outside of the record the first or the last cubic is
+        continued.
 
     Returns
     -------
     values, rates : (M, C) array
-        The columns and their time derivatives at the moments.
+        The columns and their time derivatives at `moments`.
     """
     last_interval = len(time) - 2
     interval = np.clip(np.searchsorted(time, moments, side="right") - 1, 0, last_interval)
@@ -303,22 +316,27 @@ def interpolated_by_cubics(
     s = (moments - time[interval])[:, np.newaxis] / length
     begin, end = values[interval], values[interval + 1]
     begin_rate, end_rate = rates[interval], rates[interval + 1]
-    shown = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * begin + s**2 * (3.0 - 2.0 * s) * end
-    shown += length * s * (1.0 - s) * ((1.0 - s) * begin_rate - s * end_rate)
-    shown_rates = 6.0 * s * (1.0 - s) * (end - begin) / length
-    shown_rates += (1.0 - s) * (1.0 - 3.0 * s) * begin_rate + s * (3.0 * s - 2.0) * end_rate
-    return shown, shown_rates
+    # Hermite basis in the fraction s of the interval: (1 + 2 s) (1 - s)^2, s^2 (3 - 2 s),
+    # s (1 - s)^2 and -s^2 (1 - s), the last two times the length; then its time derivative
+    interpolated = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * begin + s**2 * (3.0 - 2.0 * s) * end
+    interpolated += length * s * (1.0 - s) * ((1.0 - s) * begin_rate - s * end_rate)
+    interpolated_rates = 6.0 * s * (1.0 - s) * (end - begin) / length
+    interpolated_rates += (1.0 - s) * (1.0 - 3.0 * s) * begin_rate + s * (3.0 * s - 2.0) * end_rate
+    return interpolated, interpolated_rates
 
 
 class Clock(Sensor):
-    """A sample stamped t was taken at (1 + `rate`) t + `zero` [s], t since the first stamp."""
+    """A sample with the time stamp t was taken at (1 + `rate`) t + `zero` [s].
+
+    t counts from the first stamp.
+    """
 
     rate: Annotated[float, "1"]
     zero: Annotated[float, "s"]
 
 
 class LoggerClock(Sensor):
-    """A logger's clock runs wrong: what it stamps t happened at (1 + `rate`) t.
+    """A logger's clock runs wrong: the event with time stamp t happened at (1 + `rate`) t.
 
     That holds for readings and for recorded inputs; t is counted from the record's first stamp.
     `logger` is the name of a logger of the campaign, or `EVERY_CHANNEL` where one logger records
@@ -357,7 +375,7 @@ class Line(Sensor):
 
 
 class DecayingLine(Sensor):
-    """A mode that the model lacks shows in ring-downs as a decaying oscillation.
+    """A decaying oscillation is added in ring-downs, as of a mode that the model lacks.
 
     It is e^(-zeta w t) (cosine cos w_d t + sine sin w_d t), t the time since the trial's start,
     w = 2 pi `frequency`, zeta the `damping_ratio`, w_d the damped angular frequency. Amplitudes are
@@ -392,6 +410,7 @@ class DecayingLine(Sensor):
         cos = np.cos(damped_omega * record.time)
         sin = np.sin(damped_omega * record.time)
         value = envelope * (self.cosine * cos + self.sine * sin)
+        # derivative at a constant envelope; the decay of the envelope adds -zeta omega value
         quadrature = envelope * damped_omega * (self.sine * cos - self.cosine * sin)
         return SensorError(value, -zeta * omega * value + quadrature)
 

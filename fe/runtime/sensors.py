@@ -27,7 +27,7 @@ Channels = Sequence[tuple[str, str]]
 HighPassFilter = Callable[
     [HighPass, SensorRecord, FloatArray, FloatArray], tuple[FloatArray, FloatArray]
 ]
-"""How columns (N, C) of a dynamic record, and their rates (N, C), pass a high-pass."""
+"""A function that filters columns (N, C) of a dynamic record and their rates (N, C)."""
 
 STRAIN = "strain"
 """Quantity of a strain gauge."""
@@ -40,7 +40,7 @@ LARGEST_ORDER = 4
 
 
 class ClockError(NamedTuple):
-    """A clock that runs wrong: what it stamps t was taken at (1 + `rate`) t + `zero` [s]."""
+    """A clock error: a sample with time stamp t was taken at (1 + `rate`) t + `zero` [s]."""
 
     rate: float
     zero: float
@@ -154,14 +154,14 @@ def apply_sensors(
         signal = readings[:, columns]
         signal_rate = slopes[:, columns]
         if not isinstance(sensor, HighPass):
-            changed, changed_rate = sensor.readings(record, signal, signal_rate)
+            faulty_signal, faulty_rate = sensor.readings(record, signal, signal_rate)
         elif record.is_dynamic:
-            changed, changed_rate = high_pass(sensor, record, signal, signal_rate)
+            faulty_signal, faulty_rate = high_pass(sensor, record, signal, signal_rate)
         else:
             continue
         acts = sensor.acts_at(record.time)[:, np.newaxis]
-        readings[:, columns] = np.where(acts, changed, signal)
-        slopes[:, columns] = np.where(acts, changed_rate, signal_rate)
+        readings[:, columns] = np.where(acts, faulty_signal, signal)
+        slopes[:, columns] = np.where(acts, faulty_rate, signal_rate)
     return readings, None if rates is None else slopes
 
 
@@ -181,21 +181,23 @@ def _rotate_gauges(
     for sensor in sensors:
         if isinstance(sensor, SensorRotation):
             angles[columns_of(sensor, record.channels)] += sensor.angle
-    turned = np.flatnonzero(angles)
-    if not turned.size:
+    turned_columns = np.flatnonzero(angles)
+    if not turned_columns.size:
         return
     if transverse is None or shear is None:
         raise InvalidPatchError(
             "A gauge is turned, but the model gives no transverse and shear strain to turn it in."
         )
-    cosine = np.cos(angles[turned])
-    sine = np.sin(angles[turned])
-    across = transverse[:, turned] * sine**2 + shear[:, turned] * (sine * cosine)
-    readings[:, turned] = readings[:, turned] * cosine**2 + across
-    if len(across) > 1 and record.is_dynamic:
+    cosine = np.cos(angles[turned_columns])
+    sine = np.sin(angles[turned_columns])
+    other_strains = transverse[:, turned_columns] * sine**2 + shear[:, turned_columns] * (
+        sine * cosine
+    )
+    readings[:, turned_columns] = readings[:, turned_columns] * cosine**2 + other_strains
+    if len(other_strains) > 1 and record.is_dynamic:
         # a response has no rates of these strains; central differences will do, as they are small
-        across_rate = np.gradient(across, record.time, axis=0)
-        slopes[:, turned] = slopes[:, turned] * cosine**2 + across_rate
+        other_strain_rates = np.gradient(other_strains, record.time, axis=0)
+        slopes[:, turned_columns] = slopes[:, turned_columns] * cosine**2 + other_strain_rates
 
 
 def _channel_name(primitive: Primitive) -> str:
@@ -211,7 +213,8 @@ def _is_for_strain(primitive: Primitive) -> bool:
 def columns_of(primitive: Primitive, channels: Channels) -> NDArray[np.intp]:
     """Return the columns that a primitive acts on.
 
-    A channel that the primitive names is meant whatever its quantity is.
+    If the primitive names a channel, its quantity does not matter. Otherwise the columns are those
+    of the primitive's quantity, or all if it has none.
     """
     name = _channel_name(primitive)
     if name != EVERY_CHANNEL:
@@ -231,8 +234,8 @@ def levels_before_record(
 ) -> FloatArray:
     """Return the constant inputs (C,) of a high-pass before a record, from the record's first row.
 
-    A settled structure had the first reading all the time, and no rates. A structure that moved
-    already had done so about zero.
+    If the structure was at rest before, the input was the first reading, or zero for a channel that
+    measures a rate. If it moved already, the input is taken as zero, the middle of its motion.
     """
     if not record.settled:
         return np.zeros_like(first_row)

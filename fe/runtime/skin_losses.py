@@ -1,4 +1,4 @@
-"""What local losses leave of the stiffness of a wing's skin; see `docs/patches.md`.
+"""Stiffness of a wing's skin that remains under local losses; see `docs/patches.md`.
 
 NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -12,7 +12,8 @@ from .errors import InvalidPatchError
 from .patch import LocalStiffnessLoss, ModelPatch
 
 ZERO_WEIGHT_STATION = 1.02
-"""Where the weight of a part of the skin would vanish, in semi-spans."""
+"""Station at which the weight of a part of the skin is zero, in semi-spans; slightly beyond the
+tip, so that all parts have a weight."""
 
 
 class RemainingSkin(NamedTuple):
@@ -37,11 +38,12 @@ class RemainingSkin(NamedTuple):
 
 
 def remaining_skin(patch: ModelPatch, strip_lines: FloatArray) -> RemainingSkin | None:
-    """Return what the skin keeps of its stiffness under the local losses of a patch.
+    """Return the fractions of its stiffness that the skin keeps under the local losses of a patch.
 
-    Losses multiply where they overlap. A strip keeps the harmonic mean of its pieces, because they
-    bend one after the other. The mean is weighted by the square of the distance from the tip: once
-    for the moment of a force there, once for the lever by which the tip follows the bending.
+    Overlapping losses multiply: (1 - loss_1) (1 - loss_2). Pieces of a strip bend in series, so
+    that the strip keeps the harmonic mean of their fractions. The weight is the square of the
+    distance from the tip: the moment of a tip force is proportional to the distance, and so is the
+    displacement of the tip by a curvature.
 
     Parameters
     ----------
@@ -53,7 +55,7 @@ def remaining_skin(patch: ModelPatch, strip_lines: FloatArray) -> RemainingSkin 
     Returns
     -------
     RemainingSkin or None
-        The fractions; None where the patch has no local loss.
+        The fractions; None if the patch has no local loss.
 
     Raises
     ------
@@ -73,20 +75,26 @@ def remaining_skin(patch: ModelPatch, strip_lines: FloatArray) -> RemainingSkin 
     edges = np.clip([*starts, *ends], strip_lines[0], strip_lines[-1])
     breaks = np.unique(np.concatenate((strip_lines, edges)))
     middles = 0.5 * (breaks[1:] + breaks[:-1])
-    by_piece = np.ones(len(middles))
+    fraction_of_piece = np.ones(len(middles))
     for loss in losses:
         is_inside = (middles > loss.start) & (middles < loss.start + loss.length)
-        by_piece *= np.where(is_inside, 1.0 - loss.loss, 1.0)
-    if by_piece.min() <= 0.0:
+        fraction_of_piece *= np.where(is_inside, 1.0 - loss.loss, 1.0)
+    if fraction_of_piece.min() <= 0.0:
         raise InvalidPatchError(
             "A local stiffness loss must leave some stiffness, but leaves "
-            f"{by_piece.min():g} of it."
+            f"{fraction_of_piece.min():g} of it."
         )
     # weighted harmonic mean of the pieces of each strip
-    strip = np.searchsorted(strip_lines, middles) - 1
-    strip = np.maximum(strip, 0)  # a piece may begin next to nothing above the first line
+    strip_of_piece = np.searchsorted(strip_lines, middles) - 1
+    # rounding may put the first piece before the first line
+    strip_of_piece = np.maximum(strip_of_piece, 0)
+    # the integral of (L - y)^2 over a piece is the difference of (L - y)^3 / 3; the 3 cancels
     weights = -np.diff((ZERO_WEIGHT_STATION * strip_lines[-1] - breaks) ** 3)
-    count = len(strip_lines) - 1
-    total = np.bincount(strip, weights, count)
-    by_strip = total / np.bincount(strip, weights / by_piece, count)
-    return RemainingSkin(breaks, by_piece, strip.astype(np.int64), by_strip)
+    strip_count = len(strip_lines) - 1
+    strip_weights = np.bincount(strip_of_piece, weights, strip_count)
+    fraction_of_strip = strip_weights / np.bincount(
+        strip_of_piece, weights / fraction_of_piece, strip_count
+    )
+    return RemainingSkin(
+        breaks, fraction_of_piece, strip_of_piece.astype(np.int64), fraction_of_strip
+    )

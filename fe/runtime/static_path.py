@@ -1,7 +1,9 @@
-"""Positions of ports with laws: at rest, load level after load level, or of one port in motion.
+"""Positions of ports with laws: in equilibrium along a load path, or of one port in motion.
 
-At rest x + C F(x) = x_linear. Written in the subset of Python that numba compiles too. NumPy and
-relative imports only: this file is copied into the FMU.
+In equilibrium x + C F(x) = x_linear: C F are the displacements by the forces F of the laws, which
+act against the motion, and x_linear is the position of the linear structure. Written in the subset
+of Python that numba compiles too. NumPy and relative imports only: this file is copied into the
+FMU.
 """
 
 import numpy as np
@@ -51,7 +53,7 @@ def static_path(
     x = memory[:, POSITION].copy()
     x_forces = np.zeros(count)
     for level in range(len(linear)):
-        # from the previous level in parts, as large as Newton's method takes them
+        # approach the level in parts; a part is halved if Newton's method fails, else doubled
         done = 0.0
         part = 1.0
         while done < 1.0:
@@ -80,7 +82,7 @@ def solve_static_position(
     memory: FloatArray,
     compliance: FloatArray,
 ) -> tuple[bool, FloatArray, FloatArray]:
-    """Solve x + C F(x) = goal by Newton's method, with halved steps where a full one overshoots.
+    """Solve x + C F(x) = goal by Newton's method, halving a step that does not reduce the residual.
 
     Parameters
     ----------
@@ -91,7 +93,7 @@ def solve_static_position(
     memory : (J, 5 + E) array
         Their memory; not changed.
     compliance : (J, J) array
-        C.
+        C, positions of the ports (rows) under unit forces at them (columns).
 
     Returns
     -------
@@ -103,14 +105,15 @@ def solve_static_position(
     unit = np.eye(len(goal))
     x = start.copy()
     forces, slopes = static_forces(x, ports, memory)
-    displaced = compliance @ forces  # not zero without a load where a law has a preload
+    displaced = compliance @ forces  # a preloaded law displaces the ports even without a load
     scale = np.max(np.abs(goal)) + np.max(np.abs(start)) + np.max(np.abs(displaced)) + 1e-300
     residual = x + displaced - goal
     size = np.max(np.abs(residual))
     for _ in range(60):
         if size <= 1e-12 * scale:
             break
-        # a singular matrix is moved off its zero; compiled, `solve` takes five seconds longer
+        # The Jacobian is I + C dF/dx. The tiny multiple of I keeps a singular one invertible. `inv`
+        # and not `solve`, which takes numba five seconds longer to compile.
         step = np.linalg.inv(unit + compliance * slopes + 1e-14 * unit) @ residual
         fraction = 1.0
         previous_size = size
@@ -128,8 +131,9 @@ def solve_static_position(
             fraction *= 0.5
         if size == previous_size:
             break
-    # The remaining residual may be rounding, or a kink met exactly. A solution that is not stable
-    # lies on another branch, beyond a snap.
+    # Near 1e-9 the remaining residual may be rounding, or that of a kink of a law. A negative
+    # determinant means an unstable equilibrium, on another branch, which snap-through separates
+    # from this one.
     solved = size <= 1e-9 * scale and np.linalg.det(unit + compliance * slopes) > -1e-9
     return solved, x, forces
 
@@ -137,10 +141,10 @@ def solve_static_position(
 def static_forces(
     x: FloatArray, ports: PortArrays, memory: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return forces of the laws and their slopes (J,) at rest, at positions `x` (J,) of the ports.
+    """Return the forces of the laws and their slopes dF/dx (J,) at rest, at port positions x (J,).
 
-    Laws of speed are zero at rest. The memory, from which the positions are reached, is not
-    changed.
+    Laws of speed have no force at rest. The memory describes the point from which the positions
+    are reached; it is not changed.
     """
     forces = np.zeros(len(x))
     slopes = np.zeros(len(x))
@@ -168,8 +172,8 @@ def solve_port_position(
 ) -> float:
     """Return the position x of a port in motion, where x + r sum F(x) = y.
 
-    Newton's method inside of a bracket. Where dry friction can hold the port, the position does not
-    change at all.
+    Newton's method within a bracket. If dry friction is strong enough to hold the port, the
+    position does not change at all.
 
     Parameters
     ----------
@@ -185,7 +189,7 @@ def solve_port_position(
     r : float
         Flexibility of the port with which it follows a force within the step.
     h : float
-        Duration of the step [s]; without one, forces of speed stay what they are.
+        Duration of the step [s]; if it is zero, the forces of laws of speed keep their values.
     """
     last = memory[port, POSITION]
     start, friction, tolerance = forces_at_last_position(port, ports, memory, h)
@@ -193,7 +197,8 @@ def solve_port_position(
     if friction > 0.0 and abs(displacement) <= r * friction:
         share_friction(port, ports, memory, displacement / r, friction, h)
         return float(last)
-    # the root lies in this direction from the last position, if the structure is stable
+    # For a stable structure the residual increases with x, so that the root lies on the side of
+    # the last position to which the free displacement points.
     sign = 1.0 if displacement > 0.0 else -1.0
     low = last
     high = last + sign * 1e300
@@ -214,7 +219,7 @@ def solve_port_position(
             low = x
         if abs(high - low) <= 1e-15 * abs(x):
             break
-        # Newton's step where it stays inside of the bracket
+        # Newton's step if it stays within the bracket, else a point near its low end
         newton = x - residual / slope if slope > 1e-6 else high
         if sign * (newton - low) > 0.0 and sign * (high - newton) > 0.0:
             x = newton
@@ -222,7 +227,8 @@ def solve_port_position(
             x = low + 0.1 * (high - low)
         else:
             x += sign * abs(residual)
-    # the steepest force rises within rounding: it gives what is missing
+    # The steepest force changes by more than the residual within the rounding of x: it takes the
+    # value that makes the residual zero.
     if r > 0.0:
         memory[steepest, FORCE] -= residual / r
     return float(evaluated)
@@ -231,9 +237,9 @@ def solve_port_position(
 def forces_at_last_position(
     port: int, ports: PortArrays, memory: FloatArray, h: float
 ) -> tuple[float, float, float]:
-    """Return what the laws of a port can do at its last position, before it moves.
+    """Return the forces of a port's laws at its last position, before it moves in a step.
 
-    Forces of speed are set to zero in the memory, but without a duration `h` they stay.
+    The forces of laws of speed are set to zero in the memory, unless the duration `h` is zero.
 
     Returns
     -------
@@ -315,7 +321,7 @@ def port_forces(
     sign : float
         Sign of the motion, for dry friction.
     steepest : int
-        A law of the port, in case that no force rises.
+        Any law of the port, returned if the force of none rises.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What the integrator of motion needs to know of a structure: the contract of its models.
+"""The interface of structures for the integrator of motion.
 
 Standard library, NumPy and relative imports only: this file is copied into the FMU.
 """
@@ -29,7 +29,7 @@ class StructureInMotion(Protocol):
 
     @property
     def laws(self) -> "PortLaws | None":
-        """The laws at its ports; None where it cannot have any."""
+        """The laws at its ports; None if the structure cannot have any."""
         ...
 
     @property
@@ -49,14 +49,14 @@ class StructureInMotion(Protocol):
     def holding_load(self) -> int | None:
         """Number of the load that holds the structure before a release, and never acts later.
 
-        The residual position follows its end with a lag, as it follows the forces of laws. None:
-        the structure has no such load, and follows its loads at once.
+        When it ends, the displacement in the left-out modes decays with the same lag with which
+        they follow forces of laws. None: the structure has no such load.
         """
         ...
 
     @property
     def modes(self) -> ModeSet:
-        """The modes that move."""
+        """The M modes with inertia; the others are left out."""
         ...
 
     @property

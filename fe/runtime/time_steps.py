@@ -22,7 +22,7 @@ SLOWEST_PHASE, FASTEST_PHASE = 0.05, 0.4
 LENGTH_TOLERANCE = 1e-9
 """Lengths of steps that differ by less than this fraction of the usual one count as one length."""
 LEAST_SUBSTEPS = 8
-"""Substeps of an interval with laws where the structure by itself does not move."""
+"""Substeps of an interval with laws if the structure has no frequency of its own."""
 
 
 class DistinctLengths(NamedTuple):
@@ -72,7 +72,7 @@ def step_boundaries(
     least: int = 1,
     switching_times: Sequence[float] = (),
 ) -> Boundaries:
-    """Return the time steps between stamps that the laws need.
+    """Return time steps between stamps that are short enough for the laws.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def step_boundaries(
     least : int
         Least number of steps in each interval, before refinement.
     switching_times : sequence of float
-        Times at which something begins or ends, and so a step [s].
+        Times at which a load or a law begins or ends, so that a step has to end there [s].
     """
     inside = [moment for moment in switching_times if time[0] < moment < time[-1]]
     if inside:
@@ -95,6 +95,7 @@ def step_boundaries(
         boundaries = step_boundaries(system, laws, all_times, refinement, least)
         samples = boundaries.sample_boundary[np.searchsorted(all_times, time)]
         return replace(boundaries, sample_boundary=samples)
+    # with laws, the slowest and the fastest mode set the length of a step
     substeps = np.ones(len(time) - 1)
     if not laws.linear:
         substeps *= LEAST_SUBSTEPS
@@ -143,7 +144,8 @@ def loaded_steps(
     begin_force, end_force : (K, M) array
         Applied modal forces at both ends of each step.
     residual_position : (K + 1, J) array
-        What loads add to the positions of the laws' ports beyond the modes, at each boundary.
+        Displacements of the laws' ports under the loads in the modes that are left out, at each
+        boundary.
     """
     length, length_of_step = boundaries.distinct_lengths
     exact = system.exact_steps(length)

@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 
 INSTANT = 1e-6
-"""Duration of a step of which only the begin matters [s]."""
+"""Duration of a step from which only the state at its begin is used [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class TransientState:
-    """All that a structure remembers between two time steps.
+    """The complete state of a structure between two time steps.
 
     Attributes
     ----------
@@ -45,7 +45,7 @@ class TransientState:
         Coefficients of the loads at this moment; of a wing the load factor [1] and the tip force
         [N].
     memory : (J, 5 + E) array
-        Memory of the laws; a column has the forces as the modes that are left out follow them.
+        Memory of the laws, among it the lagged forces that the left-out modes follow.
     """
 
     displacement: FloatArray
@@ -177,7 +177,7 @@ class ModalIntegrator:
     def _with_still_modes(
         self, equilibrium: TransientState, holding: FloatArray | float = 0.0
     ) -> TransientState:
-        """Return an equilibrium with its modes at rest, moved aside by `holding` (M,)."""
+        """Return an equilibrium as a state of resting modes, displaced by `holding` (M,)."""
         q = self._responses.modal_coordinates @ self._static_loads(equilibrium) + holding
         return replace(equilibrium, displacement=q, velocity=np.zeros_like(q))
 
@@ -191,14 +191,13 @@ class ModalIntegrator:
     def state_after_release(
         self, offset: float, load: npt.ArrayLike, holding_load: int
     ) -> TransientState:
-        """Return the state just after a structure that was held aside is let go.
+        """Return the state just after the release of a structure that a force held displaced.
 
         Parameters
         ----------
         offset : float
-            How far the holding force had moved the last static output, of a wing its tip, from its
-            equilibrium under the other loads [m]. It does not count what laws add: the held point
-            is where it would be without them.
+            Displacement of the last static output (of a wing, its tip) by the holding force, from
+            the equilibrium under the other loads [m]. It is that of the structure without laws.
         load : (L,) array_like
             Coefficients of the loads that stay.
         holding_load : int
@@ -232,9 +231,9 @@ class ModalIntegrator:
     ) -> tuple[TransientState, float]:
         """Return the equilibrium of a structure with laws that is held aside, and the force.
 
-        The held point stays where the force moves it without laws, so that the laws change the
-        force: with a, the response of the ports to a unit force there, and a_0, that of the point
-        itself, the positions of the ports are x = x_linear - (C - a a^T / a_0) F.
+        The point is held at the displacement that the force causes without laws, so that laws
+        change the force: with a, the response of the ports to a unit force there, and a_0, that of
+        the point itself, the positions of the ports are x = x_linear - (C - a a^T / a_0) F.
 
         Parameters
         ----------
@@ -268,7 +267,7 @@ class ModalIntegrator:
     ) -> TransientState:
         """Return the state after a time step under loads that are held.
 
-        The step is exact for the kept modes where there are no laws. If the loads differ from those
+        Without laws the step is exact for the kept modes. If the loads differ from those
         of the state, they jump at once, and the structure overshoots.
 
         Parameters
@@ -409,8 +408,8 @@ class ModalIntegrator:
 
         Displacement and velocity of the structure stay what they were; they are projected on the
         new modes with the new mass matrix, exactly in reduced coordinates. What the new modes
-        cannot hold follows the load without delay, as always. The memory of laws stays where they
-        are the same at the same ports; other laws have been loaded from zero to where they are.
+        cannot represent follows the load without delay, as always. The memory of laws is kept if
+        they are the same at the same ports; other laws are loaded from zero to their positions.
 
         Parameters
         ----------

@@ -55,8 +55,8 @@ class UnitResponses:
     @cached_property
     def residual_displacements(self) -> FloatArray:
         """Displacements (n, L + J) under the unit loads, of the modes that are left out."""
-        of_modes = self.structure.mode_shapes @ self.modal_coordinates
-        return np.asarray(self.structure.unit_responses - of_modes)
+        modal_displacements = self.structure.mode_shapes @ self.modal_coordinates
+        return np.asarray(self.structure.unit_responses - modal_displacements)
 
     @cached_property
     def modal_outputs(self) -> FloatArray:
@@ -96,7 +96,7 @@ class UnitResponses:
             return ModalSystem(self.omega, damping)
         names = self.structure.laws.ports
         rows = self.participation[:, self.load_count :].T
-        # residual flexibility; a smaller one than this is rounding
+        # residual flexibility: static minus modal compliance; below the limit it is rounding
         flexibility = np.diag(self.port_compliance)
         residual = flexibility - np.sum((rows / self.omega) ** 2, axis=1)
         is_flexible = np.array(

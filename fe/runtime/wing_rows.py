@@ -38,7 +38,7 @@ _STRAIN_COMPONENTS = (None, ".transverse", ".shear")
 
 
 def strain_gauge(output: str) -> int:
-    """Return the number of the gauge of an output, from 0, or -1 for outputs that are no strains.
+    """Return the number of an output's gauge, counted from 0, or -1 if the output is no strain.
 
     In the names strain[k], strain[k].transverse and strain[k].shear k counts from 1.
     """
@@ -62,7 +62,7 @@ class PlanformStations(NamedTuple):
 
 
 def planform_stations(semi_span: float, root_chord: float, tip_chord: float) -> PlanformStations:
-    """Return the stations of Gauss and Legendre of a planform whose chord is linear along the span.
+    """Return the points of Gauss-Legendre integration over a planform of linear taper.
 
     Parameters
     ----------
@@ -92,8 +92,8 @@ class WingRows:
     def _station_weights(self, y: float) -> FloatArray:
         """Return weights (P,) that interpolate values at the stations to `y` [m from the root].
 
-        Within a cell of the mesh a value is a parabola; beyond the tip a force hangs on a rigid
-        arm.
+        Within a cell of the mesh, a value is interpolated by the parabola through both ends and the
+        middle. Beyond the tip it is extrapolated linearly, as on a rigid arm.
 
         Raises
         ------
@@ -131,7 +131,7 @@ class WingRows:
     ) -> FloatArray:
         """Return the row (n,) of the upward displacement of a section at a chord fraction.
 
-        A section is taken as straight through two neighbouring lines.
+        The section moves as the straight line through two neighbouring lines along the span.
 
         Parameters
         ----------
@@ -155,7 +155,7 @@ class WingRows:
         number = int(np.searchsorted(chords[order], within, side="right"))
         number = min(max(number, 1), len(order) - 1)
         fore, aft = order[number - 1 : number + 1]
-        # straight through both
+        # linear between the two lines, or extrapolated beyond them
         fraction = (chord - chords[fore]) / (chords[aft] - chords[fore])
         rows = self.arrays.line_rows[2:]
         return np.asarray(weights @ ((1.0 - fraction) * rows[fore] + fraction * rows[aft]))
@@ -196,12 +196,12 @@ class WingRows:
         along_span, along_chord = np.sum([(0.0, 0.0), *moves], axis=0).tolist()
         if along_span == 0.0 and along_chord == 0.0:
             return row
-        # outboard is along the straight chord line; the force keeps its distance aft of it
+        # The force moves outboard parallel to the straight chord line, at a constant distance.
         distance_aft = (chord - arrays.straight_chord_line) * self._chord_at(y) + along_chord
         moved_y = y + along_span
         moved_chord = arrays.straight_chord_line + distance_aft / self._chord_at(moved_y)
-        # the clamp grips the same two lines wherever it pulls, or the response had a kink at each
-        # web
+        # The moved force acts on the same two lines: otherwise the response would have a kink where
+        # the force passes a web.
         moved_row = self.displacement_row(moved_y, moved_chord, between_lines_at=chord)
         return row + moved_row - self.displacement_row(y, chord)
 
@@ -212,7 +212,7 @@ class WingRows:
         return arrays.root_chord + taper * y / arrays.semi_span
 
     def manoeuvre_loads(self, patch: ModelPatch = NO_PATCH) -> FloatArray:
-        """Return the loads (2, n) in a turn that go with the load factor and with its square [N].
+        """Return the loads (2, n) in a turn per unit load factor, and per unit of its square [N].
 
         Parameters
         ----------
@@ -304,9 +304,10 @@ class WingRows:
 
     @cached_property
     def _skin_fraction(self) -> FloatArray:
-        """The skin's fraction (G,) of the bending stiffness at each gauge, as the strain shows it.
+        """The skin's fraction (G,) of the bending stiffness at each gauge, computed from strains.
 
-        A softer skin raises the strain under lift by that fraction of its own loss.
+        At a given bending moment the strain goes as 1 / stiffness. If a skin of fraction s loses
+        the part d of its stiffness, the ratio of the strains before and after is 1 - s d.
         """
         terms = len(self.arrays.stiffness)
         all_healthy = np.ones(terms)
@@ -321,13 +322,14 @@ class WingRows:
         return np.asarray(self.arrays.strain_rows[0] @ displacement)
 
     def strain_factors(self, patch: ModelPatch) -> FloatArray | None:
-        """Return factors on the strains of the gauges where local losses end within a strip.
+        """Return factors that correct the strains of gauges for local losses within a strip.
 
-        The structure has a loss smeared over the strip; a gauge reads the curvature of its own
-        section. At a given bending moment the strain of a section whose skin keeps the fraction r
-        of its stiffness goes as 1 / (1 - s (1 - r)), s the skin's fraction of the bending
-        stiffness. The factor is the mean of that over the gauge with the losses where they are,
-        over the same with smeared losses. It is one where losses end at edges of strips.
+        In the stiffness, a local loss is averaged over its strip between mesh lines; a gauge reads
+        the curvature at its own section. At a given bending moment the strain of a section whose
+        skin keeps the fraction r of its stiffness goes as 1 / (1 - s (1 - r)), s the skin's
+        fraction of the bending stiffness. The factor is the mean of that over the gauge with the
+        losses where they are, over the same with smeared losses. It is one if losses end at
+        edges of strips.
 
         Parameters
         ----------
@@ -337,7 +339,7 @@ class WingRows:
         Returns
         -------
         (G,) array or None
-            The factors; None where the patch has no local loss.
+            The factors; None if the patch has no local loss.
         """
         skin = remaining_skin(patch, self.arrays.strip_lines)
         if skin is None:
@@ -346,13 +348,15 @@ class WingRows:
         half_length = 0.5 * max(self.arrays.gauge_length, LEAST_GAUGE_LENGTH)
         gauge_begin = self.arrays.gauge_stations[:, None] - half_length
         gauge_end = self.arrays.gauge_stations[:, None] + half_length
-        begin = np.maximum(skin.breaks[:-1], gauge_begin)
-        end = np.minimum(skin.breaks[1:], gauge_end)
-        covered = np.maximum(end - begin, 0.0)
+        covered_begin = np.maximum(skin.breaks[:-1], gauge_begin)
+        covered_end = np.minimum(skin.breaks[1:], gauge_end)
+        covered_lengths = np.maximum(covered_end - covered_begin, 0.0)
         # mean strains
-        exact = self._mean_strain(covered, skin.by_piece)
-        smeared = self._mean_strain(covered, skin.by_strip[skin.strip_of_piece])
-        return np.asarray(exact / smeared)
+        strain_with_local_losses = self._mean_strain(covered_lengths, skin.by_piece)
+        strain_with_averaged_losses = self._mean_strain(
+            covered_lengths, skin.by_strip[skin.strip_of_piece]
+        )
+        return np.asarray(strain_with_local_losses / strain_with_averaged_losses)
 
     def _mean_strain(self, covered: FloatArray, remaining: FloatArray) -> FloatArray:
         """Return relative strains (G,) of gauges over pieces of the skin.

@@ -136,32 +136,37 @@ def _calculix_frequencies(deck: CalculixDeck, folder: Path, modes: int) -> Float
 def _differences(
     deck: CalculixDeck, displacement: FloatArray, printed: _PrintedResults
 ) -> dict[str, float]:
-    """Return the relative differences of a solution, see `Agreement.loads`.
+    """Return the relative differences between our solution and that of CalculiX for one load.
 
     Parameters
     ----------
     deck : CalculixDeck
-        The model.
+        The model of n unknowns that both solved.
     displacement : (n,) array
         Our solution.
     printed : _PrintedResults
-        That of CalculiX.
+        What CalculiX printed.
+
+    Returns
+    -------
+    dict of str to float
+        The difference of each quantity that the deck has; see `Agreement.loads`.
     """
     our_probes = deck.probes @ displacement
     our_nodes = deck.structure.full_displacement(displacement)
     differences = {"nodal displacements": _relative_difference(printed.displacements, our_nodes)}
-    gauges = len(deck.structure.gauges)
-    outputs = {
-        "gauge strains": slice(0, gauges),
-        "displacement outputs": slice(gauges, len(our_probes)),
+    gauge_count = len(deck.structure.gauges)
+    probes_by_quantity = {
+        "gauge strains": slice(0, gauge_count),
+        "displacement outputs": slice(gauge_count, len(our_probes)),
     }
-    for name, rows in outputs.items():
-        if len(our_probes[rows]):
-            difference = _relative_difference(printed.probes[rows], our_probes[rows])
-            differences[name] = difference
+    for quantity, probe_rows in probes_by_quantity.items():
+        if len(our_probes[probe_rows]):
+            difference = _relative_difference(printed.probes[probe_rows], our_probes[probe_rows])
+            differences[quantity] = difference
     if _prints_strains(deck):
         our_strains = deck.body.mesh.strains(our_nodes, INTEGRATION_POINTS).reshape(-1, 6)
-        our_strains[:, 3:] *= 0.5  # engineering to tensor shear
+        our_strains[:, 3:] *= 0.5  # engineering to tensor shear strains, as CalculiX prints them
         difference = _relative_difference(printed.strains, our_strains[:, CALCULIX_STRAINS])
         differences["strains at integration points"] = difference
     return differences

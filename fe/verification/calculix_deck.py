@@ -81,7 +81,9 @@ class Step(NamedTuple):
 
 
 class Grading(NamedTuple):
-    """Elasticity that changes inside cells, given as a function of a nodal temperature.
+    """Elasticity that varies within cells, which the deck states as temperature-dependent.
+
+    The nodes get artificial temperatures, between which CalculiX interpolates the elasticity.
 
     Attributes
     ----------
@@ -90,7 +92,7 @@ class Grading(NamedTuple):
     temperatures : (nodes,) array
         Temperatures of the nodes.
     cells : (nc,) array of bool
-        The cells where the elasticity changes; elsewhere the factor is one.
+        The cells in which the elasticity changes; in others the factor is one.
     """
 
     course: list[tuple[float, float]]
@@ -188,7 +190,7 @@ class CalculixDeck:
 
     @cached_property
     def probes(self) -> FloatArray:
-        """Rows (m, n) of the results that are read, on the free unknowns."""
+        """Rows (m, n) on the free unknowns of the outputs that are compared."""
         rows = sparse.vstack((self.structure.gauge_output, self.structure.displacement_output))
         return np.asarray(rows.toarray())
 
@@ -201,8 +203,9 @@ class CalculixDeck:
     def text(self, *steps: Step) -> str:
         """Return the input of a job: the model, then its steps.
 
-        Behind the nodes of the mesh there are those of rigid motions, three motions each, then
-        eight of each point mass, then the probes, three each.
+        The nodes of the mesh are followed by auxiliary nodes: those of rigid motions, with three
+        motions each, then the eight corners of the block of each point mass, then the nodes of the
+        probes, with three outputs each.
         """
         mesh = self.body.mesh
         supports = self.body.supports
@@ -248,7 +251,10 @@ class CalculixDeck:
         return [*zip(block.corners, point + corners, strict=True)]
 
     def _equations(self, blocks: Iterable[MassBlock], first_probe: int) -> Iterator[list[Term]]:
-        """Yield sums that are zero, whose first term depends on the others."""
+        """Yield the constraint equations, each as the terms of a sum that is zero.
+
+        The first term is that of the dependent displacement.
+        """
         yield from self._rigid_equations()
         for block in blocks:
             yield from _block_equations(block)
@@ -274,7 +280,7 @@ class CalculixDeck:
         return [_node_and_direction(unknown) for unknown in unknowns]
 
     def terms(self, values: FloatArray) -> Iterator[Term]:
-        """Yield the values (n,) on the free unknowns that are not zero."""
+        """Yield a term for each nonzero entry of a row (n,) on the free unknowns."""
         for unknown in np.flatnonzero(values).tolist():
             node, direction = self.places[unknown]
             yield Term(node, direction, float(values[unknown]))
@@ -301,7 +307,7 @@ def _block_equations(block: MassBlock) -> Iterator[list[Term]]:
 
 
 def _groups_of_three(count: int) -> int:
-    """Return the number of nodes that have enough directions for a number of values."""
+    """Return the number of nodes needed for `count` values, three directions each."""
     return -(-count // 3)
 
 

@@ -33,12 +33,15 @@ DAMAGED_LOSSES = (0.4, 0.6)
 REFINEMENTS = (0.5, 1.0, 2.0)
 QUICK_REFINEMENTS = (0.25, 0.5, 1.0)
 RIGID_FORCE_LIMIT = 1e-12
-"""Largest force of a rigid motion, relative to the terms of its sum."""
+"""Largest elastic force in a rigid motion, relative to the terms whose sum it is."""
 MASS_LIMIT = 1e-10
+"""Largest relative difference between the mass of the matrix and that of the volumes."""
 BALANCE_LIMIT = 1e-5
+"""Largest relative difference of the other balances."""
 CONVERGENCE_LIMIT = 0.01
-"""Largest change between the two finest meshes."""
+"""Largest relative change of a result between the two finest meshes."""
 CALCULIX_LIMIT = 1e-5
+"""Largest relative difference to CalculiX."""
 
 
 class RootMotions(NamedTuple):
@@ -50,7 +53,11 @@ class RootMotions(NamedTuple):
 
 
 def _root_motions(operators: AffineOperators) -> RootMotions:
-    """Return the rigid motions that the root allows; its own unknowns are the last three."""
+    """Return the rigid motions that the root allows: heave, flap and yaw.
+
+    The last three of the free unknowns are those of the root itself: each motion has a one
+    there, and its nodal displacements before.
+    """
     motions = rigid_motions(operators.wing_mesh.points, np.zeros(3), 2.0)
     nodal = motions[operators.body.supports.free_displacements]
     _, _, along_z, about_x, _, about_z = nodal.T
@@ -75,21 +82,22 @@ class Balance(NamedTuple):
 
 
 def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[str, Balance]:
-    """Return sums that must agree for the wing at a load factor.
+    """Return pairs of sums that must be equal in a correct model of the wing.
 
     Parameters
     ----------
     operators : AffineOperators
         The wing.
     load_factor : float
-        The load factor.
+        The load factor of the turn.
 
     Returns
     -------
     dict of str to Balance
-        The mass of the matrix and that of the volumes; the force of the root spring and the net
-        load; the moment of the flap spring and that of the load about the root; the elastic energy
-        and half the work of the load.
+        "mass": from the mass matrix, and from density times volume. "reaction": the force in the
+        transverse spring of the root, and the net lift. "root moment": the moment in the flap
+        spring, and that of the load about the root. "energy and work": the elastic energy, and half
+        the work of the load.
     """
     mesh = operators.wing_mesh
     root = mesh.design.root
@@ -99,6 +107,7 @@ def wing_balance(operators: AffineOperators, load_factor: float = 3.0) -> dict[s
     rule = gauss_points(2)
     _, determinants = gradients(mesh.kind, mesh.nodes, rule.points)
     volume = determinants @ rule.weights
+    # the kinetic energy of heaving at unit speed is half the total mass
     matrix_mass = motions.heave @ (operators.mass_terms[0] @ motions.heave)
     # forces and energy of the solution
     u = static_response(operators, {"load_factor": load_factor}).displacement
@@ -175,20 +184,22 @@ def mesh_convergence(design: WingDesign, refinements: Sequence[float]) -> list[M
 
 
 def observed_order(ratio: float, values: Sequence[float]) -> float:
-    """Return the order p of v = v_0 + c h^p through the last three of values on meshes.
+    """Return the order of convergence p that the results on the three finest meshes show.
+
+    With v = v_0 + c h^p and h_k = h_0 / ratio^k, successive changes of v have the ratio
+    ratio^p, from which p follows (Roache 1998, Richardson extrapolation).
 
     Parameters
     ----------
     ratio : float
-        The ratio of the mesh sizes h of successive meshes.
+        The ratio of the mesh sizes h of successive meshes, coarser to finer.
     values : sequence of float
-        The values.
+        The results, from the coarsest to the finest mesh; at least three.
 
     Returns
     -------
     float
-        The order; NaN if the values do not approach a limit from one side with an order of 0.05 to
-        12.
+        The order; NaN if the results oscillate, or if the order is not between 0.05 and 12.
     """
     earlier_change = values[-2] - values[-3]
     last_change = values[-1] - values[-2]
@@ -211,7 +222,7 @@ class Check:
     limit : float, optional
         Largest allowed value; None for a figure that is only reported.
     note : str
-        Text beside the figure.
+        Text printed after the figure.
     """
 
     group: str
@@ -258,17 +269,29 @@ def all_checks(design: WingDesign, jobs: Path, *, quick: bool = False) -> list[C
 
 
 def balance_checks(operators: AffineOperators) -> Iterator[Check]:
-    """Yield the sums that must agree for the wing at the load factor of its lift.
+    """Yield checks of the forces, masses and energies of the wing, at the load factor of its lift.
 
-    The first check is the largest force of a rigid motion without the forces of the springs,
-    relative to the sum of the magnitudes of its terms.
+    First, rigid motions must cause no elastic force. The figure is the largest entry of K r,
+    for all rigid motions r that the root allows and without the springs of the root, relative to
+    the largest entry of |K| |r|: the size of the terms that cancel, and so of their rounding
+    errors. Then come the balances of `wing_balance`, each as the relative difference of two sums.
+
+    Parameters
+    ----------
+    operators : AffineOperators
+        The wing.
     """
     motions = np.column_stack(_root_motions(operators))
     stiffness = operators.stiffness()
     without_springs = stiffness - operators.body.supports.stiffness
-    force = np.abs(without_springs @ motions).max()
-    magnitude = (abs(stiffness) @ np.abs(motions)).max()
-    yield Check("wing", "force of a rigid motion", float(force / magnitude), RIGID_FORCE_LIMIT)
+    largest_force = np.abs(without_springs @ motions).max()
+    largest_sum_of_magnitudes = (abs(stiffness) @ np.abs(motions)).max()
+    yield Check(
+        "wing",
+        "force of a rigid motion",
+        float(largest_force / largest_sum_of_magnitudes),
+        RIGID_FORCE_LIMIT,
+    )
     balances = wing_balance(operators, operators.wing_mesh.design.lift.load_factor)
     for name, balance in balances.items():
         yield Check(

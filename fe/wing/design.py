@@ -28,7 +28,7 @@ _NAMES = Path(__file__).with_name("names.toml")
 
 
 def wing_structure(regions: tuple[str, ...], gauges: int) -> StructureDesign:
-    """Return a wing as a structure: the names and ranges of what can be chosen and read.
+    """Return the structure design of a wing: names and ranges of its inputs, names of its outputs.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def _box_fault(design: WingDesign, subject: str, front: float, rear: float) -> F
 
 
 def _region_faults(design: WingDesign) -> Iterator[Fault]:
-    """Yield damage regions that lie off the box, overlap, or have names that cannot be."""
+    """Yield damage regions that lie off the box, overlap, or have names that are taken."""
     span = design.planform.semi_span
     for index, defect in enumerate(design.defects):
         label = f"defects[{index}]"

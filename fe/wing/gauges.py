@@ -27,7 +27,7 @@ class LinePoints(NamedTuple):
 
 
 def averaging_points(middle: float, length: float, lines: FloatArray) -> LinePoints:
-    """Return Gauss points of the mean over a length, interval by interval between mesh lines.
+    """Return Gauss points and weights of a mean over a length, for each interval of mesh lines.
 
     Strain jumps at the edge of a defect, which is a mesh line. Points that disregard the mesh lines
     would misjudge how much of a gauge lies beyond the edge.
@@ -75,17 +75,19 @@ class _SkinPoint(NamedTuple):
 
 
 def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
-    """Return the strain of each gauge as a row on the displacements, eq. (15).
+    """Return the matrix that gives the gauge strains from nodal displacements.
 
-    The strain is that of the upper skin, on its outer surface or in the middle of its thickness,
-    averaged over the gauge interval by interval between the mesh lines.
+    Kapteyn et al. 2021, eq. (15). The strain is that of the upper skin, on its outer surface or in
+    the middle of its thickness. It is averaged over the area of the gauge, separately in each
+    interval between mesh lines.
 
     Parameters
     ----------
     mesh : WingMesh
         The mesh.
     angle : float
-        Angle [rad] in the skin from the span towards the tip's rear, along which gauges read.
+        Direction of the gauges in the plane of the skin: the angle [rad] from the spanwise
+        direction, positive towards the trailing edge.
 
     Returns
     -------
@@ -103,7 +105,7 @@ def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
     along, aft = _directions_in_skin(mesh, cells, local)
     return mesh.strain_rows(
         row=np.array([point.gauge for point in points]),
-        weight=-weights,
+        weight=-weights,  # positive in compression
         cells=cells,
         local=local,
         direction=np.cos(angle) * along + np.sin(angle) * aft,
@@ -111,26 +113,26 @@ def gauge_output(mesh: WingMesh, angle: float = 0.0) -> sparse.csr_array:
 
 
 def _gauge_points(mesh: WingMesh, gauge: int) -> list[_SkinPoint]:
-    """Return the points over which a gauge averages: a rectangle around its middle.
+    """Return the integration points of a gauge, which averages over a rectangle around its middle.
 
-    The rectangle reaches the same distances fore and aft of the gauge's own chord line.
+    Along the span, the middle of the rectangle keeps its distance to the straight chord line.
     """
     gauges = mesh.design.gauges
     planform = mesh.design.planform
     distance, chord_fraction = gauges.positions[gauge]
-    chord = planform.chord(distance / planform.semi_span)
-    behind_straight_line = (chord_fraction - planform.straight_chord_line) * chord
+    local_chord = planform.chord(distance / planform.semi_span)
+    aft_of_straight_line = (chord_fraction - planform.straight_chord_line) * local_chord
     points = []
-    along = averaging_points(distance, gauges.averaging_spanwise, mesh.span_lines)
-    for station, station_weight in zip(*along, strict=True):
+    span_points = averaging_points(distance, gauges.averaging_spanwise, mesh.span_lines)
+    for station, station_weight in zip(*span_points, strict=True):
         straight_line = planform.straight_chord_line * planform.chord(station / planform.semi_span)
-        across = averaging_points(
-            behind_straight_line + straight_line,
+        chord_points = averaging_points(
+            aft_of_straight_line + straight_line,
             gauges.averaging_chordwise,
             mesh.chord_positions(station),
         )
-        for behind, chord_weight in zip(*across, strict=True):
-            cell, local = mesh.skin_point(station, behind)
+        for distance_aft, chord_weight in zip(*chord_points, strict=True):
+            cell, local = mesh.skin_point(station, distance_aft)
             points.append(_SkinPoint(gauge, station_weight * chord_weight, cell, local))
     return points
 

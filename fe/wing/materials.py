@@ -32,22 +32,23 @@ def cell_elasticity(mesh: WingMesh) -> FloatArray:
 def _set_skin_elasticity(mesh: WingMesh, local: FloatArray) -> None:
     """Set the elasticity of the skin and of the leading-edge wall in local axes (nc, 6, 6) [Pa].
 
-    The thickness of the wall runs along the chord, so that its in-plane shear is that of axes 2, 3.
+    The local axes are chordwise (1), spanwise (2) and across (3). The wall stands upright: its
+    thickness lies along the chord, so that its in-plane shear is that of axes 2 and 3.
     """
     skin = mesh.design.skin
-    in_plane = skin.in_plane_shear_ratio
-    transverse = skin.transverse_shear_ratio
+    in_plane_ratio = skin.in_plane_shear_ratio
+    transverse_ratio = skin.transverse_shear_ratio
 
     def unit_elasticity(shear_moduli: tuple[float, float, float]) -> FloatArray:
         compliance = orthotropic_compliance(1.0, skin.poisson_ratio, shear_moduli)
         return np.asarray(np.linalg.inv(compliance))
 
-    of_skin = unit_elasticity((in_plane, transverse, transverse))
-    of_wall = unit_elasticity((transverse, transverse, in_plane))
+    skin_unit_elasticity = unit_elasticity((in_plane_ratio, transverse_ratio, transverse_ratio))
+    wall_unit_elasticity = unit_elasticity((transverse_ratio, transverse_ratio, in_plane_ratio))
     is_skin = mesh.is_skin
     modulus = skin.young_modulus(mesh.centre_stations)[is_skin, None, None]
     is_wall = mesh.leading_edge[is_skin, None, None]
-    local[is_skin] = np.where(is_wall, of_wall, of_skin) * modulus
+    local[is_skin] = np.where(is_wall, wall_unit_elasticity, skin_unit_elasticity) * modulus
 
 
 def _add_rod_stiffness(mesh: WingMesh, local: FloatArray) -> None:
@@ -55,6 +56,7 @@ def _add_rod_stiffness(mesh: WingMesh, local: FloatArray) -> None:
     for rod in mesh.design.rods:
         has_rod = (mesh.web == rod.web) & (mesh.centre_stations < rod.reach)
         thickness = mesh.design.webs[rod.web].thickness
+        # an additional spanwise modulus E with E I = the rod's bending stiffness, I that of the web
         second_moment = thickness * _web_height(mesh)[has_rod] ** 3 / 12.0
         local[has_rod, 1, 1] += rod.bending_stiffness / second_moment
 
@@ -73,10 +75,10 @@ def cell_axes(mesh: WingMesh) -> FloatArray:
 
 
 def modulus_variation(mesh: WingMesh) -> FloatArray:
-    """Return Young's modulus at the points of `gauss_points(3)` over that at the cell's centre.
+    """Return the ratio of Young's modulus at Gauss points of cells to that at their centres.
 
-    It differs from one if the skin's modulus is given at stations, and therefore changes inside a
-    cell.
+    The points are those of `gauss_points(3)`. The ratio differs from one if the skin's modulus is
+    given at stations, between which it is linear, so that it changes within a cell.
 
     Returns
     -------

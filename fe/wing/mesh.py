@@ -122,9 +122,9 @@ class WingMesh(CellMesh):
     def skin_point(
         self, distance: float, behind: float, *, upper: bool = True
     ) -> tuple[int, FloatArray]:
-        """Find a point on the outer surface of the skin of the box.
+        """Find the cell of a point on the outer surface of the skin, and its position in the cell.
 
-        That it lies there was checked with the design.
+        The check of the design guarantees that the point lies on the box.
 
         Parameters
         ----------
@@ -149,7 +149,7 @@ class WingMesh(CellMesh):
 
 
 def _interval_of(lines: FloatArray, position: float) -> tuple[int, float]:
-    """Return the interval between lines that holds a position, and the local coordinate in it."""
+    """Return the interval of lines that contains a position, and the local coordinate in it."""
     last_interval = len(lines) - 2
     line = np.searchsorted(lines, position, side="right") - 1
     interval = int(np.clip(line, 0, last_interval))
@@ -158,13 +158,13 @@ def _interval_of(lines: FloatArray, position: float) -> tuple[int, float]:
 
 
 def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
-    """Return the half thickness at the mesh lines whose straight edges are nearest to the airfoil.
+    """Return half thicknesses at mesh lines, so that straight edges fit the airfoil best.
 
-    Straight edges between points of the airfoil would make the section thinner, the more so the
-    coarser the mesh. Here each line is moved off the airfoil so that the straight edges are nearest
-    to it in the sense of least squares. That keeps the area and, to fourth order, the second
-    moment. Lines that bound a narrow cell, such as a web, move together, so that the skin does not
-    kink there.
+    Straight edges between points of the airfoil would make the section too thin, the more so the
+    coarser the mesh. Here each line is moved off the airfoil, by offsets that minimise the squared
+    distance between the edges and the airfoil. That keeps the area and, to fourth order, the second
+    moment. Lines that bound a narrow cell, such as a web, get the same offset, so that the skin has
+    no kink there.
 
     Parameters
     ----------
@@ -189,6 +189,7 @@ def straight_edged(behind: FloatArray, chord: FloatArray, thickness_ratio: float
     is_wide = root_width > _NARROW * root_width.max()
     group = np.concatenate([[0], np.cumsum(is_wide)])
     in_group = (group[:, None] == np.arange(group[-1] + 1)).astype(np.float64)
+    # normal equations of the least squares for the offset of each group
     right_hand_side = (moment @ in_group)[..., None]
     offset = np.linalg.solve(in_group.T @ gram @ in_group, right_hand_side).squeeze(axis=-1)
     return np.asarray(on_airfoil + in_group @ offset.T)
@@ -219,10 +220,10 @@ def _hat_function_gram(width: FloatArray) -> FloatArray:
 
 
 def _airfoil_moments(behind: FloatArray, chord: FloatArray, thickness_ratio: float) -> FloatArray:
-    """Return what the airfoil has more than straight edges between its points on the mesh lines.
+    """Return moments of the gap between the airfoil and straight edges through its mesh points.
 
-    The gap between airfoil and edges is integrated over the chord times the linear shape function
-    (hat) of each mesh line, by Gauss-Legendre quadrature in each cell.
+    For each mesh line, the gap times the linear shape function (hat) of the line is integrated over
+    the chord, by Gauss-Legendre quadrature in each cell.
 
     Parameters
     ----------
@@ -279,7 +280,8 @@ def _grid_points(
     chord = planform.chord(across / planform.semi_span)
     behind = np.array([line.at(chord) for line in along])
     outer = straight_edged(behind, chord, thickness_ratio)
-    # The skin's thickness is measured normal to it, the grid line is upright.
+    # The skin's thickness is measured normal to it, and the grid line is vertical: a slope makes
+    # the vertical thickness larger by sqrt(1 + slope^2).
     slope = four_digit_slope(behind / chord, thickness_ratio)
     inner = outer - design.skin.thickness * np.sqrt(1.0 + slope**2)
     levels = np.linspace(-1.0, 1.0, height_cells + 1)
@@ -291,7 +293,7 @@ def _grid_points(
 
 @dataclass(frozen=True)
 class _GridCells:
-    """Which part of the wing each cell of the grid belongs to.
+    """The part of the wing to which each cell of the grid belongs.
 
     Attributes
     ----------

@@ -59,7 +59,7 @@ def _filled(
     Parameters
     ----------
     required : iterable of MeshLine
-        What the design asks for; of two lines at the same position one is kept.
+        Lines that the design requires; of two lines at the same position one is kept.
     optional : iterable of OptionalLine
         Lines that are taken if they have room.
     chords : (k,) array
@@ -104,7 +104,11 @@ def _distinct_lines(required: Iterable[MeshLine], chords: FloatArray) -> list[Me
 
 
 def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatArray) -> bool:
-    """Return whether a line lies between others, crosses none, and is farther than `room` [m]."""
+    """Return whether a line can be added between others.
+
+    It must lie between two lines, cross none, and be farther than `room` [m] from all, at each of
+    the chords.
+    """
     gaps = line.at(chords) - np.array([other.at(chords) for other in lines])
     is_behind = (gaps > 0.0).all(axis=1)
     is_ahead = (gaps < 0.0).all(axis=1)
@@ -116,22 +120,33 @@ def _has_room(line: MeshLine, room: float, lines: list[MeshLine], chords: FloatA
 def _lines_between(
     start: MeshLine, end: MeshLine, chords: FloatArray, size: float
 ) -> list[MeshLine]:
-    """Return evenly distributed lines between two, at most `size` [m] apart at the first chord."""
+    """Return evenly spaced mesh lines between two lines, without these.
+
+    Parameters
+    ----------
+    start, end : MeshLine
+        The two lines.
+    chords : (k,) array
+        The chords at which lines are located [m].
+    size : float
+        The largest distance of neighbouring lines at the first of these chords [m].
+    """
     distance = (end.at(chords) - start.at(chords))[0]
-    count = max(1, int(np.ceil(distance / size - 1e-9)))
-    fraction_step = end.fraction - start.fraction
-    offset_step = end.offset - start.offset
+    # 1e-9: a quotient that is an integer but for rounding errors needs no additional cell
+    cell_count = max(1, int(np.ceil(distance / size - 1e-9)))
+    fraction_difference = end.fraction - start.fraction
+    offset_difference = end.offset - start.offset
     return [
         MeshLine(
-            start.fraction + number / count * fraction_step,
-            start.offset + number / count * offset_step,
+            start.fraction + number / cell_count * fraction_difference,
+            start.offset + number / cell_count * offset_difference,
         )
-        for number in range(1, count)
+        for number in range(1, cell_count)
     ]
 
 
 def _lines_beside(design: WingDesign, edges: list[MeshLine]) -> list[OptionalLine]:
-    """Return lines on both sides of the edges of defects, if the design asks for small cells."""
+    """Return optional lines on both sides of edges of defects, if the design has an edge size."""
     if design.mesh.edge_size is None:
         return []
     distance = design.mesh.edge_size / design.mesh.refinement
@@ -199,7 +214,8 @@ def _material_ends(design: WingDesign) -> list[float]:
 def web_faces(design: WingDesign, index: int) -> tuple[MeshLine, MeshLine]:
     """Return the front and the rear mesh line of a web.
 
-    The first web lies behind its chord fraction, the last one before it, the others around it.
+    The first web lies aft of its chord fraction, the last one fore of it, and the others are
+    centred on it.
     """
     web = design.webs[index]
     if index == 0:
@@ -251,7 +267,7 @@ def chord_lines(design: WingDesign) -> tuple[MeshLine, ...]:
 
 
 def cells_within(lines: FloatArray, intervals: Iterable[tuple[float, float]]) -> IntArray:
-    """Return the interval that holds the middle of each cell between lines.
+    """Return the interval in which the middle of each cell between mesh lines lies.
 
     Parameters
     ----------

@@ -138,7 +138,9 @@ def root_support(mesh: WingMesh) -> Supports:
 
 
 def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float) -> FloatArray:
-    """Return the weights (nodes,) of the mean displacement of upper and lower skin at a point.
+    """Return weights (nodes,) that give the displacement of a section at a chord position.
+
+    It is the mean of the displacements of the upper and the lower skin there.
 
     Parameters
     ----------
@@ -150,17 +152,17 @@ def section_displacement(mesh: WingMesh, distance: float, chord_fraction: float)
         Position along the local chord.
     """
     planform = mesh.design.planform
-    behind = chord_fraction * planform.chord(distance / planform.semi_span)
+    distance_aft = chord_fraction * planform.chord(distance / planform.semi_span)
     weights = np.zeros(len(mesh.points))
     for upper in (True, False):
-        cell, local = mesh.skin_point(distance, behind, upper=upper)
+        cell, local = mesh.skin_point(distance, distance_aft, upper=upper)
         (values,), _ = mesh.kind.shape_functions(local[None])
         weights[mesh.cells[cell]] += 0.5 * values
     return weights
 
 
 def upward(weights: FloatArray) -> FloatArray:
-    """Return the weights (full,) of upward displacements from those of nodes (nodes,)."""
+    """Return weights on all unknowns (full,) that weigh upward displacements of nodes (nodes,)."""
     return np.kron(weights, np.array([0.0, 0.0, 1.0]))
 
 
@@ -192,7 +194,9 @@ def wing_body(mesh: WingMesh) -> Body[WingMesh]:
 
 
 def lift_load(mesh: WingMesh) -> FloatArray:
-    """Return the load (full,) [N] at load factor 1: up and forward, half on each skin.
+    """Return the aerodynamic load (full,) [N] at load factor 1, upward and forward.
+
+    Half of it acts on each skin.
 
     The load follows the design's distribution along the span, and (1 - xi)^p along the chord with
     the design's exponent p. Each skin cell is loaded on its outer face. The sums are exactly those
@@ -215,10 +219,10 @@ def _add_skin_pressure(mesh: WingMesh, load: FloatArray, *, upper: bool) -> None
     lift = mesh.design.lift
     # integration points on the outer faces
     face = gauss_points(4, 2)
-    height = 1.0 if upper else 0.0
-    local = np.column_stack([face.points, np.full(len(face.points), height)])
+    local_height = 1.0 if upper else 0.0
+    local = np.column_stack([face.points, np.full(len(face.points), local_height)])
     cells = mesh.skin_cells(upper=upper)
-    values, _ = mesh.kind.shape_functions(local)
+    shape_values, _ = mesh.kind.shape_functions(local)
     x, y, _ = np.moveaxis(mesh.positions(cells, local), 2, 0)
     jacobian = jacobians(mesh.kind, mesh.nodes[cells], local)
     area = np.linalg.det(jacobian[..., :2, :2])  # in the plan view
@@ -226,16 +230,17 @@ def _add_skin_pressure(mesh: WingMesh, load: FloatArray, *, upper: bool) -> None
     station = np.clip(y / planform.semi_span, 0.0, 1.0)
     chord = planform.chord(station)
     chord_fraction = x / chord + planform.straight_chord_line
-    along_span = DISTRIBUTIONS[lift.distribution](planform, station)
-    along_chord = (1.0 - chord_fraction) ** lift.chordwise_exponent
-    pressure = along_span * along_chord / chord
-    np.add.at(load, mesh.cells[cells], (pressure * area * face.weights) @ values)
+    span_distribution = DISTRIBUTIONS[lift.distribution](planform, station)
+    chord_distribution = (1.0 - chord_fraction) ** lift.chordwise_exponent
+    pressure = span_distribution * chord_distribution / chord
+    np.add.at(load, mesh.cells[cells], (pressure * area * face.weights) @ shape_values)
 
 
 def turn_load(body: Body[WingMesh]) -> FloatArray:
     """Return the load (full,) [N] of load factor 1, with inertia relief if the design has it.
 
-    With inertia relief the weight acts at the nodes, and the lift is larger by the same amount.
+    With inertia relief, the weight acts downwards at the nodes, and the lift is scaled up by as
+    much, so that the net force is that of the design.
     """
     load = lift_load(body.mesh)
     if body.mesh.design.lift.inertia_relief:
@@ -318,7 +323,7 @@ def _assemble_wing(design: WingDesign) -> AffineOperators:
 def wing_values(
     wing: AffineWing, young_modulus_factor: float, stiffness_loss: Losses, **others: float
 ) -> dict[str, float]:
-    """Return the values of all that can be chosen of a wing by their names.
+    """Return the values of the wing's parameters, losses, masses and controls by their names.
 
     Parameters
     ----------

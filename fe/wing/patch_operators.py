@@ -134,20 +134,20 @@ class _SkinStrips(NamedTuple):
 
 
 def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> FloatArray:
-    """Return the weights of the mean over the planform, by Simpson's rule along the span.
+    """Return the weights of a mean over the planform, by Simpson's rule along the span.
 
     Parameters
     ----------
     stations : (P,) array
-        Distances from the root [m]. Every other station ends an interval; the one between is its
-        middle.
+        Distances from the root [m], P odd: the ends of the intervals and, between two ends, the
+        middle of the interval.
     root_chord, tip_chord : float
-        The chords [m].
+        The chords [m]; between them the chord is linear.
 
     Returns
     -------
     (P,) array
-        The weights; they sum to one.
+        The weights, which sum to one.
     """
     length = stations[2::2] - stations[:-2:2]
     last_offset = len(stations) - 2
@@ -161,8 +161,9 @@ def area_weights(stations: FloatArray, root_chord: float, tip_chord: float) -> F
 def section_lines(design: WingDesign) -> tuple[float, ...]:
     """Return the chord fractions of the elastic line, then of the webs that are other lines.
 
-    The webs are in ascending order. A web that is too near to another line gives no lever; of two
-    such webs the one nearer to the elastic line is a line.
+    The webs are in ascending order. A web closer to another line than `LEAST_LINE_DISTANCE` is
+    left out, since a moment would need large opposite forces on a short lever. The webs are tried
+    from the elastic line outwards, so that of two webs close together the inner one is kept.
     """
     elastic_chord = design.tip_load.chord
     web_chords = sorted(
@@ -243,7 +244,8 @@ def _line_rows(
 def _strain_rows(operators: AffineOperators) -> StrainRows:
     """Return the strains of the gauges along the span, across it, and in shear.
 
-    The shear strain follows from the strain along the diagonal, as in a rosette.
+    The shear strain follows from the strain at 45 degrees, as in a rosette: that strain is
+    (along + across + shear) / 2.
     """
     mesh = operators.wing_mesh
     along = operators.gauge_output
@@ -255,38 +257,48 @@ def _strain_rows(operators: AffineOperators) -> StrainRows:
 def _lift_rows(
     operators: AffineOperators, weight: FloatArray, stations: FloatArray
 ) -> sparse.csr_array:
-    """Return the lift of load factor 1 by the station nearest to each node, csr (P, n) [N].
+    """Return the upward lift of load factor 1, divided among stations along the span.
+
+    The force at each node of the mesh is counted to the station nearest to it.
 
     Parameters
     ----------
     operators : AffineOperators
-        The wing.
+        The wing of n free unknowns.
     weight : (full,) array
-        Its weight at the nodes, downwards [N].
+        The weight at all nodes; its forces point downwards, so its entries are negative [N].
     stations : (P,) array
         Distances of the stations from the root [m].
+
+    Returns
+    -------
+    csr (P, n)
+        One load vector for each station [N]; their sum is the lift without the weight.
     """
     mesh = operators.wing_mesh
-    lift = turn_load(operators.body)
-    if mesh.design.lift.inertia_relief:  # the load contains the weight
-        lift = lift - weight
+    lift_of_unknowns = turn_load(operators.body)
+    if mesh.design.lift.inertia_relief:  # the turn's load is then lift + weight
+        lift_of_unknowns = lift_of_unknowns - weight
     _, span_position, _ = mesh.points.T
     nearest_station = np.abs(span_position[:, np.newaxis] - stations).argmin(axis=1)
-    entries = (np.repeat(nearest_station, 3), np.arange(mesh.unknowns))
-    by_station = sparse.coo_array((lift, entries), shape=(len(stations), len(lift))).tocsr()
-    return sparse.csr_array(by_station @ operators.expansion)
+    # each node has three unknowns, which go to the same station
+    rows_and_columns = (np.repeat(nearest_station, 3), np.arange(mesh.unknowns))
+    lift_by_station = sparse.coo_array(
+        (lift_of_unknowns, rows_and_columns), shape=(len(stations), len(lift_of_unknowns))
+    ).tocsr()
+    return sparse.csr_array(lift_by_station @ operators.expansion)
 
 
 def _skin_strips(operators: AffineOperators) -> _SkinStrips:
-    """Return the stiffness of the skin, parted by strips between mesh lines and by terms."""
+    """Return the stiffness of the skin, split by strips between mesh lines and stiffness terms."""
     mesh = operators.wing_mesh
     _, centre_position, _ = mesh.centres.T
     strip_of_cell = np.searchsorted(mesh.span_lines, centre_position) - 1
-    skin = np.flatnonzero(mesh.stiffness_term <= len(mesh.design.regions))
-    pairs = np.stack((strip_of_cell, mesh.stiffness_term), axis=1)[skin]
-    parts, part_of_cell = np.unique(pairs, axis=0, return_inverse=True)
+    skin_cells = np.flatnonzero(mesh.stiffness_term <= len(mesh.design.regions))
+    strip_and_term_of_cell = np.stack((strip_of_cell, mesh.stiffness_term), axis=1)[skin_cells]
+    parts, part_of_cell = np.unique(strip_and_term_of_cell, axis=0, return_inverse=True)
     strip_of, term_of = parts.T
     stiffness = tuple(
-        operators.body.stiffness(skin[part_of_cell == number]) for number in range(len(parts))
+        operators.body.stiffness(skin_cells[part_of_cell == part]) for part in range(len(parts))
     )
     return _SkinStrips(strip_of, term_of, stiffness)

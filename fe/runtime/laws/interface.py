@@ -10,10 +10,10 @@ compiles too, with:
 law : (`PARAMETERS` + E,) array
     The law's parameters, then those of its hysteretic elements: `PortForce.parameter_row`.
 memory : (`FIRST_ELEMENT` + E,) array
-    What the law remembers: 1 if dry friction holds the port (`STUCK`); the port's last position
-    (`POSITION`); the force as the residual position follows it (`LAGGED_FORCE`); what loads that
-    were removed still add to the position (`FADING_POSITION`); the law's force (`FORCE`); then the
-    states of the elements.
+    The memory of the law: 1 if dry friction holds the port (`STUCK`); the port's last position
+    (`POSITION`); the force after the lag with which the residual position follows it
+    (`LAGGED_FORCE`); the decaying displacement left by removed loads (`FADING_POSITION`); the law's
+    force (`FORCE`); then the states of the hysteretic elements.
 x : float
     Position of the port [m or rad].
 duration : float
@@ -34,15 +34,15 @@ from ..primitive import Primitive
 PARAMETERS = 5
 """Largest number of parameters of a law."""
 POSITIVE, NOT_NEGATIVE = "be positive", "not be negative"
-"""Requirement on a number; it stands after the unit in the annotation of the number."""
+"""Requirements on a number, given after the unit in the annotation of the number."""
 
 
 class PortForce(Primitive):
-    """A primitive that is a force at a port: a law, by its numbers."""
+    """A primitive that is an internal force at a port, given by the parameters of a law."""
 
     can_act_in_windows: ClassVar[bool] = True
     depends_on_speed: ClassVar[bool] = False
-    """Whether the force is one of speed, which is zero at rest."""
+    """Whether the force depends on the speed; it is then zero at rest."""
     hysteretic: ClassVar[bool] = False
     """Whether the force depends on the history of the motion."""
 
@@ -50,7 +50,7 @@ class PortForce(Primitive):
 
     @property
     def proportional(self) -> tuple[str, ...]:
-        """Names of the numbers that the force is in proportion to; it vanishes with the first."""
+        """Names of the numbers by which the force scales; it is zero if the first one is zero."""
         first_number = next(iter(self.units))
         return (first_number,)
 
@@ -66,7 +66,7 @@ class PortForce(Primitive):
 
     @property
     def magnitude(self) -> float:
-        """A number that is zero where the law gives no force at all."""
+        """A number that is zero if the law has no force at all."""
         return float(getattr(self, self.proportional[0]))
 
     def check(self) -> None:
@@ -98,7 +98,7 @@ class PortForce(Primitive):
     ) -> tuple[float, float]:
         """Return the force at `x` and its derivative by `x`; the memory is not changed.
 
-        Of dry friction: the largest force, as if the port moved forwards.
+        For dry friction it is the largest force, with the sign for a forward motion.
         """
         return 0.0, 0.0
 

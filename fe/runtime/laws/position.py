@@ -100,7 +100,7 @@ LONGEST_STEP = 0.3
 """Longest step along a Bouc-Wen path, in yield displacements; divided by the order above order
 one."""
 MOST_ELEMENTS = 10_000
-"""Largest number of elements of a joint, far more than its curve can show."""
+"""Largest number of elements of a joint, far more than its force-displacement curve resolves."""
 
 
 class BoucWen(PortForce):
@@ -140,7 +140,7 @@ def hysteretic_displacement(law: FloatArray, memory: FloatArray, x: float) -> fl
     """Return z of a Bouc-Wen law at `x`, along the straight path from the last position."""
     yield_displacement = law[1]
     order = law[2]
-    # all in yield displacements
+    # all displacements in units of the yield displacement
     z = memory[FIRST_ELEMENT] / yield_displacement
     remaining = (x - memory[POSITION]) / yield_displacement
     # unloading: dz = dx until z is zero
@@ -148,10 +148,10 @@ def hysteretic_displacement(law: FloatArray, memory: FloatArray, x: float) -> fl
         unloaded = remaining if abs(remaining) <= abs(z) else -z
         z += unloaded
         remaining -= unloaded
-    # loading: dz/dx = 1 - |z|^order by the method of Runge and Kutta; the last step is short
+    # loading: dz/dx = 1 - |z|^order by the Runge-Kutta method of order four; the last step is short
     if remaining != 0.0:
         size = abs(z)
-        distance = min(abs(remaining), 2.0 + 40.0 / order)  # by then it yields to the last bit
+        distance = min(abs(remaining), 2.0 + 40.0 / order)  # beyond it, z = 1 exactly
         while distance > 0.0:
             step = min(distance, LONGEST_STEP / max(order, 1.0))
             distance -= step

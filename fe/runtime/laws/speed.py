@@ -13,7 +13,7 @@ from ..arrays import POSITION
 from .interface import NOT_NEGATIVE, POSITIVE, FloatArray, PortForce, power
 
 COEFFICIENT, EXPONENT, POSITION_EXPONENT, LEVEL, ONE_SIDED = range(5)
-"""Columns of a law's parameters: k, p, a, l, and 1 where there is no force below the level."""
+"""Columns of a law's parameters: k, p, a, l, and 1 if there is no force below the level."""
 
 
 def force_of_mean_speed(
@@ -21,7 +21,8 @@ def force_of_mean_speed(
 ) -> tuple[float, float]:
     """Return the force of a law of speed at `x`, and its derivative by `x`.
 
-    The speed is the mean speed since the last position. Of dry friction: the largest force.
+    The speed is the mean speed (x - last position) / duration. For dry friction the force is the
+    largest one, with the sign for a forward motion.
     """
     exponent = law[EXPONENT]
     size = law[COEFFICIENT] * power(abs(x), law[POSITION_EXPONENT])
@@ -122,7 +123,9 @@ def speed_after(
 ) -> float:
     """Return the speed of a port after the law has acted on it alone for a duration [s].
 
-    With `passes_zero`, dry friction goes on with its sign where the speed has become zero.
+    The solution of s' = -strength |s - l|^p sgn(s - l) in closed form, for each exponent p. With
+    `passes_zero`, dry friction keeps its sign when the speed passes zero, instead of stopping the
+    port there.
     """
     exponent = law[EXPONENT]
     above_level = speed - law[LEVEL]
@@ -160,9 +163,9 @@ def reversal_correction(
 ) -> tuple[float, float, float]:
     """Return the correction of a step in which the speed of a port changes its sign.
 
-    The step has taken friction of the first sign throughout. The reversal is that of the cubic
-    through the values and slopes of the speed; the impulse of friction and its first moment are
-    corrected for the time after it.
+    In the step, friction had its first sign throughout. The time of the reversal is the zero of the
+    cubic (Hermite) interpolation of the speed by its values and slopes at both ends. The impulse of
+    friction and its first moment, which gives the position, are corrected for the time after it.
 
     Parameters
     ----------
@@ -173,7 +176,7 @@ def reversal_correction(
     slopes : tuple of float
         Accelerations at both ends.
     speed_lost : float
-        What the first half of the impulse took from the speed.
+        Decrease of the speed by the first half of the impulse.
     strength : float
         Strength of the law at its position.
     duration : float
@@ -184,8 +187,8 @@ def reversal_correction(
     speed : float
         Correction of the speed at the end.
     position : float
-        Correction of the position at the end; if friction holds, the distance from the step's begin
-        to the reversal instead.
+        Correction of the position at the end. If friction holds the port, it is instead the
+        distance from the position at the begin of the step to that of the reversal.
     is_held : float
         1 if friction holds the port from the reversal on, else 0.
     """
@@ -207,7 +210,7 @@ def reversal_correction(
     u = 0.5 * (low + high)
     slope = (linear + u * (2.0 * square + 3.0 * u * cubic)) / duration
     deceleration = max(-sign * slope, 0.0)
-    # backwards, without this friction
+    # acceleration towards the other side, without friction
     free_acceleration = -sign * (slope + 2.0 * speed_lost / duration)
     limit = holding_limit(law, strength, 0.5 * duration)
     if free_acceleration <= 0.0 or 0.5 * duration * free_acceleration <= limit:
