@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import uav_twin
-from discrepancy.application import _again, apply_verdict, gives
+from discrepancy.application import _command_with_model, apply_verdict, gives
 from discrepancy.campaign.records import Channel, NoiseRecord, Quantity
 from discrepancy.document import Origin
 from discrepancy.errors import ModelError, VerdictFileError
@@ -110,7 +110,7 @@ def test_there_and_back_by_the_command_line(laboratory, tmp_path, monkeypatch):
     )
     assert once == again
     command = "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --model own.toml --seed 0"
-    assert _again(command, Path("two/one.json")) == (
+    assert _command_with_model(command, Path("two/one.json")) == (
         "uav-twin discrepancy run --from-run /flights/m1 --to-step 3 --seed 0 --model two/one.json "
         "--out verdicts/m1_one"
     )

@@ -231,7 +231,7 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tm
     unknown = ("isolated = false", "isolated = false\nsuperposition = false")
     with closing(FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2"), unknown))) as fmu:
         problem = problem_of(campaign, fmu)
-        assert Search(problem, (), fitted(problem)).force is None
+        assert Search(problem, (), fitted(problem)).force_search is None
 
 
 def drawn_through(search, effect, place):
@@ -336,7 +336,7 @@ def test_one_law_stands_where_several_follow_the_jumps_that_an_accelerometer_sho
         Search(found.problem, FEW[:3], found.no_effect),
     )
     begun = replace(alone.point, effect=np.append(alone.effect, 0.0))
-    again.keep(fit(found.problem, both, begun), exact=True)  # the other one was found first
+    again.record(fit(found.problem, both, begun), exact=True)  # the other one was found first
     again.search_sets()
     assert again.best().candidate.identifiers == ("coulomb_friction",)
 
