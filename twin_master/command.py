@@ -22,6 +22,7 @@ from scenarios import scenario_files
 from twin_master import parts
 from twin_master.errors import TwinMasterError, said
 from twin_master.fleet_command import engine_of, fly_and_show, shown
+from twin_master.watch.cause_search import CauseSearch
 
 
 def run(
@@ -180,6 +181,7 @@ def watch(
     last: int = 1000,
     view: bool = False,
     no_report: bool = False,
+    cause_search: CauseSearch | None = None,
 ) -> None:
     """Watch a real asset: observations in, a decision for each step out, as a line of JSON.
 
@@ -206,7 +208,8 @@ def watch(
             scenario, observations, out, {"seed": seed, "calibration": calibration, "library": library},
             decide=decide, resume=resume, follow=follow, steps=steps, model_patch=model_patch,
             from_step=from_step, teach=teach, allow_unknown=allow_unknown, ca_file=ca_file, replace=replace,
-            last=last, report=not no_report, otherwise="-", begun=opened, progress=terminal.progress(),
+            last=last, report=not no_report, otherwise="-", begun=opened, cause_search=cause_search,
+            progress=terminal.progress(),
         )  # fmt: skip
         _write("", flush=True)
         if not terminal.loudness.quiet:

@@ -52,7 +52,7 @@ def watch(
 
     fleet_view = parts.is_fleet, parts.serve_fleet
     try:
-        with parts.listening(watched.ask), shown(view, fleet_view) as begun, console.showing:
+        with parts.call_on_end_signal(watched.ask), shown(view, fleet_view) as begun, console.showing:
             begun(folder)
             watched.run(lambda: console.refresh(watched.standing))
     except Exception as error:

@@ -37,6 +37,6 @@ from twin_master.report.page import report_figures as report_figures
 from twin_master.report.page import write_report as write_report
 from twin_master.scenario.reading import load_scenario as load_scenario
 from twin_master.watch.opening import open_run as open_run
-from twin_master.watch.opening import watch as watch
 from twin_master.workflow import fly as fly
 from twin_master.workflow import resume as resume
+from uav_twin.watching import watch as watch

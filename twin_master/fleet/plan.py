@@ -19,8 +19,8 @@ from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import Count, Flag, Name, Probability, Section, Seed, named_once
 from twin_master.seeds import generator
-from twin_master.watch.feeds import is_broker
-from twin_master.watch.message import Fed
+from twin_master.watch.broker_address import is_broker
+from twin_master.watch.message import FeedItem
 
 SHARD = 256
 """Twins that are flown in one piece, unless the file says otherwise."""
@@ -125,7 +125,7 @@ class Member:
     parameters: Mapping[str, float]
     place: int = 0
     file: Path | None = None
-    recording: tuple[Fed, ...] | None = None
+    recording: tuple[FeedItem, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.report.reading import printed_factors
 from twin_master.run_folder import folder_config
 from twin_master.scenario.schema import Scenario
-from twin_master.viewer.server import serve_page, text_of
+from twin_master.viewer.server import ServedText, package_text, serve_texts
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -346,11 +346,11 @@ def serve_fleet(
         return html.replace("</body>", tag)
 
     texts = {
-        "/": (page, "text/html"),
-        "/version": (current, "text/plain"),
-        "/view.js": (text_of("twin_master.fleet", "view.js"), "text/javascript"),
+        "/": ServedText(page, "text/html"),
+        "/version": ServedText(current, "text/plain"),
+        "/view.js": package_text("twin_master.fleet", "view.js", "text/javascript"),
     }
-    serve_page(texts, port, ready, wanted)
+    serve_texts(texts, port, ready, wanted)
 
 
 def _stamp(folder: Path) -> list[tuple[str, int, int]]:

@@ -40,14 +40,15 @@ from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one,
 from twin_master.mission.steps import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
-from twin_master.watch.intake import Feed, Intake
-from twin_master.watch.message import Fed
+from twin_master.watch.feed import Feed
+from twin_master.watch.intake import Intake
+from twin_master.watch.message import FeedItem
 
 if TYPE_CHECKING:
     from distributed import Client
 
 
-def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
+def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[FeedItem]]) -> Flights:
     """Return what B twins conclude of B recordings: beliefs and controls are those of a watch of each."""
     flights, most = Flights.empty(knowledge, len(recordings)), knowledge.scenario.mission.steps
     for number, messages in enumerate(recordings):
@@ -68,7 +69,7 @@ def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Fl
     return flights
 
 
-def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
+def _history(knowledge: Knowledge, messages: Sequence[FeedItem]) -> History:
     scenario = knowledge.scenario
     twin = knowledge.twin(lag=scenario.watch.lag)
     history = History(twin, scenario.observation.count)

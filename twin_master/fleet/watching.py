@@ -23,11 +23,14 @@ from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
 from twin_master.fleet.reading import attention, severity
 from twin_master.mission.side_by_side import IN_FLIGHT
 from twin_master.run_folder import CONFIG_NAME
-from twin_master.watch.feeds import broker_of, file_feed, is_broker
+from twin_master.watch.broker_address import is_broker, parse_broker
+from twin_master.watch.feed import Feed
+from twin_master.watch.feeds import file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.intake import Feed
-from twin_master.watch.mqtt import Session, Topic
-from twin_master.watch.opening import begun_watch, resumed_watch
+from twin_master.watch.mqtt import Topic
+from twin_master.watch.mqtt_session import Session
+from twin_master.watch.opening import begin_watch, resume_watch
+from twin_master.watch.result import notices_since
 
 STEPS_AT_ONCE = 64
 """Steps of one asset before the next one is looked at."""
@@ -102,7 +105,7 @@ class WatchedAsset:
         self.first_untold = self._alarms_before = 0
         if before is not None and before["last"] is not None:
             self.first_untold, self._alarms_before = before["last"]["step"] + 1, before["alarms"]
-        told = [notice for _, notice in watch.told(self.first_untold)] if self.decision else []
+        told = [notice for _, notice in notices_since(watch, self.first_untold)] if self.decision else []
         self.alarms = {notice.sentence for notice in told if notice.kind == "alarm"}
         if self.decision is not None:
             watch.filtered = watch.twin.estimator.smoothed(watch.twin.carried[-1:])[0]
@@ -260,7 +263,7 @@ class FleetWatch:
             return count
         try:
             if key not in self.assets:
-                self._take_up(group, name, feed())
+                self.update_from_journal(group, name, feed())
             asset = self.assets[key]
             if self.enough(asset):
                 return count
@@ -271,13 +274,13 @@ class FleetWatch:
                 count += 1
                 if count == most or self.enough(asset) or self.asked:
                     break
-            if not count and not asset.watch.intake.ended:
-                asset.watch.quiet(partial(self._decided, asset))
+            if not count and not asset.watch.intake.has_ended:
+                asset.watch.report_silence(partial(self._decided, asset))
         except Exception as error:  # noqa: BLE001 - whatever one asset comes to, the others go on
             self.lost(key, error)
         return count
 
-    def _take_up(self, group: Group, name: str, feed: Feed) -> None:
+    def update_from_journal(self, group: Group, name: str, feed: Feed) -> None:
         """Begin the watch of an asset, or go on with it."""
         key, folder = f"{group.name}/{name}", self.folder / group.name / name
         if not _NAME.fullmatch(name):
@@ -285,16 +288,16 @@ class FleetWatch:
         if len(self.assets) == LARGEST_FLEET:
             raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
         like = self._like.get(group.name)
-        opened = resumed_watch(folder, None, SilentProgress(), like)
+        opened = resume_watch(folder, None, SilentProgress(), like)
         if not (folder / CONFIG_NAME).is_file():
             with explained_write_errors(folder):
                 folder.parent.mkdir(exist_ok=True)
-            opened = begun_watch(group.scenarios[0], group.file, folder, SilentProgress(), like=like)
+            opened = begin_watch(group.scenarios[0], group.file, folder, SilentProgress(), sibling=like)
         with ExitStack() as closing:
             watch = closing.enter_context(opened)
-            closing.enter_context(watch.begun(feed))
+            closing.enter_context(watch.begin(feed))
             if isinstance(feed, Topic):
-                feed.begun(watch)
+                feed.attach(watch)
             asset = WatchedAsset(key, watch, feed, self._told_before.get(key))
             asset.close = closing.pop_all().close
         self.closing.callback(asset.close)
@@ -308,7 +311,7 @@ class FleetWatch:
         if "control" in decision:
             asset.decision = decision
         self._tell(asset, decision)
-        asset.feed.decide(decision)
+        asset.feed.send_decision(decision)
         asset.alarms |= {notice["sentence"] for notice in decision["notices"] if notice["kind"] == "alarm"}
 
     def ask(self) -> None:
@@ -354,7 +357,7 @@ class _Files:
         """Whether nothing more is to be read."""
         found = (self._fleet.assets.get(f"{self._group.name}/{name}") for name in self._files)
         return not self._follow and all(
-            asset is None or asset.watch.intake.ended or self._fleet.enough(asset) for asset in found
+            asset is None or asset.watch.intake.has_ended or self._fleet.enough(asset) for asset in found
         )
 
     def look(self, searching: bool) -> int:
@@ -390,11 +393,11 @@ class _Topics:
     ended = False
 
     def __init__(self, fleet: FleetWatch, group: Group, authority: Path | None) -> None:
-        broker = broker_of(group.observations, authority, many=True)
+        broker = parse_broker(group.observations, authority, many=True)
         self._fleet, self._group, self._topic = fleet, group, broker.topic
         self._session = Session(broker, group.name, fleet.folder, fleet.note, self._pulse)
         fleet.goodbyes.callback(self._session.close)
-        self._messages = self._session.messages(0.0)
+        self._messages = self._session.receive(0.0)
         self._topics: dict[str, Topic] = {}
 
     def look(self, searching: bool) -> int:
@@ -410,7 +413,7 @@ class _Topics:
             asset = self._fleet.assets.get(f"{self._group.name}/{name}")
             topic = self._found(name)
             if topic is not None and not (asset and self._fleet.enough(asset)):
-                topic.came.append(message.payload)
+                topic.payloads.append(bytes(message.payload))
                 steps += self._advanced(name)
             if time.monotonic() - begin > STATE_SECONDS:
                 break
@@ -431,6 +434,6 @@ class _Topics:
         kept = [topic.watch for topic in self._topics.values() if topic.watch is not None]
         return {
             "state": "watching", "assets": len(kept), "steps": sum(watch.twin.steps for watch in kept),
-            "quiet": sum(watch.is_quiet for watch in kept), "lag": len(self._session.came),
+            "quiet": sum(watch.is_quiet for watch in kept), "lag": len(self._session.unread),
             "refused": sum(watch.intake.counts.rejected for watch in kept),
         }  # fmt: skip
