@@ -28,9 +28,19 @@ class ForceDrawing(NamedTuple):
 
 
 def find_force_drawing(step: int, verdict_folder: Path) -> ForceDrawing | None:
-    """Return the drawing in the folder of a verdict that came after a step.
+    """Return the drawing of a missing force in the folder of a verdict.
 
-    None if the folder has no drawing, or no verdict that can be read.
+    Parameters
+    ----------
+    step : int
+        The step after which the verdict came.
+    verdict_folder : Path
+        The folder of the verdict.
+
+    Returns
+    -------
+    ForceDrawing or None
+        None if the folder has no drawing, or no verdict that can be read.
     """
     drawing = verdict_folder / PICTURE
     if not drawing.is_file():

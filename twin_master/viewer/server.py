@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 from tornado.httpserver import HTTPServer
 from tornado.netutil import bind_sockets
-from tornado.routing import Rule
-from tornado.web import Application, HTTPError, RequestHandler, URLSpec
+from tornado.routing import Rule, URLSpec
+from tornado.web import Application, HTTPError, RequestHandler
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from reporting.page import script_source
@@ -65,18 +65,22 @@ class _StepsSocket(WebSocketHandler):
     """The connection of one open page."""
 
     def initialize(self, page: FlightPage) -> None:
+        """Take what the rule of the handler gives; tornado calls this after the constructor."""
         self._page = page
 
     def on_message(self, message: str | bytes) -> None:
+        """Answer a request; close the connection if the message is no request."""
         try:
             self._page.ask(self.send, Request.model_validate_json(message))
         except ValueError as error:
             self.close(_INVALID_MESSAGE, str(error)[:100])
 
     def on_close(self) -> None:
+        """Forget the viewer, who has left."""
         self._page.forget(self.send)
 
     def send(self, text: str) -> None:
+        """Send an answer; forget the viewer if it has left."""
         try:
             self.write_message(text)
         except WebSocketClosedError:
@@ -87,13 +91,22 @@ class _TextHandler(RequestHandler):
     """Answers requests for one text."""
 
     def initialize(self, text: ServedText) -> None:
+        """Take what the rule of the handler gives; tornado calls this after the constructor."""
         self._text = text
 
     def set_default_headers(self) -> None:
+        """Set the headers that keep a page from loading anything from other hosts."""
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
     def get(self, *groups: str) -> None:
+        """Answer with the text, or with 404 if there is none.
+
+        Parameters
+        ----------
+        *groups : str
+            What the groups of the path match.
+        """
         self.set_header("Content-Type", f"{self._text.media_type}; charset=utf-8")
         try:
             self.write(self._text.read(*groups))
@@ -102,7 +115,17 @@ class _TextHandler(RequestHandler):
 
 
 def package_text(package: str, name: str, media_type: str) -> ServedText:
-    """Return a file of a package as a text of a server; it is read when it is asked for."""
+    """Return a file of a package as a text of a server; it is read when it is asked for.
+
+    Parameters
+    ----------
+    package : str
+        The package, such as "twin_master.viewer".
+    name : str
+        The name of the file in the folder of the package.
+    media_type : str
+        The type of the text, such as "text/css".
+    """
     file = resources.files(package).joinpath(name)
     return ServedText(lambda: file.read_text(encoding="utf-8"), media_type)
 

@@ -37,8 +37,13 @@ def _read_messages(
 def feed_of_json_lines(scenario: Scenario, stream: IO[bytes]) -> Feed:
     """Return the feed of a stream of JSON objects, one a line.
 
-    If the scenario asks for a notice of silence, the stream is polled, so that silence is noticed
-    while nothing comes.
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario of the asset. If it asks for a notice of silence, the stream is polled, so that
+        silence is noticed while nothing comes.
+    stream : file
+        The stream, open to be read as bytes.
     """
     notices_silence = scenario.watch.quiet_after_seconds is not None
     return Feed(_read_messages(scenario, Pipe(stream, polls=notices_silence)))

@@ -231,7 +231,15 @@ class Watch:
 
     @contextmanager
     def begin(self, feed: Feed, patch: GivenPatch | None = None) -> Iterator[None]:
-        """Open the journal, and take up the twin as it is after the last line; see `run`."""
+        """Open the journal, and take up the twin as it is after the last line.
+
+        Parameters
+        ----------
+        feed : Feed
+            The feed of the observations.
+        patch : GivenPatch, optional
+            A patch to adopt before the first step.
+        """
         intake = Intake(self.scenario, feed, self.folder / REJECTED_NAME)
         intake.stops_at_refusals = True
         flush_seconds = FLUSH_SECONDS if feed.replayable else 0.0
@@ -367,6 +375,15 @@ class Watch:
 
         The function uses the lines that the journal has now. So it may be called in a thread while
         the watch goes on.
+
+        Parameters
+        ----------
+        patch : Path
+            The file of the patch.
+        from_step : int
+            The first step that would be filtered with the patched model.
+        compared : ComparedSteps
+            The steps in which the evidence with and without the patch is compared.
         """
         models = tuple(self.models)
         earlier_models = [model for model in models if model.from_step <= from_step]

@@ -186,7 +186,15 @@ class Intake:
         return state
 
     def journal_line(self, step: MissionStep, twin: Twin) -> JsonObject:
-        """Return the line of the journal with the last reading and what the twin concluded."""
+        """Return the line of the journal with the last reading and what the twin concluded.
+
+        Parameters
+        ----------
+        step : MissionStep
+            The last reading, and the conclusions of the twin.
+        twin : Twin
+            The twin after this step.
+        """
         concluded = step.concluded
         record = step_record(step) | {
             "observation_step": self.observation_step,
@@ -391,6 +399,13 @@ class Intake:
 
     def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Refuse an observation that has probability zero in every state.
+
+        Parameters
+        ----------
+        reading : Reading
+            The observation.
+        error : TwinMasterError
+            The error of the twin, which becomes the reason of the refusal.
 
         Returns
         -------

@@ -91,6 +91,7 @@ def contains(file: BinaryIO, position: Position | None) -> bool:
 
 @lru_cache(1000)
 def _hash(beginning: bytes) -> str:
+    """Return the SHA-256 of the beginning of a file, by which the file is known again."""
     return sha256(beginning).hexdigest()
 
 
@@ -119,6 +120,7 @@ class Lines:
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[bytes | Refused | None]:
+        """Yield the lines, each with its line feed; None if no further line has come yet."""
         line: bytes | Refused = b""
         for piece in self.pieces():
             if not isinstance(piece, bytes):

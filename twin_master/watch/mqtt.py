@@ -135,10 +135,7 @@ class Topic(Feed):
             self._session.publishers.pop(self, None)
 
     def note_answer(self, message_id: int, refusal: str | None) -> None:
-        """Note that the broker has a decision, or why it refuses it.
-
-        After a refusal decisions are sent again when a pause is over.
-        """
+        """Note the answer of the broker; after a refusal decisions are sent again after a pause."""
         if refusal is not None and message_id in self._line_of_message:
             is_first_refusal = self._end_of_pause == 0.0
             if is_first_refusal:

@@ -55,7 +55,15 @@ class DecisionPublisher(Protocol):
         """Send decisions, as many as the session can take."""
 
     def note_answer(self, message_id: int, refusal: str | None) -> None:
-        """Note that the broker has a decision, or why it refuses it."""
+        """Note the answer of the broker to a decision.
+
+        Parameters
+        ----------
+        message_id : int
+            The number that `Session.send` has returned.
+        refusal : str or None
+            Why the broker refuses the decision; None if it has taken it.
+        """
 
     def resend_unacknowledged(self) -> None:
         """Note that decisions without an answer must be sent again."""
@@ -139,6 +147,7 @@ class Session:
 
     @property
     def _is_connected(self) -> bool:
+        """Whether the broker has let the twin in, and the connection is not lost."""
         return self._client is not None and self._client.is_connected()
 
     def _connect(self) -> None:
@@ -362,7 +371,22 @@ class Session:
         self._last_message = None
 
     def send(self, topic: str, decision: Decision, publisher: DecisionPublisher) -> int:
-        """Send a decision; return the message number with which the publisher gets the answer."""
+        """Send a decision without waiting for the answer of the broker.
+
+        Parameters
+        ----------
+        topic : str
+            The topic of the observations of the asset.
+        decision : dict
+            The decision.
+        publisher : DecisionPublisher
+            Gets the answer of the broker.
+
+        Returns
+        -------
+        int
+            The number of the message, which comes with the answer.
+        """
         assert self._client is not None, "`can_send` says whether there is a connection"
         message = self._client.publish(f"{topic}/decision", json.dumps(decision), qos=1)
         self._publisher_of_message[message.mid] = publisher

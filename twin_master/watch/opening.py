@@ -332,9 +332,7 @@ def watch(
     folder = _folder_of_watch(loaded, folder)
     reading_scenario = _scenario_for_reading(loaded, folder, allow_unknown=allow_unknown)
     if teach:
-        check_teachable(reading_scenario)
-        if cause_search is None:
-            raise MissionInputError("`teach` needs a `cause_search`, as `uav_twin.watch` has it.")
+        _check_teaching(reading_scenario, cause_search)
 
     # Mistakes in the arguments are found before a model is built and a folder made
     feed = choose_feed(
@@ -346,11 +344,6 @@ def watch(
     )
     if replace:
         _check_recording_is_kept(feed, folder)
-    if resume and (replace or overrides != Overrides()):
-        raise MissionInputError(
-            "a watch is taken up with what its folder holds: give nothing beside --resume that "
-            "changes it."
-        )
     opened = _open_watch(loaded, folder, overrides, progress, resume=resume, replace=replace)
     with opened as watched:
         try:
@@ -398,6 +391,13 @@ def _scenario_for_reading(
     return scenario
 
 
+def _check_teaching(scenario: Scenario, cause_search: CauseSearch | None) -> None:
+    """Refuse to teach if no search for causes is given, or none could find a cause."""
+    check_teachable(scenario)
+    if cause_search is None:
+        raise MissionInputError("`teach` needs a `cause_search`, as `uav_twin.watch` has it.")
+
+
 def _check_recording_is_kept(feed: Feed | Broker, folder: Path) -> None:
     """Refuse to replace a folder that contains the observations to be read."""
     if isinstance(feed, RecordedFeed) and folder.resolve() in feed.path.resolve().parents:
@@ -417,6 +417,11 @@ def _open_watch(
     replace: bool,
 ) -> AbstractContextManager[Watch]:
     """Return the watch that is begun or resumed, as a context that holds its folder."""
+    if resume and (replace or overrides != Overrides()):
+        raise MissionInputError(
+            "a watch is taken up with what its folder holds: give nothing beside --resume that "
+            "changes it."
+        )
     if resume or loaded is None:
         return resume_watch(folder, loaded, progress)
     resolved = resolve_scenario(loaded, overrides)

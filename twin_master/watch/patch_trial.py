@@ -163,7 +163,15 @@ def _log_evidence(history: History, compared: ComparedSteps) -> float:
 
 
 def merge_patches(believed: Path | None, new: Path) -> bytes:
-    """Return the content of a patch file with the believed patch, if any, and a new one."""
+    """Return the content of a patch file with the effects of two patches.
+
+    Parameters
+    ----------
+    believed : Path or None
+        The file of the patch that is believed already, if any.
+    new : Path
+        The file of the patch that is added.
+    """
     if believed is None:
         return new.read_bytes()
     first = json.loads(believed.read_text(encoding="utf-8"))

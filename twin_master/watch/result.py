@@ -77,8 +77,15 @@ def _last_steps(watch: Watch, step_count: int, last: int) -> MissionResult:
 def notices_since(watch: Watch, first_step: int) -> list[tuple[int, Notice]]:
     """Return the notices of a watch from a step on, each sentence once, with its step.
 
-    A notice before the first step of the watch counts to that step. The first alarm is always
-    among them, even if it was raised earlier.
+    A notice before the first step of the watch counts to that step.
+
+    Parameters
+    ----------
+    watch : Watch
+        The watch.
+    first_step : int
+        The first step whose notices are returned. The first alarm of the watch is returned in any
+        case.
     """
     records: list[tuple[int, JsonObject]] = []
     first_alarm = watch.teaching.first_alarm

@@ -243,7 +243,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
         """Return seconds that pass with the decisions, and not with the clock of a machine that is busy."""
         return 1.0 if watch.folder.name == "two" and len(told) > 5 else 0.0
 
-    monkeypatch.setattr(Watch, "silence", property(silence))
+    monkeypatch.setattr(Watch, "seconds_since_step", property(silence))
     client, steps, further = broker.client("client", heard), iter(range(1000)), list[int]()
     client.subscribe([("wings/+/decision", 1), ("wings/fleet/heartbeat", 1)])
 

@@ -56,7 +56,7 @@ def watching(where: Broker, watch: Watch, steps: int) -> Iterator[list[str]]:
     """Watch so many steps in a thread, from when the twin is connected on; yields what it notes."""
     notes = list[str]()
     feed = MqttFeed(where, watch, notes.append)
-    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"steps": steps})
+    thread = threading.Thread(target=watch.run, args=(feed, str), kwargs={"step_limit": steps})
     thread.start()
     wait_until(lambda: notes)
     yield notes

@@ -327,7 +327,7 @@ def test_a_reader_that_leaves_ends_the_watch_in_order(scenario, mission, tmp_pat
 
 def test_the_shipped_recording_is_noticed(tmp_path, monkeypatch):
     """The gauge that comes loose at step 10, and the skin that softens from step 25 on."""
-    monkeypatch.setattr(Watch, "store", lambda *_arguments, **_options: None)
+    monkeypatch.setattr("twin_master.watch.opening.store_watch", lambda *_arguments, **_options: None)
     folder = tmp_path / "a b"
     done = command("watch", "watched_wing", "--out", folder, "--pace", "0.001")
     assert done.returncode == 0, done.stderr
