@@ -208,7 +208,7 @@ def _compared(
     if from_run is None:
         assert campaign is not None
         return parts.read_campaign(campaign), parts.choose_model(model)
-    with parts.run_up_to_step(from_run, first, last, reporter()) as folder:
+    with parts.copy_of_run_until(from_run, first, last, reporter()) as folder:
         try:
             data = parts.run_campaign(folder, first, last)
             if model is not None:

@@ -154,4 +154,4 @@ from twin_master.library.grid import grid_of_scenario as grid_of_scenario
 from twin_master.library.sampling import blocks_folder as blocks_folder
 from twin_master.library.sampling import sample_library as sample_library
 from twin_master.scenario.reading import load_scenario as load_scenario
-from twin_master.watch.opening import run_up_to_step as run_up_to_step
+from twin_master.watch.opening import copy_of_run_until as copy_of_run_until

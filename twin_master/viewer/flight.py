@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from twin_master.errors import RunFolderError
-from twin_master.learning.expectation import Expected, expected_of, joined
+from twin_master.learning.expectation import Expected, LearntExpectation, expected_of, joined
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt, is_state_believed
@@ -291,23 +291,37 @@ class Flight:
             rows = np.array([array_of(record["observed"]) for record in records])
             expected = _expected_without_learning(knowledge, joint, rows)
         else:
-            parts = []
-            observations = self.observations_in(records)
-            for record, joint_of_step, observed in zip(records, joint, observations, strict=True):
-                # Of the joint (S, U) only the column of the control in force is not zero
-                control = slice(record["control_index"], record["control_index"] + 1)
-                parts.append(
-                    knowledge.expectation.of_marginals(
-                        _learnt_in(record), joint_of_step[None, :, control], control, observed
-                    )
-                )
-            expected = joined(parts)
+            expected = self._expected_with_learning(knowledge.expectation, joint, records)
         return StepBeliefs(
             probability=filtered,
             is_believed=np.array([is_state_believed(_unexplained(record)) for record in records]),
             expected=expected,
             control_probability=np.array([record["decision_probability"] for record in records]),
         )
+
+    def _expected_with_learning(
+        self, expectation: LearntExpectation, joint: Float, records: Sequence[StepRecord]
+    ) -> Expected:
+        """Return the sensors and rewards that a learning twin expected in each of n steps.
+
+        Parameters
+        ----------
+        expectation : LearntExpectation
+            The expectation of the twin, given what it has learnt.
+        joint : (n, S, U) array
+            The beliefs over states and controls.
+        records : sequence of n dict
+            The records of the steps, with what was learnt up to each.
+        """
+        parts = []
+        observations = self.observations_in(records)
+        for record, joint_of_step, observed in zip(records, joint, observations, strict=True):
+            # Only the control in force has a probability that is not zero
+            control = slice(record["control_index"], record["control_index"] + 1)
+            learnt = _learnt_in(record)
+            belief = joint_of_step[None, :, control]  # (1, S, 1)
+            parts.append(expectation.of_marginals(learnt, belief, control, observed))
+        return joined(parts)
 
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
         """Return what the twin expected after a step in each of the n steps to come."""

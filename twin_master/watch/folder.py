@@ -160,6 +160,7 @@ class Watch:
 
     def _keep_knowledge(self, sibling: "Watch | None") -> None:
         """Write the knowledge of all models into the folder, where viewers find it."""
+        # Without adopted patches both have the knowledge of the beginning
         has_same_knowledge = sibling is not None and len(self.models) == len(sibling.models) == 1
         if sibling is not None and has_same_knowledge:
             share_knowledge(sibling.folder, self.folder)
@@ -172,7 +173,8 @@ class Watch:
         """Read the state of teaching from the journal, and load the models adopted there."""
         check_header(self.journal_path, self._config_hash)
         notice = self.scenario.notice
-        self.teaching = Teaching(1.0 if notice is None else notice.threshold)
+        threshold = 1.0 if notice is None else notice.threshold  # without notices: of no effect
+        self.teaching = Teaching(threshold)
         self.teaching.read_journal(self.journal_path)
         loaded_count = len(self.models) - 1  # the first model was not adopted
         for record in self.teaching.adopted_models[loaded_count:]:

@@ -413,11 +413,13 @@ class Intake:
             The reading in its place: none for the next step, which is predicted through; for an
             earlier step the row that it had before.
         """
+        # Undo what was noted when the message was accepted
         self.stream.restore(self._previous_stream_state)
+        self._unreadable = self._previous_unreadable
         self._with_readings_here -= 1
         self._refuse(str(error), self.observation_step)
+        # Only the notice that two times disagree still holds
         self.notices = [notice for notice in self.notices if notice.kind == "clock"]
-        self._unreadable = self._previous_unreadable
         if reading.revises is not None:
             return Reading(self._row_before_revision, None, reading.revises)
         return Reading(np.full(self._width, np.nan), reading.control)
@@ -485,13 +487,14 @@ class Intake:
             raise Refused(f"it contradicts what was received of step {step} before")
         has_other_control = message.control not in (None, twin.control_of(step))
         if has_other_control:
+            # Counted from the end: -1 is the status of the last step
             former_status = self._statuses[step - twin.steps]
             if former_status is StepStatus.WITH_CONTROL:
                 raise Refused(f"it contradicts the control of step {step}")
         merged_row = np.where(np.isnan(row), message.observed, row)
         if not has_other_control and np.array_equal(merged_row, row, equal_nan=True):
             self.counts.duplicates += 1
-            self._with_readings_here += 1
+            self._with_readings_here += 1  # a duplicate has readings, too
             return
         self._row_before_revision = row
         revision = replace(message, observed=merged_row, revises=step)

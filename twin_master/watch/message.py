@@ -376,7 +376,8 @@ class MessageReader:
             raise Refused(
                 f"`covariance` is {count} rows of {count} numbers, in SI units; null is none"
             )
-        # The correlations, so that the tolerances hold for any unit
+        # Correlations in the place of covariances, so that the tolerances hold for any unit.
+        # A correlation is at most 1. A value with a variance of zero is not scaled.
         standard_deviation = np.sqrt(np.abs(np.diag(matrix)))
         standard_deviation[standard_deviation == 0.0] = 1.0
         with np.errstate(over="ignore"):

@@ -137,12 +137,12 @@ def resume_watch(
 
 
 @contextmanager
-def run_up_to_step(
+def copy_of_run_until(
     folder: Path, first: int | None, last: int | None, progress: Progress
 ) -> Iterator[Path]:
-    """Give the folder of a run up to a step.
+    """Give the folder of a run that ended at a step.
 
-    A watch may go on meanwhile. So of a watch a temporary copy is given that ended at the step.
+    A watch may go on meanwhile. So of a watch a temporary copy is given, which ends at the step.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def open_run(folder: Path | str) -> "xr.DataTree":
     folder = Path(folder)
     if _watch_config(folder) is None or is_stored(folder):
         return open_stored_run(folder)
-    with run_up_to_step(folder, None, None, SilentProgress()) as stored_copy:
+    with copy_of_run_until(folder, None, None, SilentProgress()) as stored_copy:
         return open_stored_run(stored_copy)
 
 

@@ -80,6 +80,7 @@ class StreamNotices:
             "names": list(self._reported_slips),
             "refused": refused if self.refused_in_a_row else None,
         }
+        # A journal leaves out what is zero, false or empty
         return {key: value for key, value in state.items() if value}
 
     def restore(self, state: Mapping[str, Any]) -> None:

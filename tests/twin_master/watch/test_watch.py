@@ -31,7 +31,7 @@ from twin_master.watch.csv_feed import CsvFeed
 from twin_master.watch.feed import Feed
 from twin_master.watch.feeds import feed_of_json_lines, file_feed
 from twin_master.watch.folder import Watch
-from twin_master.watch.opening import resume_watch, run_up_to_step
+from twin_master.watch.opening import copy_of_run_until, resume_watch
 from twin_master.watch.recorded_feeds import FolderFeed
 from twin_master.watch.result import notices_since, store_watch
 
@@ -77,13 +77,13 @@ def test_a_recorded_mission_is_watched_as_it_was_flown(base, mission, whole, tmp
     with pytest.raises(MissionInputError, match="holds no journal"):
         file_feed(tmp_path, base.scenario)
     before = (whole / JOURNAL_NAME).read_bytes()
-    with run_up_to_step(whole, 3, 20, SilentProgress()) as copy:  # up to a step
+    with copy_of_run_until(whole, 3, 20, SilentProgress()) as copy:  # up to a step
         assert (copy / "run.nc").is_file()
         assert [record["step"] for record in journal(copy)] == list(range(21))
     assert not copy.exists()
     assert (whole / JOURNAL_NAME).read_bytes() == before
     nowhere = r"has the steps 0 to 20 up to step 20, and none from 21 on"
-    with pytest.raises(MissionInputError, match=nowhere), run_up_to_step(whole, 21, 20, SilentProgress()):
+    with pytest.raises(MissionInputError, match=nowhere), copy_of_run_until(whole, 21, 20, SilentProgress()):
         raise AssertionError
 
 
