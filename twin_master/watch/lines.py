@@ -42,13 +42,22 @@ def rotated_files(path: Path) -> list[Path]:
     Their names have a number or a date after that of the log, as logrotate and `logging.handlers`
     make them: `log.csv.1`, `log.csv-20260501`, `log.csv.2026-05-01_12`.
     """
-    candidates = path.parent.glob(f"{escape(path.name)}[.-]*")
-    suffixes = [file.name.removeprefix(path.name) for file in candidates]
-    dates = [suffix for suffix in suffixes if _DATE_SUFFIX.fullmatch(suffix)]
-    numbers = [suffix for suffix in suffixes if _NUMBER_SUFFIX.fullmatch(suffix)]
-    # The largest number is the oldest
-    ordered = sorted(dates) + sorted(numbers, key=lambda suffix: -int(suffix[1:]))
-    return [path.with_name(path.name + suffix) for suffix in ordered]
+    dates = []
+    numbers = []
+    for file in path.parent.glob(f"{escape(path.name)}[.-]*"):
+        suffix = file.name.removeprefix(path.name)
+        if _DATE_SUFFIX.fullmatch(suffix):
+            dates.append(suffix)
+        elif _NUMBER_SUFFIX.fullmatch(suffix):
+            numbers.append(suffix)
+    dates.sort()
+    numbers.sort(key=_number_of_suffix, reverse=True)  # the largest number is the oldest
+    return [path.with_name(path.name + suffix) for suffix in dates + numbers]
+
+
+def _number_of_suffix(suffix: str) -> int:
+    """Return the number in a suffix such as `.12`."""
+    return int(suffix.removeprefix("."))
 
 
 def first_line(path: Path) -> bytes:
@@ -327,7 +336,12 @@ def _first_written_after(inodes: dict[Path, int], inode: int, path: Path) -> Pat
 
     If no file has the inode, only the log at `path` counts.
     """
-    files = list(inodes)
-    numbers = list(inodes.values())
-    later_files = files[numbers.index(inode) + 1 :] if inode in numbers else [path]
-    return next((file for file in later_files if file.stat().st_size), None)
+    later_files = [path]
+    inodes_in_order = list(inodes.values())
+    if inode in inodes_in_order:
+        index = inodes_in_order.index(inode)
+        later_files = list(inodes)[index + 1 :]
+    for file in later_files:
+        if file.stat().st_size > 0:
+            return file
+    return None
