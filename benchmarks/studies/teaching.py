@@ -88,7 +88,7 @@ def watched(run: Path, folder: Path, scenario: Path, *, teach: bool) -> Watched:
         feed = file_feed(run / "run.nc", watch.scenario)
         if teach:
             with closing(Tutor(watch, DiscrepancySearch(), wait=True)) as tutor:
-                watch.run(feed, lambda _decision: None, tutor.act)
+                watch.run(feed, lambda _decision: None, tutor.teach)
         else:
             watch.run(feed, lambda _decision: None)
     lines = [record for record, *_ in records(folder / JOURNAL_NAME)]

@@ -119,9 +119,9 @@ class Flight:
         self._path = folder / JOURNAL_NAME
         self.scenario = kept_scenario(folder)
         self.number = 0
-        self._begin_file(0)
+        self._start_with_file(0)
 
-    def _begin_file(self, inode: int) -> None:
+    def _start_with_file(self, inode: int) -> None:
         """Forget all steps, and begin with the file of an inode."""
         self._inode = inode
         self._end = 0  # of the lines that were read [bytes]
@@ -174,7 +174,7 @@ class Flight:
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             status = os.fstat(file.fileno())
             if self._has_other_file(status):
-                self._begin_file(status.st_ino)
+                self._start_with_file(status.st_ino)
             new_lines = islice(records_of(file, self._path, self._end), MOST_NEW_LINES)
             for record, begin, end in new_lines:
                 self._take_line(record, begin)
@@ -274,7 +274,7 @@ class Flight:
         # Successive steps in which the twin knew the same
         for _, group in groupby(records, lambda record: id(self._knowledge_in(record))):
             steps = list(group)
-            parts.append(self._beliefs_with(self._knowledge_in(steps[0]), steps))
+            parts.append(self._beliefs_under(self._knowledge_in(steps[0]), steps))
         return StepBeliefs(
             probability=np.concatenate([part.probability for part in parts]),
             is_believed=np.concatenate([part.is_believed for part in parts]),
@@ -282,24 +282,26 @@ class Flight:
             control_probability=np.concatenate([part.control_probability for part in parts]),
         )
 
-    def _beliefs_with(self, knowledge: Knowledge, records: Sequence[StepRecord]) -> StepBeliefs:
+    def _beliefs_under(self, knowledge: Knowledge, records: Sequence[StepRecord]) -> StepBeliefs:
         """Return what the twin believed in n steps in which it knew the same."""
         filtered = np.array([record["filtered"] for record in records])
         controls = [record["control_index"] for record in records]
         joint = known_control(filtered, controls, len(knowledge.model.controls))  # (n, S, U)
         if knowledge.expectation is None:
             rows = np.array([array_of(record["observed"]) for record in records])
-            expected = _expected_without_learning(knowledge, joint, rows)
+            expected = _expectation_without_learning(knowledge, joint, rows)
         else:
-            expected = self._expected_with_learning(knowledge.expectation, joint, records)
+            expected = self._expectation_with_learning(knowledge.expectation, joint, records)
         return StepBeliefs(
             probability=filtered,
-            is_believed=np.array([is_state_believed(_unexplained(record)) for record in records]),
+            is_believed=np.array(
+                [is_state_believed(_unexplained_probability(record)) for record in records]
+            ),
             expected=expected,
             control_probability=np.array([record["decision_probability"] for record in records]),
         )
 
-    def _expected_with_learning(
+    def _expectation_with_learning(
         self, expectation: LearntExpectation, joint: Float, records: Sequence[StepRecord]
     ) -> Expected:
         """Return the sensors and rewards that a learning twin expected in each of n steps.
@@ -318,7 +320,7 @@ class Flight:
         for record, joint_of_step, observed in zip(records, joint, observations, strict=True):
             # Only the control in force has a probability that is not zero
             control = slice(record["control_index"], record["control_index"] + 1)
-            learnt = _learnt_in(record)
+            learnt = _learnt_quantities(record)
             belief = joint_of_step[None, :, control]  # (1, S, 1)
             parts.append(expectation.of_marginals(learnt, belief, control, observed))
         return joined(parts)
@@ -332,14 +334,14 @@ class Flight:
         predicted = predict(
             knowledge.model, filtered, control, knowledge.plan.policy, horizon
         ).predicted
-        unexplained = _unexplained(record)
+        unexplained = _unexplained_probability(record)
         joint = predicted[..., None] * knowledge.asked(unexplained)  # (n, S, U)
         if knowledge.expectation is None:
-            expected = _expected_without_learning(knowledge, joint, None)
+            expected = _expectation_without_learning(knowledge, joint, None)
         else:
             all_controls = slice(None)
             expected = knowledge.expectation.of_marginals(
-                _learnt_in(record), joint, all_controls, None
+                _learnt_quantities(record), joint, all_controls, None
             )
         return StepBeliefs(
             probability=predicted,
@@ -349,13 +351,15 @@ class Flight:
         )
 
 
-def _unexplained(record: StepRecord) -> float:
+def _unexplained_probability(record: StepRecord) -> float:
     """Return the probability in a step that no state of the model explains the sensors."""
     hypotheses = record.get("suspicion", {}).get("hypotheses", {})
     return float(hypotheses.get("none of these", 0.0))
 
 
-def _expected_without_learning(knowledge: Knowledge, joint: Float, rows: Float | None) -> Expected:
+def _expectation_without_learning(
+    knowledge: Knowledge, joint: Float, rows: Float | None
+) -> Expected:
     """Return the sensors and rewards expected under beliefs, by a twin that learns nothing.
 
     Parameters
@@ -370,7 +374,7 @@ def _expected_without_learning(knowledge: Knowledge, joint: Float, rows: Float |
     return expected_of(knowledge.sensor_model, knowledge.rewards, joint, rows, quantiles=False)
 
 
-def _learnt_in(record: StepRecord) -> dict[str, Learnt]:
+def _learnt_quantities(record: StepRecord) -> dict[str, Learnt]:
     """Return what the twin has learnt up to a step, by quantity."""
     return {name: Learnt(**learnt) for name, learnt in record.get("learnt", {}).items()}
 

@@ -91,7 +91,7 @@ class FlightPage:
         self._open_requests: dict[SendText, Request] = {}
         self._error = ""
 
-    def html(self) -> str:
+    def render_html(self) -> str:
         """Return the page, whose script draws the figures from the answers."""
         flight = self._flight
         mission = flight.scenario.mission

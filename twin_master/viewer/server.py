@@ -134,7 +134,7 @@ def _do_nothing() -> None:
     """Stand for what is done every few milliseconds if nothing is to be done."""
 
 
-def _always() -> bool:
+def _is_always_wanted() -> bool:
     """Say that a server goes on until its process is interrupted."""
     return True
 
@@ -203,7 +203,7 @@ def serve(
     folder: Path,
     port: int,
     on_ready: Callable[[str], None],
-    is_wanted: Callable[[], bool] = _always,
+    is_wanted: Callable[[], bool] = _is_always_wanted,
 ) -> None:
     """Show the flight of a run folder to browsers of this machine.
 
@@ -228,7 +228,7 @@ def serve(
     """
     flight = Flight(folder)
     page = FlightPage(flight)
-    html = page.html()
+    html = page.render_html()
 
     def read_drawing(number: str) -> str:
         return flight.drawings[int(number)].path.read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from twin_master.watch.message import PRESENT_NAMES, MessageContent, Refused
 from twin_master.watch.recorded_feeds import RecordedFeed
 
 
-def _whole_number(cell: str) -> int:
+def _parse_whole_number(cell: str) -> int:
     """Return a whole number, also one that a table of floating-point numbers has as `12.0`."""
     digits, point, decimals = cell.partition(".")
     is_whole = point and not decimals.strip("0")
@@ -23,7 +23,7 @@ def _whole_number(cell: str) -> int:
 
 
 _CONVERSIONS: dict[str, Callable[[str], object]] = {
-    "step": _whole_number,
+    "step": _parse_whole_number,
     "time": float,
     "control": str,
 }

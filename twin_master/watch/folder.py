@@ -301,7 +301,7 @@ class Watch:
             notices.append(Notice("heard", sentence).as_record())
         if notices:
             line["notices"] = line.get("notices", []) + notices
-        self._append(line)
+        self._append_line(line)
         self.filtered = step.concluded.filtered
         self.is_quiet = False
         self._time_of_last_step = time.monotonic()
@@ -314,9 +314,9 @@ class Watch:
             "next_control": self.twin.proposed_control,
             "intake": self.intake.state(),
         }
-        self._append(line | fields)
+        self._append_line(line | fields)
 
-    def _append(self, line: JournalLine) -> None:
+    def _append_line(self, line: JournalLine) -> None:
         """Add a line to the journal, and update the state of teaching with it."""
         state_before = {"begin": self.journal.size, "teaching": self.teaching.as_record()}
         self.journal.append({**line, "standing": state_before})
@@ -474,9 +474,9 @@ class Watch:
         keep_knowledge(self.folder, self.models[former_number].knowledge, former_number)
         keep_knowledge(self.folder, outcome.model.knowledge)
         self.write_event(model=record)
-        self._note_adoption(record)
+        self._show_adoption(record)
 
-    def _note_adoption(self, model: ModelRecord) -> None:
+    def _show_adoption(self, model: ModelRecord) -> None:
         """Show how well the patched model fits, beside the former one."""
         comparisons = []
         for name, value in model["before"].items():

@@ -257,7 +257,7 @@ class Intake:
                 if self.stops_at_refusals and self.stream.has_refusals_to_report:
                     return None
                 begin = time.monotonic()
-                has_message = self.has_queued_readings or self._receive(twin)
+                has_message = self.has_queued_readings or self._receive_message(twin)
                 if self._queue:
                     return self._next_reading(twin)
                 if self.has_ended or not (has_message or self.on_poll):
@@ -273,7 +273,7 @@ class Intake:
         """Return whether the twin has the steps after which the watch ends."""
         return self.step_limit is not None and twin.steps >= self.step_limit
 
-    def _receive(self, twin: Twin) -> bool:
+    def _receive_message(self, twin: Twin) -> bool:
         """Take in the next message of the feed; return whether one has come."""
         item = self._next_item()
         self.has_ended = item is None

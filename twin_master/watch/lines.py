@@ -95,11 +95,11 @@ def contains(file: BinaryIO, position: Position | None) -> bool:
         return False
     file.seek(0)
     beginning = file.read(min(position["read"], _PIECE_BYTES))
-    return _hash(beginning) == str(position["beginning"])
+    return _hash_of_beginning(beginning) == str(position["beginning"])
 
 
 @lru_cache(1000)
-def _hash(beginning: bytes) -> str:
+def _hash_of_beginning(beginning: bytes) -> str:
     """Return the SHA-256 of the beginning of a file, by which the file is known again."""
     return sha256(beginning).hexdigest()
 
@@ -142,14 +142,14 @@ class Lines:
                 if not line:
                     self.begin = self.end
                 self.end += len(part)
-                line = self._extend(line, part)
+                line = self._extend_line(line, part)
                 if part.endswith(b"\n"):
                     yield line
                     line = b""
         if isinstance(line, bytes) and line:
             yield line
 
-    def _extend(self, line: bytes | Refused, part: bytes) -> bytes | Refused:
+    def _extend_line(self, line: bytes | Refused, part: bytes) -> bytes | Refused:
         """Return a line with a further part; a line that gets too long becomes a refusal."""
         if isinstance(line, Refused):
             return line
@@ -211,9 +211,9 @@ class GrowingFile(Lines):
     ) -> None:
         self._followed_path = followed_path
         self._is_copy = False
-        self._open(file, position)
+        self._start_reading(file, position)
 
-    def _open(self, file: BinaryIO, position: Position | None) -> None:
+    def _start_reading(self, file: BinaryIO, position: Position | None) -> None:
         """Go on with a file at a position."""
         self.end = 0
         if position is not None and contains(file, position):
@@ -226,7 +226,7 @@ class GrowingFile(Lines):
     @property
     def position(self) -> Position:
         """The end of the last line."""
-        return {"beginning": _hash(self._beginning[: self.end]), "read": self.end}
+        return {"beginning": _hash_of_beginning(self._beginning[: self.end]), "read": self.end}
 
     def pieces(self) -> Iterator[bytes | Refused | None]:
         """Yield the pieces of the file, and of those that take its place."""
@@ -252,7 +252,7 @@ class GrowingFile(Lines):
         while True:
             piece = self._file.read(_PIECE_BYTES)
             if self._was_cut():
-                yield from self._go_on_after_cut(path)
+                yield from self._switch_after_cut(path)
                 continue
             if not piece:
                 next_file = self._open_next(path)
@@ -260,7 +260,7 @@ class GrowingFile(Lines):
                     # What its writer has left in the file before the other took its place
                     piece = self._file.read(_PIECE_BYTES)
                     if not piece:
-                        yield from self._go_on(next_file)
+                        yield from self._switch_to(next_file)
                         continue
                     next_file.close()
             self._note_beginning(piece)
@@ -271,7 +271,7 @@ class GrowingFile(Lines):
         if len(self._beginning) < _PIECE_BYTES:
             self._beginning = (self._beginning + piece)[:_PIECE_BYTES]
 
-    def _go_on_after_cut(self, path: Path) -> Iterator[bytes | Refused]:
+    def _switch_after_cut(self, path: Path) -> Iterator[bytes | Refused]:
         """Go on in the copy of a file that was cut; without a copy, at its new beginning."""
         copy = find_file(path, self.position, follow=True)
         if copy is None:
@@ -280,9 +280,9 @@ class GrowingFile(Lines):
                 "behind that and was not read yet is lost"
             )
         file = (copy or path).open("rb", buffering=0)
-        yield from self._go_on(file, is_copy=copy is not None)
+        yield from self._switch_to(file, is_copy=copy is not None)
 
-    def _go_on(self, file: BinaryIO, *, is_copy: bool = False) -> Iterator[bytes]:
+    def _switch_to(self, file: BinaryIO, *, is_copy: bool = False) -> Iterator[bytes]:
         """Go on with another file.
 
         A line that was begun goes on there only if one of the two files is a copy of the other. If
@@ -291,7 +291,7 @@ class GrowingFile(Lines):
         line_goes_on = self._is_copy or is_copy
         position = self.position
         self._file.close()
-        self._open(file, position)
+        self._start_reading(file, position)
         self._is_copy = is_copy
         if not line_goes_on:
             yield b""
@@ -312,21 +312,21 @@ class GrowingFile(Lines):
             own = os.fstat(self._file.fileno())
             if os.path.samestat(own, path.stat()):
                 return None
-            inodes = _inodes(path)
-            inodes_again = _inodes(path)
+            inodes = _inodes_of_log(path)
+            inodes_again = _inodes_of_log(path)
             next_path = _first_written_after(inodes, own.st_ino, path)
             if next_path is None:
                 return None
             with ExitStack() as closing:
                 file = closing.enter_context(next_path.open("rb", buffering=0))
                 # Only if no file was renamed meanwhile, the opened file is the one that was chosen
-                if inodes == inodes_again == _inodes(path):
+                if inodes == inodes_again == _inodes_of_log(path):
                     closing.pop_all()
                     return file
         return None
 
 
-def _inodes(path: Path) -> dict[Path, int]:
+def _inodes_of_log(path: Path) -> dict[Path, int]:
     """Return the inode of each rotated file of a log, the oldest first, and of the log itself."""
     return {file: file.stat().st_ino for file in (*rotated_files(path), path)}
 

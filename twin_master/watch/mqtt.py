@@ -75,9 +75,9 @@ class Topic(Feed):
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
         """Yield what has come, without end."""
         while True:
-            yield self._read(self.payloads.popleft() if self.payloads else None)
+            yield self._read_payload(self.payloads.popleft() if self.payloads else None)
 
-    def _read(self, payload: bytes | None) -> FeedItem:
+    def _read_payload(self, payload: bytes | None) -> FeedItem:
         """Return the observation in a message, which must name its step or time."""
         if payload is None:
             return None, ""
@@ -203,7 +203,7 @@ class MqttFeed(Topic):
     ) -> None:
         name = watch.scenario.mission.name
         session = Session(broker, name, watch.folder, note, self._heartbeat)
-        super().__init__(session, broker.topic, scenario or watch.scenario, _raise)
+        super().__init__(session, broker.topic, scenario or watch.scenario, _raise_error)
         self.attach(watch)
 
     def _heartbeat(self) -> JsonObject:
@@ -223,13 +223,13 @@ class MqttFeed(Topic):
     def messages(self, position: Position | None) -> Iterator[FeedItem]:
         """Yield what comes, without end; a message is acknowledged when it is in the journal."""
         for message in self._session.receive(0.1):
-            yield self._read(None if message is None else bytes(message.payload))
+            yield self._read_payload(None if message is None else bytes(message.payload))
 
     def close(self) -> None:
         """Publish the last decisions and disconnect; see `Session.close`."""
         self._session.close()
 
 
-def _raise(error: Exception) -> None:
+def _raise_error(error: Exception) -> None:
     """Let an error that keeps decisions from being published end the watch."""
     raise error

@@ -450,7 +450,12 @@ def _run(
             )
         with closing(Tutor(watched, cause_search, wait=feed.replayable)) as tutor:
             return watched.run(
-                feed, decide, tutor.act, step_limit=step_limit, patch=patch, unconfirmed=unconfirmed
+                feed,
+                decide,
+                tutor.teach,
+                step_limit=step_limit,
+                patch=patch,
+                unconfirmed=unconfirmed,
             )
 
 

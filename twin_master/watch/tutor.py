@@ -46,7 +46,7 @@ class Tutor:
         self._running_search: RunningSearch | None = None
         self.outcome: Future[PatchOutcome] | None = None
 
-    def act(self) -> None:
+    def teach(self) -> None:
         """Do what is due after the last step of the watch, whose journal is open."""
         teaching = self._watch.teaching
         if teaching.steps_to_search is not None:
@@ -69,7 +69,7 @@ class Tutor:
             seed=watch.scenario.mission.seed,
             low_priority=not self._wait,
         )
-        if not self._has_searched(request):
+        if not self._search_has_ended(request):
             return
         step_name = watch.scenario.mission.step_name
         verdict = read_verdict(folder, request.log, first_step, last_step, step_name)
@@ -77,7 +77,7 @@ class Tutor:
         verdict["of_many"] = watch.teaching.is_alarm_of_many
         watch.write_event(verdict=verdict)
 
-    def _has_searched(self, request: SearchRequest) -> bool:
+    def _search_has_ended(self, request: SearchRequest) -> bool:
         """Return whether a search has ended; start it if it was not started yet.
 
         If the steps of the watch wait for the verdict, this waits until the search has ended, or

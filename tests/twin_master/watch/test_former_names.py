@@ -39,11 +39,11 @@ def test_a_journal_of_an_earlier_version_is_read_and_gone_on_with(base, loose, t
     """Also in the middle of a search, of the trial of a patch, and behind its adoption."""
     (tmp_path / "whole").mkdir()
     whole = watchful(base, tmp_path / "whole" / "watch")
-    whole.run(CsvFeed(loose, whole.scenario), str, tutor(whole, tmp_path, "named", -0.3).act)
+    whole.run(CsvFeed(loose, whole.scenario), str, tutor(whole, tmp_path, "named", -0.3).teach)
     (asked,) = [line["verdict"]["to_step"] for line in journal(whole.folder) if "verdict" in line]
     stopped = watchful(base, tmp_path / "stopped")
     for number, end in enumerate((asked, asked + 5, asked + 15, None)):
-        teach = tutor(stopped, tmp_path, "named", -0.3).act
+        teach = tutor(stopped, tmp_path, "named", -0.3).teach
         stopped.run(CsvFeed(loose, stopped.scenario), str, teach, step_limit=end)
         with_former_names(stopped.folder)
         with pytest.warns(FormerNameWarning, match=SENTENCE) as told:

@@ -78,7 +78,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     (tmp_path / "whole").mkdir()
     watch = watchful(base, tmp_path / "whole" / "watch")
     decisions = list[dict[str, Any]]()
-    watch.run(CsvFeed(loose, watch.scenario), decisions.append, tutor(watch, tmp_path, "named", -0.3).act)
+    watch.run(CsvFeed(loose, watch.scenario), decisions.append, tutor(watch, tmp_path, "named", -0.3).teach)
     records = journal(watch.folder)
     (verdict,) = [record["verdict"] for record in records if "verdict" in record]
     (model,) = [record["model"] for record in records if "model" in record]
@@ -113,7 +113,7 @@ def test_what_is_named_is_tried_adopted_and_the_same_after_kills(base, mission, 
     stopped = watchful(base, tmp_path / "stopped")
     asked = verdict["to_step"]
     for end in (asked + 5, asked + 15, None):
-        teach = tutor(stopped, tmp_path, "named", -0.3).act
+        teach = tutor(stopped, tmp_path, "named", -0.3).teach
         stopped.run(CsvFeed(loose, stopped.scenario), str, teach, step_limit=end)
         again = watchful(stopped, tmp_path / f"{end}")
         check_same(again.folder, stopped.folder, JOURNAL_NAME)
@@ -179,7 +179,9 @@ def test_a_wrong_name_is_not_adopted_and_a_family_is_told(base, loose, tmp_path)
         (None, 0.0, "the search ended without a verdict: Nothing can be said."),
     ):
         watch = watchful(base, tmp_path / f"{kind}{gain}")
-        watch.run(CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).act, step_limit=40)
+        watch.run(
+            CsvFeed(loose, watch.scenario), str, tutor(watch, tmp_path, kind, gain).teach, step_limit=40
+        )
         records = journal(watch.folder)
         assert not any("model" in record for record in records)
         notices = [n["sentence"] for record in records for n in record.get("notices", [])]
@@ -249,7 +251,7 @@ def test_after_an_alarm_of_many_gauges_nothing_is_adopted_from_its_name_alone(ba
     watch = watchful(base, tmp_path / "watch")
     search = DiscrepancySearch(command=(sys.executable, str(script), str(answer), "-"))
     teach = Tutor(watch, search, wait=True)
-    watch.run(CsvFeed(saturated, watch.scenario), str, teach.act, step_limit=30)
+    watch.run(CsvFeed(saturated, watch.scenario), str, teach.teach, step_limit=30)
     records = journal(watch.folder)
     trial = next(n["sentence"] for r in records for n in r.get("notices", []) if n["kind"] == "trial")
     assert not any("model" in record for record in records)
@@ -320,7 +322,7 @@ def test_live_steps_wait_neither_for_the_search_nor_for_the_patched_model(
         if decision["step"] == 45:  # and those behind the trial while the model was built
             wait_until(lambda: live.outcome is not None and live.outcome.done())
 
-    noticing.run(CsvFeed(loose, noticing.scenario), decide, live.act)
+    noticing.run(CsvFeed(loose, noticing.scenario), decide, live.teach)
     model = next(record for record in journal(noticing.folder) if "model" in record)
     verdict = next(record["verdict"] for record in journal(noticing.folder) if "verdict" in record)
     assert (verdict["step"], model["step"]) == (32, 45)
