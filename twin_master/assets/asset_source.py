@@ -25,8 +25,9 @@ from reporting.text_file import read_bytes
 from twin_master.assets.parameter import ParameterDraws, draw_parameter
 from twin_master.errors import MissionInputError, said
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
-from twin_master.scenario.section import AssetSection, BeliefSection, FileSection
+from twin_master.scenario.kinds import AssetSection, BeliefSection, FileSection
+from twin_master.scenario.mission import CALIBRATION_COPY
+from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
@@ -94,7 +95,9 @@ class StatelessAsset(Asset):
 
 
 def asked_table(
-    scenario: Scenario, states: Float, ask: Callable[[Mapping[str, float], Mapping[str, float]], Float]
+    scenario: Scenario,
+    states: Float,
+    ask: Callable[[Mapping[str, float], Mapping[str, float]], Float],
 ) -> Float:
     """Ask what is shown under every control in every state (S, F), both by name: (S, U, G)."""
     rows = (dict(zip(scenario.state_names, levels, strict=True)) for levels in states.tolist())

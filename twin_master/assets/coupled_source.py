@@ -23,8 +23,9 @@ from reporting.toml_file import Fault, Number, Positive
 from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource, Session
 from twin_master.errors import MissionInputError
+from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, Count, FileSection, Flag, Section, named_once
+from twin_master.scenario.section import Count, Flag, Section, repeated_name_fault
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.wiring import Wiring
@@ -86,7 +87,7 @@ class SspSection(SeveralSection):
     kind: Literal["ssp"] = "ssp"
     file: str
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": SSP_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": SSP_COPY}
 
     def source(self, scenario: Scenario) -> "SspSource":
         """Return the system of the file."""
@@ -104,13 +105,13 @@ class CoupledSection(SeveralSection):
         """Return the files of the components too, but for shipped ones, which are packed anew."""
         found = super().all_files()
         for component in self.component:
-            found |= {component.copies()[key]: Path(path) for key, path in component.own_files().items()}
+            found |= {component.copies()[key]: Path(path) for key, path in component.user_files().items()}
         return found
 
-    def moved(self, folder: Path) -> Self:
+    def with_paths_from(self, folder: Path) -> Self:
         """Return the table with its relative paths from a folder."""
-        components = tuple(component.moved(folder) for component in self.component)
-        return super().moved(folder).model_copy(update={"component": components})
+        components = tuple(component.with_paths_from(folder) for component in self.component)
+        return super().with_paths_from(folder).model_copy(update={"component": components})
 
     def portable(self) -> FileSection:
         """Return the table with the paths of the copies inside a run folder."""
@@ -124,7 +125,7 @@ class CoupledSection(SeveralSection):
     def faults(self) -> Iterator[Fault]:
         """Yield what an FMU has, and names that come twice."""
         yield from super().faults()
-        yield named_once("component", [component.name for component in self.component])
+        yield repeated_name_fault("component", [component.name for component in self.component])
 
 
 class SeveralSource(FmuSource):

@@ -33,8 +33,9 @@ from twin_master.assets.reduced_model import NamedStructure, ReducedModelSource
 from twin_master.assets.structure_source import StructureFmuSource
 from twin_master.errors import MissionInputError, said
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, BeliefSection
+from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, BeliefSection
+from twin_master.scenario.mission import CALIBRATION_COPY
+from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
@@ -56,7 +57,7 @@ class DesignSection(FmuSection):
     packed: Literal["python", "compiled"] = "python"
     """What evaluates the FMU: Python, or C compiled here, which carries no patch."""
 
-    kept: ClassVar[Mapping[str, str]] = {
+    copy_paths: ClassVar[Mapping[str, str]] = {
         "binding": BINDING_COPY,
         "design": FLOWN_DESIGN_COPY,
         "patch": PATCH_COPY,
@@ -82,7 +83,7 @@ class DesignBelief(BeliefSection):
     patch: str | None = None
     """A patch file: effects that the model carries."""
 
-    kept: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "DesignSource":
         """Return the model of the wing."""
@@ -180,7 +181,13 @@ class _Wing(NamedStructure):
             It is none, the wing cannot carry it, or an effect depends on time or on what happened before and
             is believed, for which a model has no time.
         """
-        from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, PointMass, PortForce, SensorDrift
+        from fe.runtime.patch import (
+            LoadPlace,
+            LocalStiffnessLoss,
+            PointMass,
+            PortForce,
+            SensorDrift,
+        )
         from fe.runtime.wing_rows import OVERHANG
         from fmu_asset.packing.patch_file import load_patch
 

@@ -35,8 +35,9 @@ from twin_master.assets.parameter import (
 )
 from twin_master.errors import MissionInputError, check_names, said
 from twin_master.network.graphical_model import GraphicalModel
+from twin_master.scenario.kinds import AssetSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import AssetSection, Flag, Name
+from twin_master.scenario.section import Flag, Name
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class FmuSection(AssetSection):
     seeds: tuple[Name, ...] = ()
     """Parameters of the binding that are given a number drawn from the seed of the run."""
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
     def faults(self) -> Iterator[Fault]:
         """Yield parameters that are seeds, too."""
@@ -80,7 +81,7 @@ class FmuFileSection(FmuSection):
     kind: Literal["fmu"] = "fmu"
     file: str
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": FMU_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": FMU_COPY}
 
     def source(self, scenario: Scenario) -> "FmuSource":
         """Return the FMU."""
@@ -93,7 +94,7 @@ class ScriptSection(FmuSection):
     kind: Literal["script"] = "script"
     script: str
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "script": FMU_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "script": FMU_COPY}
 
     def portable(self) -> FmuFileSection:
         """Return the FMU that was packed: from then on it is what is flown."""
@@ -138,7 +139,12 @@ class FmuAsset(Asset):
         load: Mapping[str, float],
         inner: InnerRoles | None = None,
     ) -> None:
-        self._session, self._observation, self._load, self._inner = session, observation, dict(load), inner
+        self._session, self._observation, self._load, self._inner = (
+            session,
+            observation,
+            dict(load),
+            inner,
+        )
         binding, self._names = session.binding, dict[str, str]()
         taken = {*binding.control, *binding.observation, *_TAKEN}
         for name in session.recorded_units:  # stored under a name without `/` that is not taken
@@ -214,7 +220,11 @@ class FmuSource(AssetSource):
         parameters = [*binding.parameter, *self._check_calibration(binding)]
         rows = (
             ("control input", scenario.control[0].values, binding.control),
-            ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
+            (
+                "state",
+                () if scenario.truth.kind == "asset" else scenario.state_names,
+                binding.health,
+            ),
             ("load", section.load, binding.load),
             ("parameter", (*section.parameters, *section.seeds), parameters),
         )

@@ -26,8 +26,8 @@ from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import InvalidModelError, MissionInputError, said
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.kinds import BeliefSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import BeliefSection
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -138,7 +138,10 @@ class ObservationLibrary:
         """
         if set(values) != set(self.control_values):
             raise MissionInputError(said("assets.inputs", self=self, values=values))
-        known, wanted = np.column_stack([self.control_values[key] for key in values]), [*values.values()]
+        known, wanted = (
+            np.column_stack([self.control_values[key] for key in values]),
+            [*values.values()],
+        )
         if not (same := np.isclose(known, wanted, rtol=_SAME, atol=0.0).all(axis=1)).any():
             shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
             raise MissionInputError(said("assets.control", shown=shown, name=name, self=self))
@@ -211,7 +214,7 @@ class LibraryBelief(BeliefSection):
     design: str | None = None
     """The wing whose stiffness curve the calibration takes, and whose field is drawn, where there is one."""
 
-    kept: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> LibrarySource:
         """Return the library.
@@ -270,8 +273,16 @@ class LibrarySource(AssetSource):
             ("observes", (library.role,), (section.role,)),
             ("has the sensors", library.sensors, () if vector is None else vector.variables),
             ("has them in", library.sensor_units, section.sensor_units),
-            ("has the states in", sorted(f"{name}: {unit}" for name, unit in units), sorted(of_states)),
-            ("was sampled under the load", _shown(library.load), _shown(scenario.asset.constant_load)),
+            (
+                "has the states in",
+                sorted(f"{name}: {unit}" for name, unit in units),
+                sorted(of_states),
+            ),
+            (
+                "was sampled under the load",
+                _shown(library.load),
+                _shown(scenario.asset.constant_load),
+            ),
         ):
             if has != wanted:
                 what = f"{self.path(OBSERVATIONS_COPY).name} {what}"

@@ -10,7 +10,7 @@ import numpy as np
 
 from reporting.arrays import Float
 from twin_master.errors import MissionInputError, check_names, said
-from twin_master.scenario.schema import Calibration
+from twin_master.scenario.mission import Calibration
 from twin_master.seeds import generator, seed_sequence
 
 if TYPE_CHECKING:

@@ -22,8 +22,9 @@ from twin_master.assets.parameter import (
 from twin_master.errors import MissionInputError, check_names, said
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import packed_row
+from twin_master.scenario.kinds import FileSection
+from twin_master.scenario.observation import MODES_ROLE, ModesSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import ROLE, FileSection, ModesSection
 from twin_master.seeds import seed_sequence
 
 if TYPE_CHECKING:
@@ -142,12 +143,12 @@ class NamedStructure(AssetSource):
         known |= {"frequency": self._frequencies() or 1}
         row, table = ("observation", [role], [name for name, count in known.items() if count]), role
         if modes is not None:
-            known[ROLE] = observation.count
+            known[MODES_ROLE] = observation.count
             there = [part.name for part in design.acceleration]
             row, table = ("accelerometer", [*modes.accelerometers], there), "acceleration"
             most = StructureSettings.mode_count
-            if max(modes.places) >= most:
-                number = max(modes.places) + 1
+            if max(modes.mode_indices) >= most:
+                number = max(modes.mode_indices) + 1
                 raise MissionInputError(said("assets.modes", most=most, number=number))
         advice = self.advice["state"] or f"give it in a table [[{table}]]"
         check_names("the scenario has the", where, [row], advice=advice)
@@ -192,7 +193,11 @@ class NamedStructure(AssetSource):
         ]
         if scenario.truth.kind == "scripted":
             given += [
-                (f"{name} that `truth.gains` give in {scenario.mission.step_name} {step}", name, value)
+                (
+                    f"{name} that `truth.gains` give in {scenario.mission.step_name} {step}",
+                    name,
+                    value,
+                )
                 for step, state in enumerate(scenario.scripted_history().tolist())
                 for name, value in zip(scenario.state_names, state, strict=True)
             ]
@@ -219,7 +224,10 @@ class ReducedModelSource(NamedStructure):
     label = "reduced model"
 
     def __init__(
-        self, scenario: Scenario, model: "ReducedModel | None" = None, section: FileSection | None = None
+        self,
+        scenario: Scenario,
+        model: "ReducedModel | None" = None,
+        section: FileSection | None = None,
     ) -> None:
         super().__init__(scenario, section)
         self.model = model
@@ -276,7 +284,10 @@ class ReducedModelSource(NamedStructure):
         states, controls = model.states.coordinates, scenario.control
         shape = (len(draws.values), len(states), len(controls))
         draw, state, control = (index.ravel() for index in np.indices(shape))
-        beside = {**scenario.asset.constant_load, **{n: values[draw] for n, values in draws.others.items()}}
+        beside = {
+            **scenario.asset.constant_load,
+            **{n: values[draw] for n, values in draws.others.items()},
+        }
         columns: dict[str, Float | float] = {
             n: value for n, value in beside.items() if n in reduced.input_names
         }
@@ -296,7 +307,7 @@ class ReducedModelSource(NamedStructure):
         """Return the natural frequencies or features of modes that are observed (G,)."""
         observation = self._scenario.observation
         if observation.modes is not None:
-            return observation.modes.observed(modal_values(self.wing, vector, observation.modes))
+            return observation.modes.observed_features(modal_values(self.wing, vector, observation.modes))
         return np.asarray(self.wing.modes(vector).frequency[: observation.count])
 
     def open(self) -> Asset:
@@ -318,7 +329,10 @@ class ReducedModelSource(NamedStructure):
 
 
 def modal_values(
-    model: "ReducedModel", vector: Float, section: ModesSection, damping: tuple[float, float] | None = None
+    model: "ReducedModel",
+    vector: Float,
+    section: ModesSection,
+    damping: tuple[float, float] | None = None,
 ) -> Float:
     """Return frequency [Hz], damping ratio and relative shape (M, 1 + A) of the observed modes of a model.
 
@@ -339,9 +353,9 @@ def modal_values(
     """
     modes = model.modes(vector)
     alpha, beta = model.damping.tolist() if damping is None else damping
-    frequency = modes.frequency[section.places]
+    frequency = modes.frequency[section.mode_indices]
     rows = [model.static_output_count + model.accelerations.index(name) for name in section.accelerometers]
-    shape = modes.output[rows][:, section.places]
+    shape = modes.output[rows][:, section.mode_indices]
     return np.column_stack(
         [frequency, rayleigh_damping_ratio(alpha, beta, frequency), *(shape[1:] / shape[0])]
     )
@@ -420,11 +434,13 @@ class RecordedStructure(Asset):
         vector = model.vector({name: value for name, value in given.items() if name in model.input_names})
         alpha, beta = model.damping.tolist()
         damping = given.get("damping_alpha", alpha), given.get("damping_beta", beta)
-        errors = section.observed(found.standard_error).tolist()
+        errors = section.observed_features(found.standard_error).tolist()
         titles = self._scenario.observation.titles
-        sensed = packed_row(section.observed(found.value), section.covariance(found.covariance))
+        sensed = packed_row(
+            section.observed_features(found.value), section.observed_covariance(found.covariance)
+        )
         return AssetReading(
-            section.observed(modal_values(model, vector, section, damping)),
+            section.observed_features(modal_values(model, vector, section, damping)),
             {f"standard_error_{title}": error for title, error in zip(titles, errors, strict=True)},
             sensed=sensed,
         )

@@ -14,9 +14,10 @@ from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
 from twin_master.errors import MissionInputError, said
 from twin_master.network.transition import NUMBER, TRANSITION_COPIES, check_fits, transition_bytes
+from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, AssetSection, Section
+from twin_master.scenario.section import Section
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,15 @@ def resolve_scenario(loaded: LoadedScenario, given: Overrides | Mapping[str, Any
         The scenario does not hold with them.
     """
     overrides = given_overrides(given)
-    table = loaded.scenario.moved(loaded.path.resolve().parent).to_dict()
+    table = loaded.scenario.with_paths_from(loaded.path.resolve().parent).to_dict()
     _change_asset(table, overrides)
     if overrides.library:
         design = table["belief"].get("design")
-        table["belief"] = {"kind": "library", "file": str(overrides.library.resolve()), "design": design}
+        table["belief"] = {
+            "kind": "library",
+            "file": str(overrides.library.resolve()),
+            "design": design,
+        }
     if overrides.calibration:
         table["calibration"] |= {"source": "file", "file": str(overrides.calibration.resolve())}
     file = table["calibration"]["file"]
@@ -247,7 +252,10 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
     )
     truth, given = table["truth"], table["calibration"]
     if moves := learnt.get("transition"):
-        own, names = moves.get("probability", {}), sorted(entry["name"] for entry in table["control"])
+        own, names = (
+            moves.get("probability", {}),
+            sorted(entry["name"] for entry in table["control"]),
+        )
         kind = table["transition"]["kind"]
         if sorted(own) != names or kind != "independent_worsening":
             both = {"own": own, "names": names}

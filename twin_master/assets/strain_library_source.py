@@ -15,7 +15,13 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.json_file import read_json
-from twin_master.assets.asset_source import LIBRARY_COPY, Asset, AssetReading, AssetSource, StatelessAsset
+from twin_master.assets.asset_source import (
+    LIBRARY_COPY,
+    Asset,
+    AssetReading,
+    AssetSource,
+    StatelessAsset,
+)
 from twin_master.assets.parameter import ParameterDraws
 from twin_master.errors import (
     MissionInputError,
@@ -23,8 +29,8 @@ from twin_master.errors import (
     said,
 )
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
+from twin_master.scenario.kinds import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import AssetSection, BeliefSection
 
 FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""
@@ -157,10 +163,10 @@ class StrainLibrarySection(AssetSection):
     """A strain library in the authors' format."""
 
     kind: Literal["strain_library"] = "strain_library"
-    own_figures: ClassVar = True
+    has_unique_model: ClassVar = True
     file: str | None = None
 
-    kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     def source(self, scenario: Scenario) -> "StrainLibrarySource":
         """Return the library, read.
@@ -180,10 +186,10 @@ class StrainLibraryBelief(BeliefSection):
     """A strain library in the authors' format as the twin's model of an FMU."""
 
     kind: Literal["strain_library"] = "strain_library"
-    own_figures: ClassVar = True
+    has_unique_model: ClassVar = True
     file: str
 
-    kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "StrainLibrarySource":
         """Return the library, read.
@@ -242,7 +248,10 @@ class StrainLibrarySource(AssetSource):
 
     def open(self) -> Asset:
         """Return the library's solution at the mean parameter, interpolated between its damage levels."""
-        names, values = self._scenario.state_names, [control.values for control in self._scenario.control]
+        names, values = (
+            self._scenario.state_names,
+            [control.values for control in self._scenario.control],
+        )
 
         def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
             index = self._control_index[values.index(dict(control))]

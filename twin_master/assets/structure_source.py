@@ -17,8 +17,8 @@ from twin_master.assets.asset_source import (
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection, FmuSource
 from twin_master.assets.reduced_model import NamedStructure, RecordedStructure, ReducedModelSource
 from twin_master.errors import MissionInputError, said
+from twin_master.scenario.kinds import BeliefSection, FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import BeliefSection, FileSection
 
 FLOWN_COPY, MODEL_COPY = "asset/flown/structure.toml", "asset/model/structure.toml"
 
@@ -59,7 +59,7 @@ class StructureSection(StructureFiles, FmuSection):
     packed: Literal["python", "compiled"] = "python"
     """What evaluates the FMU: Python, or C compiled here."""
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "structure": FLOWN_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "structure": FLOWN_COPY}
 
     def source(self, scenario: Scenario) -> "StructureFmuSource":
         """Return the FMU of the structure."""
@@ -72,7 +72,7 @@ class StructureBelief(StructureFiles, BeliefSection):
     kind: Literal["structure"] = "structure"
     structure: str
 
-    kept: ClassVar[Mapping[str, str]] = {"structure": MODEL_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"structure": MODEL_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "ReducedModelSource":
         """Return the model of the structure."""
@@ -106,7 +106,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
         return slice(0)
 
     def _fitted(self, binding: Binding, folder: Path) -> Binding:
-        if "binding" not in self.section.own_files():  # whose names may be others
+        if "binding" not in self.section.user_files():  # whose names may be others
             self._check_ranges(self.section.parameters)
         self.check_model()
         return binding

@@ -70,7 +70,10 @@ class FmuTestBench(ExitStack):
         """Hold the tip aside [m], let it go, and record for `duration` [s] at `sampling_rate` [Hz]."""
         time = sampling_times(duration, sampling_rate)
         binding = self._binding.with_header(step_size=1.0 / sampling_rate)
-        release = {"response": float(TRANSIENT), "initial_tip_displacement": initial_tip_displacement}
+        release = {
+            "response": float(TRANSIENT),
+            "initial_tip_displacement": initial_tip_displacement,
+        }
         with self._session(binding, release) as session:
             session.reset(control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0})
             recorded = simulate_from_now(session, time.size - 1, {})

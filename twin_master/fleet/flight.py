@@ -280,7 +280,7 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
 
 def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
     """Return what `fly_shard` wants of a scenario, what belongs to it made in a folder."""
-    located = scenario.portable().moved(folder)
+    located = scenario.portable().with_paths_from(folder)
     write_members(folder, source_of(scenario, real=real).files())
     source = source_of(located, real=real)
     source.prepare(folder, SilentProgress())

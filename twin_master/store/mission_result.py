@@ -125,7 +125,7 @@ def _truth(scenario: Scenario, name: str) -> Float | None:
     healthy = np.zeros(observation.count)
     for fault in truth.sensor_faults:
         if fault.kind == "drift":
-            healthy[fault.places(observation.count)] = np.nan
+            healthy[fault.sensor_indices(observation.count)] = np.nan
     return healthy
 
 
