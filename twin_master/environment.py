@@ -117,7 +117,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             self._let_go()
             scenario = self.scenario.with_seed(self._seed)
             source = scenario.asset.source(scenario)
-            source.use(self._folder)
+            source.use_prepared_folder(self._folder)
             self._asset = source.open()
         else:
             self._asset.restore_state(self._start)

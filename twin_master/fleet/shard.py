@@ -134,7 +134,7 @@ class Kit:
             scenario = scenario.with_seed(seed)
         source: AssetSource = scenario.asset.source(scenario)
         if isinstance(source, FmuSource):
-            source.use(self._folder)  # packed already
+            source.use_prepared_folder(self._folder)  # packed already
         else:
             source.prepare(self._folder, SilentProgress())
         return source.open()

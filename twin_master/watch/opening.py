@@ -14,8 +14,8 @@ from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
 from twin_master.assets.resolution import (
     Overrides,
+    as_overrides,
     believed_source,
-    given_overrides,
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, NotResumableError, said
@@ -241,7 +241,7 @@ def watch(
         With one clear sentence; what was observed is kept.
     """
     loaded = None if scenario is None else load_scenario(scenario)
-    given, progress = given_overrides(overrides), progress or SilentProgress()
+    given, progress = as_overrides(overrides), progress or SilentProgress()
     patch = None if model_patch is None or from_step is None else (Path(model_patch), from_step)
     if (model_patch, from_step) != (None, None) and (patch is None or not resume):
         raise MissionInputError("--model-patch and --from-step go together, with --resume.")
