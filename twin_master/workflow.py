@@ -33,8 +33,9 @@ from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_k
 from twin_master.mission.steps import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.consistency import WATCHED_KIND
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.scenario.schema import WATCHED_KIND, Scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
