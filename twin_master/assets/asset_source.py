@@ -51,6 +51,10 @@ HASHED_COPIES = {
 """The copies inside a run folder whose hashes the run states, by the names of the hashes."""
 FLOWN_DESIGN_HASH = "flown_design"
 """Name of the hash of the wing design that flies; that of the believed design is `design`."""
+NO_ASSET = (
+    "this scenario has no `[asset]`: it is for a real one, whose observations `uav-twin watch` "
+    "takes in, and its `belief` must be a model of its own."
+)
 
 
 @dataclass(frozen=True)
@@ -492,10 +496,7 @@ class WatchedSource:
     def __getattr__(self, name: str) -> NoReturn:
         if name.startswith("__"):  # Python looks for methods such as `__deepcopy__`
             raise AttributeError(name)
-        raise MissionInputError(
-            "this scenario has no `[asset]`: it is for a real one, whose observations "
-            "`uav-twin watch` takes in, and its `belief` must be a model of its own."
-        )
+        raise MissionInputError(NO_ASSET)
 
 
 def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:

@@ -57,6 +57,7 @@ class ComponentSection(FileSection):
         return self.all_files()[self.copies()["design"]]
 
     def _is_shipped(self, key: str, name: str) -> bool:
+        """Return whether a key holds the name of a companion, or of a shipped design."""
         if key == "fmu":
             return name in COMPANION_NAMES
         return super()._is_shipped(key, name)
@@ -211,6 +212,7 @@ class SspSource(SeveralSource):
         return join_ssp(read_ssp(self.path(SSP_COPY), folder or self.path(COMPONENT_FOLDER)))
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding, after it is checked with the system of the file."""
         from fmu_asset.ssp.check import left_out_sentence
 
         wiring = self.wiring(scratch)
@@ -232,6 +234,7 @@ class CoupledSource(SeveralSource):
         return f"{len(self.section.component)} coupled FMUs"
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding, after it is checked with the FMUs if none must be packed."""
         from fmu_asset.coupling.wiring import Wiring
 
         components = self.section.component
@@ -247,6 +250,7 @@ class CoupledSource(SeveralSource):
         return binding
 
     def _pack_fmus(self, progress: Progress) -> dict[str, Path]:
+        """Pack the components that are no FMUs yet; return all FMUs by the names of the hashes."""
         fmus = {}
         with progress.stage("Packing the FMUs"):
             for component in self.section.component:

@@ -142,7 +142,7 @@ class _Wing(NamedStructure):
         return wing_structure(self.wing_design.regions, gauge_count)
 
     @property
-    def where(self) -> str:
+    def full_name(self) -> str:
         """The design by its name, for messages."""
         return f"the design {self.wing_design.name}"
 
@@ -162,7 +162,7 @@ class _Wing(NamedStructure):
         """The parameters that may be calibrated; masses are not, as strains do not show them."""
         return [parameter.name for parameter in self.design.parameter]
 
-    def reduced(self, progress: Progress) -> "ReducedModel":
+    def load_reduced_model(self, progress: Progress) -> "ReducedModel":
         """Return the reduced model; it comes from the cache if it is there."""
         from fe.reduction.model_cache import reduced_model
 
@@ -326,6 +326,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return super().binding().with_regions(self.wing_design.regions)
 
     def _effect_parameters(self) -> tuple[str, ...]:
+        """Return the names of the parameters that switch and size the effects of the patch."""
         from fmu_asset.slaves.effects import effect_rows
 
         if self.patch is None:
@@ -333,6 +334,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         return tuple(variable.name for variable in effect_rows(self.patch.plain, 0, {}))
 
     def _check_calibration(self, binding: Binding) -> None:
+        """Refuse a form of FMU that cannot be packed here, and a calibration that does not fit."""
         from fmu_asset.packing.structure_fmu import check_form
 
         check_form(self.section.packed, patched=self.patch_path is not None)
@@ -344,6 +346,7 @@ class WingFmuSource(_Wing, StructureFmuSource):
         )
 
     def _pack(self, progress: Progress) -> None:
+        """Pack the wing, with the figures of its calibration, as the FMU in the run folder."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
         options: dict[str, Any] = {}

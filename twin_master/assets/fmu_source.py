@@ -309,7 +309,10 @@ class FmuSource(AssetSource):
             ) from error
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Return the binding with the lengths of arrays that the FMU has."""
+        """Return the binding with the lengths of arrays that the FMU has.
+
+        A subclass may write into the scratch folder, which is removed afterwards.
+        """
         return FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters()).binding
 
     def _check_state_units(self, binding: Binding) -> None:
@@ -499,6 +502,7 @@ class ScriptSource(FmuSource):
         return {**read_files(other_files), FMU_COPY: script_fmu(script).content}
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding with the lengths of arrays of the FMU, packed in a scratch folder."""
         packed = scratch / "asset.fmu"
         packed.write_bytes(self.files()[FMU_COPY])
         return FmiAsset(packed, binding, parameters=self.parameters()).binding

@@ -102,14 +102,14 @@ class NamedStructure(AssetSource):
         return load_structure(self.file)
 
     @property
-    def where(self) -> str:
+    def full_name(self) -> str:
         """The structure by its name, for messages."""
         return f"the structure {self.design.name}"
 
     @property
     def description(self) -> str:
         """The FMU or model, and the name of the structure."""
-        return f"{self.label} of {self.where}"
+        return f"{self.label} of {self.full_name}"
 
     @property
     def design_hash(self) -> str:
@@ -124,7 +124,7 @@ class NamedStructure(AssetSource):
         free_masses = [mass.name for mass in self.design.mass if mass.free]
         return [parameter.name for parameter in self.design.parameter] + free_masses
 
-    def reduced(self, progress: Progress) -> "ReducedModel":
+    def load_reduced_model(self, progress: Progress) -> "ReducedModel":
         """Return the reduced model; it comes from the cache if it is there."""
         from fe.reduction.model_cache import reduced_model
 
@@ -205,7 +205,7 @@ class NamedStructure(AssetSource):
         accelerometers = [acceleration.name for acceleration in self.design.acceleration]
         names_by_sort = [("accelerometer", modes.accelerometers, accelerometers)]
         advice = self.advice.state or "give it in a table [[acceleration]]"
-        check_names("the scenario has the", self.where, names_by_sort, advice=advice)
+        check_names("the scenario has the", self.full_name, names_by_sort, advice=advice)
 
     def _check_observed_sensors(self) -> None:
         """Refuse sensors that the structure does not have: their role, unit, number and titles."""
@@ -220,25 +220,25 @@ class NamedStructure(AssetSource):
         roles = [name for name, count in counts.items() if count]
         advice = self.advice.state or f"give it in a table [[{role}]]"
         check_names(
-            "the scenario has the", self.where, [("observation", [role], roles)], advice=advice
+            "the scenario has the", self.full_name, [("observation", [role], roles)], advice=advice
         )
         other_units = sorted(set(observation.sensor_units) - {"1", UNITS[role]})
         if other_units:
             raise MissionInputError(
-                f"{self.where} shows `{role}` in {UNITS[role]}, and `observation.unit` says "
+                f"{self.full_name} shows `{role}` in {UNITS[role]}, and `observation.unit` says "
                 f"{comma_list(other_units)}: write the former."
             )
         if observation.count != counts[role]:
             raise MissionInputError(
-                f"{self.where} has {counts[role]} sensors of `{role}`, and the scenario expects "
-                f"{observation.count}."
+                f"{self.full_name} has {counts[role]} sensors of `{role}`, and the scenario "
+                f"expects {observation.count}."
             )
         # Titles that are the names of the sensors in another order would name the wrong ones.
         titles = list(observation.titles)
         names = sensors.get(role, [])
         if titles != names and sorted(titles) == sorted(names):
             raise MissionInputError(
-                f"`observation.titles` are {comma_list(titles)}, and {self.where} has these "
+                f"`observation.titles` are {comma_list(titles)}, and {self.full_name} has these "
                 f"sensors in the order {comma_list(names)}: give the titles in that order."
             )
 
@@ -250,14 +250,17 @@ class NamedStructure(AssetSource):
         check_calibration(
             calibration,
             self.parameter_names,
-            self.where,
+            self.full_name,
             ranges=self.design.ranges,
             advice=self.advice.calibration,
             design_hash=self.design_hash if believed else "",
         )
         names_by_sort = [("parameter", [calibration.parameter], self.parameter_names)]
         check_names(
-            "the scenario calibrates the", self.where, names_by_sort, advice=self.advice.parameter
+            "the scenario calibrates the",
+            self.full_name,
+            names_by_sort,
+            advice=self.advice.parameter,
         )
 
     def _check_ranges(self, parameters: Mapping[str, float]) -> None:
@@ -269,8 +272,9 @@ class NamedStructure(AssetSource):
             low, high = self.design.ranges.get(name, (value, value))
             if not low <= value <= high:
                 raise MissionInputError(
-                    f"the {description} is {value:.6g}, but {self.where} gives {name} the range "
-                    f"{low:g} to {high:g}; give a value inside, or widen the range in its file."
+                    f"the {description} is {value:.6g}, but {self.full_name} gives {name} the "
+                    f"range {low:g} to {high:g}; give a value inside, or widen the range in its "
+                    "file."
                 )
 
     def _chosen_values(self, parameters: Mapping[str, float]) -> Iterator[ChosenValue]:
@@ -349,14 +353,14 @@ class ReducedModelSource(NamedStructure):
             ("control input", scenario.control[0].values, control_names),
         )
         advice = self.advice.state
-        check_names("the scenario has the", self.where, names_by_sort, advice=advice)
+        check_names("the scenario has the", self.full_name, names_by_sort, advice=advice)
         self._check_observed()
         self._check_ranges({})
         self.check_model()
 
     def _build(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure; return the hash of its design."""
-        self.model = self.model or self.reduced(progress)
+        self.model = self.model or self.load_reduced_model(progress)
         return {"design": self.model.design_hash}
 
     @property

@@ -10,7 +10,7 @@ from pydantic import ConfigDict, Field
 
 from reporting.toml_file import read_toml, validate
 from reporting.words import comma_list
-from twin_master.assets.asset_source import AssetSource, PairedSource
+from twin_master.assets.asset_source import NO_ASSET, AssetSource, PairedSource, WatchedSource
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
 from twin_master.errors import MissionInputError
@@ -254,8 +254,8 @@ def asset_source(scenario: Scenario) -> AssetSource:
     Raises
     ------
     MissionInputError
-        If the scenario flies a strain library and names none, or one that is missing, damaged or
-        does not fit; or if the twin cannot believe what it is to believe.
+        If the scenario has no asset; if it flies a strain library and names none, or one that is
+        missing, damaged or does not fit; or if the twin cannot believe what it is to believe.
     InvalidModelError
         If the twin of the scenario does not fit in memory.
     """
@@ -264,7 +264,9 @@ def asset_source(scenario: Scenario) -> AssetSource:
     believed: AssetSource = scenario.belief.source(scenario, flown)
     if believed is flown:
         return flown
-    return PairedSource(flown, believed, differ=scenario.another_model)
+    if isinstance(flown, WatchedSource):
+        raise MissionInputError(NO_ASSET)
+    return PairedSource(flown, believed, differ=scenario.models_differ)
 
 
 def believed_source(scenario: Scenario) -> AssetSource:

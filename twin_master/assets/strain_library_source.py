@@ -320,7 +320,7 @@ def _source_of_file(scenario: Scenario, path: Path) -> StrainLibrarySource:
     MissionInputError
         If it has another one: asset and model would fly different turns.
     """
-    if scenario.another_model:
+    if scenario.models_differ:
         for control in scenario.control:
             try:
                 library_load_factor = float(control.name.removesuffix("g"))

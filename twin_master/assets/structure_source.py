@@ -104,18 +104,21 @@ class StructureFmuSource(NamedStructure, FmuSource):
         return structure_binding(self.design, self._frequency_count())
 
     def _check_calibration(self, binding: Binding) -> None:
+        """Refuse a form of FMU that cannot be packed here, and a calibration that does not fit."""
         from fmu_asset.packing.structure_fmu import check_form
 
         check_form(self.section.packed)
         self._check_parameter(believed=isinstance(self._scenario.belief, AssetBelief))
 
     def _observation_slice(self, binding: Binding, role: str = "") -> slice:
+        """Return the positions of a role in the binding; none if features of modes are observed."""
         if self._scenario.observation.modes is None:
             return super()._observation_slice(binding, role)
         self._check_observed()
-        return slice(0)  # features of modes are no observation of the binding
+        return slice(0)  # the features are identified from accelerations
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding, after the structure is checked; packing takes too long for a check."""
         has_user_binding = "binding" in self.section.user_files()
         if not has_user_binding:  # the parameters then have the names of the structure
             self._check_ranges(self.section.parameters)
@@ -124,7 +127,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
 
     def _build(self, progress: Progress) -> dict[str, str]:
         """Reduce the structure and pack the FMU; return the hashes of both."""
-        self.model = self.reduced(progress)
+        self.model = self.load_reduced_model(progress)
         if not self.path(BINDING_COPY).exists():
             from fmu_asset.structures import structure_binding_text
 

@@ -207,7 +207,7 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
 def flies_model(scenario: Scenario) -> bool:
     """Return whether the reduced model itself is flown, in the place of the FMU that is packed of it."""
     asset, belief = scenario.asset, scenario.belief
-    same = (asset.kind, belief.kind) == ("design", "design") and not scenario.another_model
+    same = (asset.kind, belief.kind) == ("design", "design") and not scenario.models_differ
     return same and getattr(asset, "design", None) == getattr(belief, "design", None)
 
 

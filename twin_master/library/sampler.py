@@ -40,7 +40,7 @@ class GridSampler:
         """Close the FMU."""
         self._asset.close()
 
-    def block(self, first: int, last: int) -> Float:
+    def observe_block(self, first: int, last: int) -> Float:
         """Return the observations of a block of points.
 
         Parameters

@@ -171,7 +171,7 @@ def _sample_blocks(
         with closing(GridSampler(grid)) as sampler:
             samplers.append(sampler)
             for first, last in next_blocks:
-                rows[first:last] = sampler.block(first, last)
+                rows[first:last] = sampler.observe_block(first, last)
                 progress_stage.advance(1)
 
     with ThreadPoolExecutor(worker_count) as pool:

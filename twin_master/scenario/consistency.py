@@ -82,7 +82,7 @@ class ScenarioTables(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete(cls, table: object) -> object:
+    def _complete_table(cls, table: object) -> object:
         """Return the table with actions as controls, and with the asset of a watched scenario.
 
         A scenario without `[asset]` and `[truth]` is of a real asset, which is watched.

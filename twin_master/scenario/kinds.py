@@ -96,7 +96,7 @@ class KindSection(FileSection):
     """Whether its observations come from a model that no other kind flies or believes."""
 
     @property
-    def departs_from_others(self) -> bool:
+    def is_known_to_differ(self) -> bool:
         """Whether its model is known to differ from that of any other kind."""
         has_patch = getattr(self, "patch", None) is not None
         return self.has_unique_model or has_patch

@@ -57,7 +57,7 @@ class StateFactor(Section):
         )
 
     @property
-    def start(self) -> float:
+    def initial_level(self) -> float:
         """The most probable level before the first observation."""
         return self.levels[self.prior.index(max(self.prior))]
 

@@ -74,7 +74,7 @@ class Scenario(ScenarioTables):
         has_dropout = any(fault.kind == "dropout" for fault in self.truth.sensor_faults)
         if has_dropout or self.truth.received:
             groups += [FigureGroup("lost", {}), FigureGroup("blind", {})]
-        if self.another_model:
+        if self.models_differ:
             groups.append(FigureGroup("misfit", {}))
         if set(self.observation.sensor_units) == {"1"}:
             groups.append(FigureGroup("bound", {}))
@@ -101,7 +101,7 @@ class Scenario(ScenarioTables):
             One row for each of T steps, one column for each of F state factors, SI.
         """
         gain = np.zeros((self.mission.steps, len(self.state)))
-        gain[0] = [factor.start for factor in self.state]
+        gain[0] = [factor.initial_level for factor in self.state]
         for entry in self.truth.gains:
             last_step = entry.first_step if entry.last_step is None else entry.last_step
             column = self.state_names.index(entry.state)
@@ -115,10 +115,10 @@ class Scenario(ScenarioTables):
         return history
 
     @property
-    def another_model(self) -> bool:
+    def models_differ(self) -> bool:
         """Whether the model that flies is known to differ from the one that the twin believes."""
         believes_asset = self.belief.kind == "asset"
-        departs = self.asset.departs_from_others or self.belief.departs_from_others
+        departs = self.asset.is_known_to_differ or self.belief.is_known_to_differ
         return departs and not believes_asset
 
     def with_paths_from(self, folder: Path) -> Self:
