@@ -118,7 +118,7 @@ class StructureFmuSource(NamedStructure, FmuSource):
         return slice(0)  # the features are identified from accelerations
 
     def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
-        """Return the binding, after the structure is checked; packing takes too long for a check."""
+        """Return the binding, after the structure is checked; it is not packed for a check."""
         has_user_binding = "binding" in self.section.user_files()
         if not has_user_binding:  # the parameters then have the names of the structure
             self._check_ranges(self.section.parameters)
