@@ -63,7 +63,7 @@ class ComponentSection(FileSection):
         return super()._is_shipped(key, name)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a component with no FMU, or with an FMU and a design."""
+        """Yield the possible faults, each with whether it is there: no FMU, or two."""
         has_fmu = self.fmu is not None
         has_design = self.design is not None
         yield (
@@ -136,7 +136,7 @@ class CoupledSection(SeveralSection):
         return CoupledSource(scenario, self)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of an FMU, and components of the same name."""
+        """Yield the possible faults, each with whether it is there: names of components."""
         yield from super().faults()
         names = [component.name for component in self.component]
         yield repeated_name_fault("component", names)
@@ -245,7 +245,9 @@ class CoupledSource(SeveralSource):
         if needs_packing:  # it takes too long for a check, which therefore uses no FMU
             self._structure({component.name: scratch for component in components})
         else:
-            fmus = {component.name: _given_fmu(component, scratch) for component in components}
+            fmus = {
+                component.name: _file_or_companion(component, scratch) for component in components
+            }
             self._open_session(binding, self.parameters(), Wiring(self._structure(fmus)))
         return binding
 
@@ -265,7 +267,7 @@ class CoupledSource(SeveralSource):
         if fmu.exists():
             return fmu
         if component.design is None:
-            return _given_fmu(component, fmu.parent)
+            return _file_or_companion(component, fmu.parent)
         if component.design == CALIBRATED_DESIGN_NAME:
             from calibration.result.file import load_calibration, tailoring
 
@@ -327,7 +329,7 @@ def _system_connectors(connections: list[Connection]) -> tuple[Connector, ...]:
     return tuple(dict.fromkeys([*outputs, *inputs]))
 
 
-def _given_fmu(component: ComponentSection, folder: Path) -> Path:
+def _file_or_companion(component: ComponentSection, folder: Path) -> Path:
     """Return the FMU of a component: its file, or a companion that is packed in a folder."""
     from fmu_asset.companions.build import companion_bytes
 

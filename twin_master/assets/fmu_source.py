@@ -71,7 +71,7 @@ class FmuSection(AssetSection):
     copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
     def faults(self) -> Iterator[Fault]:
-        """Yield parameters that are seeds as well."""
+        """Yield the possible faults, each with whether it is there: parameters that are seeds."""
         for name in self.seeds:
             yield (
                 name in self.parameters,

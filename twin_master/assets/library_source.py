@@ -378,16 +378,17 @@ class LibrarySource(AssetSource):
         return library
 
     def _check_labels(self, library: ObservationLibrary) -> None:
-        """Refuse a library with other sensors, units or loads than the scenario."""
+        """Refuse a library whose role, sensors, units or load are not those of the scenario."""
         scenario = self._scenario
         observation = scenario.observation
         vector = self._flown.binding().observation.get(observation.role)
         sensors = () if vector is None else vector.variables
-        unit_of_state = zip(library.states.names, library.state_units, strict=True)
-        state_units = sorted(f"{name}: {unit}" for name, unit in unit_of_state)
+        names_and_units = zip(library.states.names, library.state_units, strict=True)
+        state_units = sorted(f"{name}: {unit}" for name, unit in names_and_units)
         wanted_state_units = sorted({f"{factor.name}: {factor.unit}" for factor in scenario.state})
         load = _assignments(library.load)
         wanted_load = _assignments(scenario.asset.constant_load)
+        # What the message says of the labels, those of the library, and those of the scenario.
         for verb, labels, wanted_labels in (
             ("observes", (library.role,), (observation.role,)),
             ("has the sensors", library.sensors, sensors),

@@ -123,7 +123,7 @@ def _draws_of_normal(
     """
     from calibration.static.posterior import GaussianPrior, stratified
 
-    assert calibration.mean is not None  # the schema requires both
+    assert calibration.mean is not None  # the schema requires it
     deviation = calibration.standard_deviation or 0.0
     probabilities = stratified(generator(seed, "calibration"), calibration.draws)
     values = GaussianPrior(calibration.mean, deviation).quantile(probabilities)

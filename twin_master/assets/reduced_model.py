@@ -243,7 +243,10 @@ class NamedStructure(AssetSource):
             )
 
     def _check_parameter(self, *, believed: bool) -> None:
-        """Refuse a calibration that the structure cannot have; raise `MissionInputError`."""
+        """Refuse a calibration whose source, parameters or design are not those of the structure.
+
+        Its design is compared only if the structure is believed: what only flies may differ.
+        """
         calibration = self._scenario.calibration
         if calibration.source == "static_test" and self.advice.static_test:
             raise MissionInputError(self.advice.static_test)

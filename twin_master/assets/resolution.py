@@ -262,7 +262,7 @@ def asset_source(scenario: Scenario) -> AssetSource:
     check_scenario_fits(scenario)
     flown: AssetSource = scenario.asset.source(scenario)
     believed: AssetSource = scenario.belief.source(scenario, flown)
-    if believed is flown:
+    if believed is flown:  # `belief.kind` is `asset`
         return flown
     if isinstance(flown, WatchedSource):
         raise MissionInputError(NO_ASSET)
@@ -344,9 +344,10 @@ def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) ->
             # The truth had the probabilities of the twin by default, and keeps them.
             truth["probability"] = table["transition"]["probability"]
     if learnt.get("calibration"):
-        _clear_calibration(table, learnt["calibration"], path)
+        learnt_parameter = learnt["calibration"].get("parameter")
+        table["calibration"] = _normal_calibration(table["calibration"], learnt_parameter, path)
     for name, learnt_table in learnt.items():
-        table[name] |= learnt_table
+        table[name] |= learnt_table  # its keys replace those of the scenario
 
 
 def _check_learnt_transition(
@@ -363,19 +364,16 @@ def _check_learnt_transition(
         )
 
 
-def _clear_calibration(
-    table: dict[str, Any], learnt_calibration: Mapping[str, Any], path: Path
-) -> None:
-    """Keep of the table `calibration` what a learnt normal distribution does not replace."""
-    calibration = table["calibration"]
-    learnt_parameter = learnt_calibration.get("parameter")
+def _normal_calibration(
+    calibration: Mapping[str, Any], learnt_parameter: object, path: Path
+) -> dict[str, Any]:
+    """Return the table `calibration` of a normal distribution, still without its moments.
+
+    The file of what was learnt has parameter, mean and standard deviation.
+    """
     if learnt_parameter != calibration["parameter"]:
         raise MissionInputError(
             f"{path} has learnt {learnt_parameter}, and the parameter of the scenario is "
             f"{calibration['parameter']}."
         )
-    table["calibration"] = {
-        "draws": calibration["draws"],
-        "file": calibration["file"],
-        "source": "normal",
-    }
+    return {"draws": calibration["draws"], "file": calibration["file"], "source": "normal"}

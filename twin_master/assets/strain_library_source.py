@@ -140,7 +140,11 @@ def load_strain_library(path: str | Path) -> StrainLibrary:
 
 
 def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
-    """Return the library of the content of the authors' file."""
+    """Return the library that the authors' file contains.
+
+    Its entry `observations[z1][z2][control][draw]` has the strain of each gauge in microstrain; z1
+    and z2 are losses in percent, and the draw is a factor on Young's modulus, or "mean".
+    """
     levels_by_region = content["states"]
     if len(levels_by_region) != len(REGION_NAMES):
         raise ValueError(
@@ -153,6 +157,7 @@ def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
     first_entry = observations[first_z1][first_z2][controls[0]]
     draws = [key for key in first_entry if key != _MEAN_ENTRY]
     gauge_count = len(first_entry[_MEAN_ENTRY])
+    # one row of strains for each draw, state and control
     rows = []
     for draw, z1, z2, control in product((_MEAN_ENTRY, *draws), *levels_by_region, controls):
         row = observations[str(z1)][str(z2)][control][draw]
@@ -163,6 +168,7 @@ def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
                 "strains"
             )
         rows.append(row)
+    # axes: draw, with "mean" first; joint state of both regions; control; gauge
     shape = (len(draws) + 1, -1, len(controls), gauge_count)
     table = np.array(rows, dtype=np.float64).reshape(shape) * MICROSTRAIN
     table.setflags(write=False)

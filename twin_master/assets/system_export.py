@@ -179,6 +179,7 @@ def _with_values(
     wiring: Wiring, binding: Binding, parameters: Mapping[str, float], load: Mapping[str, float]
 ) -> Wiring:
     """Return the system with values of parameters and loads, which are in the binding's units."""
+    # The values of the system's connectors, in the units of the system.
     system = system_description(wiring)
     exchange = Exchange(system, binding)
     initial_values = exchange.settings(parameters)
@@ -187,6 +188,7 @@ def _with_values(
         variable = slot.variable
         numbers = slot.numbers(value).tolist()
         initial_values.append(InitialValue(variable.kind, variable.reference, numbers))
+    # The same values at the components to which the connectors lead.
     values_by_component = system.settings_of_components(initial_values)
     components = []
     for component in wiring.structure.components:

@@ -91,6 +91,13 @@ class FmuTestBench(ExitStack):
             The length of the record [s].
         sampling_rate : float
             The sampling rate [Hz].
+
+        Returns
+        -------
+        time : (N,) array
+            The time of each sample after the release [s].
+        signal : (N,) array
+            The signal of the recorded gauge [V].
         """
         time = sampling_times(duration, sampling_rate)
         binding = self._binding.with_header(step_size=1.0 / sampling_rate)
@@ -102,8 +109,9 @@ class FmuTestBench(ExitStack):
             session.reset(
                 control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0}
             )
-            # The state of the release is the first sample.
-            history = simulate_from_now(session, time.size - 1, {})
+            # The first sample is the initial state, and each step gives a further one.
+            step_count = time.size - 1
+            history = simulate_from_now(session, step_count, {})
         return time, SENSITIVITY * history.values[:, RECORDED_GAUGE - 1]
 
     def _open_session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:

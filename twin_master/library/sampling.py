@@ -122,7 +122,8 @@ def sample_library(
             f"the number of workers must be at least 1, and {worker_count} came."
         )
     binding = load_binding(grid.binding)
-    sensor_count = _check_grid(grid, binding)
+    _check_grid(grid, binding)
+    sensor_count = _count_sensors(grid, binding)
     record = _library_record(grid)
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
     lock = lock_folder(folder)
@@ -186,8 +187,8 @@ def _sample_blocks(
                 sampler.close()
 
 
-def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
-    """Check the grid beside the binding and the FMU; return the number of sensors."""
+def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
+    """Refuse a grid with names that the binding does not have, or with unusable values."""
     parameter_names = list(grid.parameters)
     if grid.parameter:
         parameter_names.append(grid.parameter)
@@ -199,7 +200,7 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
         ("parameter", parameter_names, binding.parameter),
     )
     check_names("the grid has the", f"the binding {binding.name}", names_by_sort)
-    binding.observation_slice(grid.role)
+    binding.observation_slice(grid.role)  # raises an error for an unknown role
     if not grid.states or not grid.controls or not grid.draws:
         raise MissionInputError(
             "a grid needs at least one state and one control with values: give --grid NAME=VALUES "
@@ -214,6 +215,11 @@ def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
     for name, levels in grid.states.items():
         if any(second <= first for first, second in itertools.pairwise(levels)):
             raise MissionInputError(f"the levels of {name} must increase, and {levels} came.")
+
+
+def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
+    """Return the number of sensors of the FMU; refuse a library that does not fit in memory."""
+    # Only the FMU knows the lengths of arrays.
     fmu = FmiAsset(grid.fmu, binding)
     warn_without_sandbox(grid.fmu, binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)

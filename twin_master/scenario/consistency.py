@@ -125,7 +125,7 @@ class ScenarioTables(Section):
         return tuple(readings)
 
     def _control_faults(self) -> Iterator[Fault]:
-        """Yield the faults of states and controls, and of what names them."""
+        """Yield the possible faults, each with whether it is there: states and controls."""
         controls = self.control_names
         yield repeated_name_fault("state", self.state_names)
         yield repeated_name_fault("control", controls)
@@ -173,7 +173,7 @@ class ScenarioTables(Section):
         return len(messages) > 1, "; ".join(messages)
 
     def _action_faults(self) -> Iterator[Fault]:
-        """Yield the faults of actions beside the controls, states and rewards."""
+        """Yield the possible faults, each with whether it is there: names and costs of actions."""
         controls = self.control_names
         # `with_controls_of_actions` added the controls of the actions at the end.
         controls_of_file = controls[: -len(self.action)] if self.action else controls
@@ -197,7 +197,7 @@ class ScenarioTables(Section):
                 yield unknown_name_fault(state, self.state_names, key, "state")
 
     def _growth_faults(self) -> Iterator[Fault]:
-        """Yield random growth and repairs that the truth does not have."""
+        """Yield the possible faults, each with whether it is there: random growth and repairs."""
         truth = self.truth
         is_random = truth.kind == "random_growth"
         if truth.probability:
@@ -219,7 +219,7 @@ class ScenarioTables(Section):
             )
 
     def _truth_faults(self) -> Iterator[Fault]:
-        """Yield the faults of the true state beside the states and the asset."""
+        """Yield the possible faults, each with whether it is there: origin of the true state."""
         truth = self.truth
         if truth.kind == "asset":
             yield (
@@ -236,7 +236,7 @@ class ScenarioTables(Section):
             yield unknown_name_fault(gain.state, self.state_names, "truth.gains.state", "state")
 
     def _reward_faults(self) -> Iterator[Fault]:
-        """Yield the faults of the rewards beside the sensors."""
+        """Yield the possible faults, each with whether it is there: sensors of the rewards."""
         rewards = self.rewards
         sensor_count = self.observation.count
         limited_count = sensor_count
@@ -253,7 +253,7 @@ class ScenarioTables(Section):
         yield value_count_fault("rewards.error_scale", rewards.error_scale, sensor_count)
 
     def _sensor_faults(self) -> Iterator[Fault]:
-        """Yield the faults of learning, notices, noise and sensor faults beside the sensors."""
+        """Yield the possible faults, each with whether it is there: what is stated by sensor."""
         sensor_count = self.observation.count
         for key in ("gauge_gain", "gauge_offset"):
             yield value_count_fault(
@@ -303,7 +303,7 @@ class ScenarioTables(Section):
         return is_absurd, message
 
     def _mode_faults(self) -> Iterator[Fault]:
-        """Yield the keys that do not go together with the observation of modes."""
+        """Yield the possible faults, each with whether it is there: observation of modes."""
         modes = self.observation.modes
         record = self.truth.record
         if modes is None:

@@ -69,17 +69,21 @@ def _belief_of_format_1(asset: Mapping[str, Any]) -> dict[str, Any]:
     return belief
 
 
-def _asset_of_format_1(asset: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table `asset` of format 2 for one of format 1, without the keys on the belief."""
-    present = dict(asset)
-    design = present.pop("design", None)
-    kind = present.pop("kind", "fmu")
+def _asset_of_format_1(former: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the table `asset` of format 2 for one of format 1, without the keys on the belief.
+
+    In format 1 the kind `fmu` also stood for scripts and wing designs, the kind `coupled` also for
+    SSP files, and a table could have keys of other kinds, which were not used.
+    """
+    asset = dict(former)
+    design = asset.pop("design", None)
+    kind = asset.pop("kind", "fmu")
     packed_design: dict[str, Any] = {}
-    if kind == "fmu" and "file" not in asset:
-        kind = "script" if "script" in asset else "design"
+    if kind == "fmu" and "file" not in former:
+        kind = "script" if "script" in former else "design"
         if kind == "design":
             packed_design = _table_of_design(design)
-    elif kind == "coupled" and "file" in asset:
+    elif kind == "coupled" and "file" in former:
         kind = "ssp"
     unused_keys: tuple[str, ...] = ()
     if kind not in ("coupled", "ssp"):
@@ -87,8 +91,8 @@ def _asset_of_format_1(asset: Mapping[str, Any]) -> dict[str, Any]:
     if kind == "strain_library":
         unused_keys += _KEYS_OF_FMUS
     for key in unused_keys:
-        present.pop(key, None)
-    return {"kind": kind} | present | packed_design
+        asset.pop(key, None)
+    return {"kind": kind} | asset | packed_design
 
 
 def _table_of_design(design: object) -> dict[str, Any]:

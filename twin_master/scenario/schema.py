@@ -93,7 +93,7 @@ class Scenario(ScenarioTables):
         return groups
 
     def scripted_history(self) -> Float:
-        """Return the scripted true state of each step; the gain of a step is in its own state.
+        """Return the scripted true state of each step, which includes the gain of that step.
 
         Returns
         -------
@@ -107,6 +107,7 @@ class Scenario(ScenarioTables):
             column = self.state_names.index(entry.state)
             gain[entry.first_step : last_step + 1, column] += entry.gain
         history = np.cumsum(gain, axis=0)
+        # round off the errors of the sums
         for factor_history in history.T:
             largest = np.abs(factor_history).max()
             # The power of ten of the largest value, which is negative or zero below 1.
@@ -160,7 +161,7 @@ class Scenario(ScenarioTables):
         return self.model_dump(mode="json")
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of the tables beside each other."""
+        """Yield the possible faults, each with whether it is there: tables that do not fit."""
         yield from self._control_faults()
         yield from self._action_faults()
         yield from self._growth_faults()
@@ -171,7 +172,7 @@ class Scenario(ScenarioTables):
         yield from self._mode_faults()
 
     def _reference_faults(self) -> Iterator[Fault]:
-        """Yield references to no figure, or to the same one."""
+        """Yield the possible faults, each with whether it is there: names of references."""
         names = [entry.figure for entry in self.reference]
         for name in names:
             yield unknown_name_fault(

@@ -78,7 +78,7 @@ class Transition(Section):
     def faults_beside(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Fault]:
-        """Yield the faults of the probabilities beside the controls and states of the scenario.
+        """Yield the possible faults, each with whether it is there: names and tables.
 
         Parameters
         ----------
@@ -100,7 +100,7 @@ class Transition(Section):
     def _probability_faults(
         self, controls: tuple[str, ...], states: tuple[str, ...]
     ) -> Iterator[Fault]:
-        """Yield the controls and states that have no probability, or are unknown."""
+        """Yield the possible faults, each with whether it is there: names of probabilities."""
         key = "transition.probability"
         yield incomplete_table_fault(self.probability, controls, key, "control")
         for control, probability in self.probability.items():
@@ -110,7 +110,7 @@ class Transition(Section):
     def _table_faults(
         self, controls: tuple[str, ...], level_counts: Mapping[str, int]
     ) -> Iterator[Fault]:
-        """Yield missing and unknown tables, and tables that are no square of probabilities."""
+        """Yield the possible faults, each with whether it is there: names and rows of tables."""
         yield incomplete_table_fault(self.tables, controls, "transition.tables", "control")
         for control, tables in self.tables.items():
             key = f"transition.tables.{control}"
@@ -152,7 +152,7 @@ class Span(Section):
     last_step: Step | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield an end before the beginning."""
+        """Yield the possible faults, each with whether it is there: an early end."""
         ends_early = self.last_step is not None and self.last_step < self.first_step
         yield (
             ends_early,
@@ -185,7 +185,7 @@ class SensorFault(Span):
     rate: Number | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the faults of the span, and a rate that the kind lacks or does not have."""
+        """Yield the possible faults, each with whether it is there: span and rate."""
         yield from super().faults()
         needs_rate = self.kind == "drift"
         has_rate = self.rate is not None
@@ -225,7 +225,7 @@ class TruthSection(Section):
     """How the record of each step is made, if modes are observed."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the keys that do not go together."""
+        """Yield the possible faults, each with whether it is there: keys of another kind."""
         is_inside_asset = self.kind == "asset"
         has_sensor_errors = self.sensor_faults or self.noise.standard_deviation
         if self.record is not None:
@@ -289,7 +289,7 @@ class Action(Section):
     """Whether the mission ends with that step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield keys that need each other, and an action without effect."""
+        """Yield the possible faults, each with whether it is there: readings and effect."""
         inspects = bool(self.inspects)
         has_deviation = self.standard_deviation is not None
         yield (
@@ -339,7 +339,7 @@ class Planner(Section):
     """`belief` and `qmdp`: how many of the assets that fly side by side may inspect in one step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield the keys of another policy."""
+        """Yield the possible faults, each with whether it is there: keys of another policy."""
         yield (
             self.limit_probability is not None and self.policy != "belief",
             "`planner.limit_probability` needs `planner.policy` `belief`",
@@ -418,7 +418,7 @@ class Learning(Section):
     not learnt."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield factors that do not increase, and a single factor."""
+        """Yield the possible faults, each with whether it is there: transition factors."""
         factors = self.transition_factors
         does_not_increase = any(second <= first for first, second in pairwise(factors))
         listed = ", ".join(str(factor) for factor in factors)
