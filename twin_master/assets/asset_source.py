@@ -138,7 +138,7 @@ def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -
     Parameters
     ----------
     scenario : Scenario
-        Names the state factors, and has the controls.
+        The scenario, with the names of the state factors and with the controls.
     states : (S, F) array
         The value of each state factor in each state.
     predict : callable

@@ -242,7 +242,9 @@ class CoupledSource(SeveralSource):
             if component.design not in (None, CALIBRATED_DESIGN_NAME):
                 load_design(component.design_path)
         needs_packing = any(component.design is not None for component in components)
-        if needs_packing:  # it takes too long for a check, which therefore uses no FMU
+        if needs_packing:
+            # Packing takes too long for a check. Components and connections are checked with a
+            # path in the place of each FMU.
             self._structure({component.name: scratch for component in components})
         else:
             fmus = {

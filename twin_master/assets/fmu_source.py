@@ -168,7 +168,7 @@ class FmuAsset(Asset):
         self.units = units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Make one communication step."""
+        """Make one communication step with the control and the health of the step (SI)."""
         observation = self._session.step(control, health, self._load)
         sensed = observation.values[self._observation]
         monitors = {self._stored_names[name]: value for name, value in observation.extra.items()}

@@ -8,7 +8,7 @@ one. The published strain library of Kapteyn et al. 2021 has a format of its own
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -183,6 +183,26 @@ class ObservationLibrary:
             )
         return int(np.argmax(is_same))
 
+    def check_parameter(self, name: str) -> None:
+        """Refuse a parameter that is not the uncertain one of the library.
+
+        A library without an uncertain parameter passes: one draw of any parameter can use it.
+
+        Raises
+        ------
+        MissionInputError
+            If the library has another parameter.
+        """
+        if self.parameter and name != self.parameter:
+            raise self._other_parameter_error(name)
+
+    def _other_parameter_error(self, name: str) -> MissionInputError:
+        """Return the error that the library has another parameter than the scenario."""
+        return MissionInputError(
+            f"the observation library was sampled over the parameter {self.parameter or 'none'}, "
+            f"and the scenario calibrates {name}: {_ADVICE}"
+        )
+
     def observations_at(self, name: str, draws: Float) -> Float:
         """Return the observations at given values of the parameter.
 
@@ -207,10 +227,7 @@ class ObservationLibrary:
         if not self.parameter and len(draws) == 1:
             return self.values
         if name != self.parameter:
-            raise MissionInputError(
-                f"the observation library was sampled over the parameter "
-                f"{self.parameter or 'none'}, and the scenario calibrates {name}: {_ADVICE}"
-            )
+            raise self._other_parameter_error(name)
         order = np.argsort(self.draws, kind="stable")
         nodes = self.draws[order]
         tolerance = _RELATIVE_TOLERANCE * float(np.abs(nodes).max())
@@ -369,40 +386,38 @@ class LibrarySource(AssetSource):
         """
         library = load_observation_library(self.path(OBSERVATIONS_COPY))
         self._check_labels(library)
-        if not library.parameter or library.parameter == self._scenario.calibration.parameter:
-            model = build_graphical_model(self._scenario)
-            self._state_and_control_indices(library, model)  # raises an error if one is missing
-        else:
-            # Raises the error that the library has another parameter.
-            library.observations_at(self._scenario.calibration.parameter, np.zeros(2))
+        library.check_parameter(self._scenario.calibration.parameter)
+        model = build_graphical_model(self._scenario)
+        self._state_and_control_indices(library, model)  # raises an error if one is missing
         return library
 
     def _check_labels(self, library: ObservationLibrary) -> None:
         """Refuse a library whose role, sensors, units or load are not those of the scenario."""
         scenario = self._scenario
         observation = scenario.observation
+        self._check_same("observes", [library.role], [observation.role])
         vector = self._flown.binding().observation.get(observation.role)
         sensors = () if vector is None else vector.variables
+        self._check_same("has the sensors", library.sensors, sensors)
+        self._check_same("has them in", library.sensor_units, observation.sensor_units)
         names_and_units = zip(library.states.names, library.state_units, strict=True)
-        state_units = sorted(f"{name}: {unit}" for name, unit in names_and_units)
-        wanted_state_units = sorted({f"{factor.name}: {factor.unit}" for factor in scenario.state})
-        load = _assignments(library.load)
-        wanted_load = _assignments(scenario.asset.constant_load)
-        # What the message says of the labels, those of the library, and those of the scenario.
-        for verb, labels, wanted_labels in (
-            ("observes", (library.role,), (observation.role,)),
-            ("has the sensors", library.sensors, sensors),
-            ("has them in", library.sensor_units, observation.sensor_units),
-            ("has the states in", state_units, wanted_state_units),
-            ("was sampled under the load", load, wanted_load),
-        ):
-            if labels != wanted_labels:
-                file_name = self.path(OBSERVATIONS_COPY).name
-                raise MissionInputError(
-                    f"the observation library {file_name} {verb} {', '.join(labels) or 'none'}, "
-                    "and the scenario with its binding asks for "
-                    f"{', '.join(wanted_labels) or 'none'}: {_ADVICE}"
-                )
+        library_units = sorted(f"{name}: {unit}" for name, unit in names_and_units)
+        units = sorted({f"{factor.name}: {factor.unit}" for factor in scenario.state})
+        self._check_same("has the states in", library_units, units)
+        load = _assignments(scenario.asset.constant_load)
+        self._check_same("was sampled under the load", _assignments(library.load), load)
+
+    def _check_same(self, verb: str, of_library: Sequence[str], of_scenario: Sequence[str]) -> None:
+        """Refuse a library that has other texts than the scenario.
+
+        The verb says in the message what the library has: "has the sensors".
+        """
+        if list(of_library) != list(of_scenario):
+            raise MissionInputError(
+                f"the observation library {self.path(OBSERVATIONS_COPY).name} {verb} "
+                f"{', '.join(of_library) or 'none'}, and the scenario with its binding asks for "
+                f"{', '.join(of_scenario) or 'none'}: {_ADVICE}"
+            )
 
     def check(self) -> None:
         """Check that the library contains what the scenario needs."""

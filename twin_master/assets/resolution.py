@@ -18,7 +18,7 @@ from twin_master.network.transition import NUMBER, TRANSITION_COPIES, check_fits
 from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Section
+from twin_master.scenario.section import Section, Table
 
 
 @dataclass(frozen=True)
@@ -130,40 +130,23 @@ def resolve_scenario(
     return parse_scenario(table, source)
 
 
-def _override_asset(table: dict[str, Any], overrides: Overrides) -> None:
+def _override_asset(table: Table, overrides: Overrides) -> None:
     """Change what flies in the table of a scenario.
 
     The keys of the asset stay as far as the kind that flies has them.
     """
-    flown = table["asset"]
+    former = table["asset"]
     library = overrides.strain_library
     files_by_kind = {"ssp": overrides.ssp, "fmu": overrides.fmu, "strain_library": library}
     given_files = {kind: file for kind, file in files_by_kind.items() if file}
-    if len(given_files) > 1:
-        raise MissionInputError(
-            "one asset flies: give one of an SSP file, --fmu and --strain-library."
-        )
-    if library and (overrides.binding or overrides.library):
-        raise MissionInputError(
-            "--strain-library is asset and model itself, and no FMU: give it without --binding and "
-            "--library."
-        )
-    if overrides.fmu and flown["kind"] in ("coupled", "ssp"):
-        raise MissionInputError(
-            "--fmu flies one FMU, and the scenario couples several: change its components."
-        )
-    if given_files and flown.get("patch"):
-        raise MissionInputError(
-            "`asset.patch` goes into the FMU that is packed of a design, and another asset is "
-            "flown: leave it out."
-        )
-    for kind, file in given_files.items():
+    _check_asset_overrides(former, overrides, len(given_files))
+    for kind, file in given_files.items():  # there is one at most
         keys_of_kind = AssetSection.kinds()[kind].model_fields
-        asset = {key: value for key, value in flown.items() if key in keys_of_kind and value != ""}
+        asset = {key: value for key, value in former.items() if key in keys_of_kind and value != ""}
         if kind == "strain_library" and file.is_dir():
             file = file / FILE_NAME
         table["asset"] = asset | {"kind": kind, "file": str(file.resolve())}
-    if library and flown["kind"] != "strain_library":
+    if library and former["kind"] != "strain_library":
         table["belief"] = {"kind": "asset"}
     if overrides.binding:
         table["asset"]["binding"] = str(overrides.binding.resolve())
@@ -171,12 +154,37 @@ def _override_asset(table: dict[str, Any], overrides: Overrides) -> None:
         table["asset"]["isolated"] = False
 
 
-def _design_tables(table: dict[str, Any]) -> list[dict[str, Any]]:
+def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) -> None:
+    """Refuse overrides that contradict each other, or the table of the asset.
+
+    The number of files is that of the overrides which replace what flies.
+    """
+    if file_count > 1:
+        raise MissionInputError(
+            "one asset flies: give one of an SSP file, --fmu and --strain-library."
+        )
+    if overrides.strain_library and (overrides.binding or overrides.library):
+        raise MissionInputError(
+            "--strain-library is asset and model itself, and no FMU: give it without --binding and "
+            "--library."
+        )
+    if overrides.fmu and asset["kind"] in ("coupled", "ssp"):
+        raise MissionInputError(
+            "--fmu flies one FMU, and the scenario couples several: change its components."
+        )
+    if file_count and asset.get("patch"):
+        raise MissionInputError(
+            "`asset.patch` goes into the FMU that is packed of a design, and another asset is "
+            "flown: leave it out."
+        )
+
+
+def _design_tables(table: Table) -> list[Table]:
     """Return the tables of a scenario that may name a design."""
     return [table["asset"], table["belief"], *table["asset"].get("component", ())]
 
 
-def _use_calibrated_design(table: dict[str, Any]) -> None:
+def _use_calibrated_design(table: Table) -> None:
     """Replace the designs in the table of a scenario by that of the calibration file.
 
     The design of the asset is replaced, and every other one that the twin believes as well.
@@ -293,15 +301,15 @@ class LearntFile(Section):
     """What replaces tables of a scenario: for a new asset, and for groups of assets."""
 
     format: Literal[1]
-    source: dict[str, Any] = Field(default_factory=dict)
-    transition: dict[str, Any] | None = None
-    observation: dict[str, Any] | None = None
-    calibration: dict[str, Any] | None = None
+    source: Table = Field(default_factory=dict)
+    transition: Table | None = None
+    observation: Table | None = None
+    calibration: Table | None = None
     """Distribution of the parameter over the assets, with which a new one begins."""
-    group: dict[str, dict[str, dict[str, Any]]] = Field(default_factory=dict)
+    group: dict[str, dict[str, Table]] = Field(default_factory=dict)
     """The tables of each group of assets, by its name."""
 
-    def tables_of_group(self, group: str | None) -> dict[str, dict[str, Any]]:
+    def tables_of_group(self, group: str | None) -> dict[str, Table]:
         """Return the tables of a group; those of a new asset if the file does not have it."""
         if group in self.group:
             return self.group[group]
@@ -313,7 +321,7 @@ class LearntFile(Section):
         return {name: table for name, table in tables.items() if table is not None}
 
 
-def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) -> None:
+def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
     """Replace what the twin of a scenario assumes by what a fleet has learnt.
 
     The truth of the scenario stays as it is.
@@ -366,7 +374,7 @@ def _check_learnt_transition(
 
 def _normal_calibration(
     calibration: Mapping[str, Any], learnt_parameter: object, path: Path
-) -> dict[str, Any]:
+) -> Table:
     """Return the table `calibration` of a normal distribution, still without its moments.
 
     The file of what was learnt has parameter, mean and standard deviation.

@@ -157,18 +157,16 @@ def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
     first_entry = observations[first_z1][first_z2][controls[0]]
     draws = [key for key in first_entry if key != _MEAN_ENTRY]
     gauge_count = len(first_entry[_MEAN_ENTRY])
-    # one row of strains for each draw, state and control
     rows = []
     for draw, z1, z2, control in product((_MEAN_ENTRY, *draws), *levels_by_region, controls):
         row = observations[str(z1)][str(z2)][control][draw]
-        has_all_gauges = np.shape(row) == (gauge_count,)
-        if not has_all_gauges or not np.all(np.isfinite(np.asarray(row, dtype=np.float64))):
+        if not _is_finite_vector(row, gauge_count):
             raise ValueError(
                 f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauge_count} finite "
                 "strains"
             )
         rows.append(row)
-    # axes: draw, with "mean" first; joint state of both regions; control; gauge
+    # The axes are the draw ("mean" first), the joint state of both regions, control and gauge.
     shape = (len(draws) + 1, -1, len(controls), gauge_count)
     table = np.array(rows, dtype=np.float64).reshape(shape) * MICROSTRAIN
     table.setflags(write=False)
@@ -182,6 +180,13 @@ def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
         strain_per_draw=table[1:],
         strain=table[0],
     )
+
+
+def _is_finite_vector(row: Any, length: int) -> bool:
+    """Return whether a row consists of a number of finite numbers."""
+    if np.shape(row) != (length,):
+        return False
+    return bool(np.all(np.isfinite(np.asarray(row, dtype=np.float64))))
 
 
 class StrainLibrarySection(AssetSection):

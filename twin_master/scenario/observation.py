@@ -2,14 +2,14 @@
 
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from reporting.arrays import Float, Index
 from reporting.toml_file import Fault, NotNegative, Positive
-from twin_master.scenario.section import Count, Name, PerSensor, Section, value_count_fault
+from twin_master.scenario.section import Count, Name, PerSensor, Section, Table, value_count_fault
 
 MODES_ROLE = "modes"
 """The role of an observation whose values are features of modes."""
@@ -102,7 +102,7 @@ class ModesSection(Section):
             if feature.kind in self.standard_deviation
         ]
 
-    def observation_keys(self) -> dict[str, Any]:
+    def observation_keys(self) -> Table:
         """Return the keys of `[observation]` that follow from the modes.
 
         They are `count`, `titles`, `unit` and `standard_deviation`.

@@ -14,6 +14,7 @@ from scenarios import scenario_files
 from twin_master.errors import ScenarioError
 from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.schema import Scenario
+from twin_master.scenario.section import Table
 from twin_master.scenario.tables import (
     GAINS_PER_SENSOR,
     MOST_DRAWS,
@@ -33,7 +34,7 @@ _KEYS_OF_COUPLED_FMUS = ("component", "connection", "algorithm", "iterations", "
 _KEYS_OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
 
 
-def from_format_1(table: Mapping[str, Any]) -> dict[str, Any]:
+def from_format_1(table: Mapping[str, Any]) -> Table:
     """Return a table of format 1 as one of format 2.
 
     In format 1 the table `asset` also said what the twin believes. A fault of the table stays in
@@ -54,12 +55,12 @@ def from_format_1(table: Mapping[str, Any]) -> dict[str, Any]:
     return {**table, "format": 2, "asset": _asset_of_format_1(asset), "belief": belief}
 
 
-def _belief_of_format_1(asset: Mapping[str, Any]) -> dict[str, Any]:
+def _belief_of_format_1(asset: Mapping[str, Any]) -> Table:
     """Return the table `belief` that the table `asset` of a file of format 1 implies."""
     model = asset.get("observation_model")
     library = asset.get("library")
     design = asset.get("design")
-    belief: dict[str, Any] = {"kind": "asset"}
+    belief: Table = {"kind": "asset"}
     if library is not None or model == "library":
         belief = {"kind": "library", "file": library, "design": design}
     elif model == "design" or (model is None and design is not None):
@@ -69,7 +70,7 @@ def _belief_of_format_1(asset: Mapping[str, Any]) -> dict[str, Any]:
     return belief
 
 
-def _asset_of_format_1(former: Mapping[str, Any]) -> dict[str, Any]:
+def _asset_of_format_1(former: Mapping[str, Any]) -> Table:
     """Return the table `asset` of format 2 for one of format 1, without the keys on the belief.
 
     In format 1 the kind `fmu` also stood for scripts and wing designs, the kind `coupled` also for
@@ -78,7 +79,7 @@ def _asset_of_format_1(former: Mapping[str, Any]) -> dict[str, Any]:
     asset = dict(former)
     design = asset.pop("design", None)
     kind = asset.pop("kind", "fmu")
-    packed_design: dict[str, Any] = {}
+    packed_design: Table = {}
     if kind == "fmu" and "file" not in former:
         kind = "script" if "script" in former else "design"
         if kind == "design":
@@ -95,7 +96,7 @@ def _asset_of_format_1(former: Mapping[str, Any]) -> dict[str, Any]:
     return {"kind": kind} | asset | packed_design
 
 
-def _table_of_design(design: object) -> dict[str, Any]:
+def _table_of_design(design: object) -> Table:
     """Return the table of a wing design by its name; None is a design without a name."""
     if design == CALIBRATED_DESIGN_NAME:
         return {"kind": "calibration"}

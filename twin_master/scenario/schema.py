@@ -17,7 +17,7 @@ from reporting.arrays import Float
 from reporting.toml_file import Fault
 from twin_master.scenario.consistency import ScenarioTables
 from twin_master.scenario.kinds import FileSection
-from twin_master.scenario.section import Section, unknown_name_fault
+from twin_master.scenario.section import Section, Table, unknown_name_fault
 from twin_master.scenario.tables import FigureGroup
 
 _GAIN_DECIMALS = 12
@@ -156,7 +156,7 @@ class Scenario(ScenarioTables):
         """Return the tables whose files a run folder has copies of, by name."""
         return {"asset": self.asset, "belief": self.belief, "calibration": self.calibration}
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Table:
         """Return the scenario as plain data in SI; `Scenario.model_validate` reads it back."""
         return self.model_dump(mode="json")
 

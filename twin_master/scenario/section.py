@@ -4,12 +4,15 @@ A key may carry its unit in its name (`levels_percent`); the value is converted 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, ConfigDict, Field, model_validator
 
 from reporting import toml_file
 from reporting.toml_file import Fault, Positive, missing_keys, short_repr
+
+Table = dict[str, Any]
+"""A table of a TOML or JSON file before it is checked: values of any type by key."""
 
 UNIT_DIVISOR = {"percent": 100.0, "microstrain": 1.0e6, "microstrain_per_step": 1.0e6}
 """By how much a value in a unit is divided to be in SI."""

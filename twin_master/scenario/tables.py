@@ -19,6 +19,7 @@ from twin_master.scenario.section import (
     Probability,
     Section,
     Step,
+    Table,
     incomplete_table_fault,
     value_count_fault,
 )
@@ -370,7 +371,7 @@ def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
     return extended
 
 
-def _add_control_of_action(table: dict[str, Any], action: Mapping[str, Any]) -> None:
+def _add_control_of_action(table: Table, action: Mapping[str, Any]) -> None:
     """Add a control, its reward and its probabilities for an action; those that exist stay."""
     name = action["name"]
     base_name = action["control"]
