@@ -7,6 +7,7 @@ import numpy as np
 
 from fe.runtime.modal_system import rayleigh_damping_ratio
 from fmu_asset.client.binding import Binding
+from fmu_asset.slaves.variables import TRANSIENT
 from reporting.arrays import Float
 from twin_master.assets.asset_source import Asset, AssetReading
 from twin_master.network.identified import packed_row
@@ -17,9 +18,6 @@ from twin_master.seeds import seed_sequence
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
     from twin_master.assets.fmu_source import Session
-
-_TRANSIENT_RESPONSE = 2.0
-"""Value of the FMU's parameter `response` with which the structure moves."""
 
 
 def modal_features(
@@ -100,7 +98,7 @@ class RecordedStructure(Asset):
         self._record = scenario.truth.record
         step_size = 1.0 / self._record.sampling_rate
         binding = binding.with_header(step_size=step_size, decimation=1)
-        self._parameters = {**parameters, "response": _TRANSIENT_RESPONSE}
+        self._parameters = {**parameters, "response": float(TRANSIENT)}
         self._session = open_session(binding, self._parameters)
         # The columns of the observed accelerometers in the observations of the binding.
         first_column = binding.observation_slice("acceleration").start
