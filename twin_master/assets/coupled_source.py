@@ -245,12 +245,13 @@ class CoupledSource(SeveralSource):
         if needs_packing:
             # Packing takes too long for a check. Components and connections are checked with a
             # path in the place of each FMU.
-            self._structure({component.name: scratch for component in components})
+            self._system_structure({component.name: scratch for component in components})
         else:
             fmus = {
-                component.name: _file_or_companion(component, scratch) for component in components
+                component.name: _fmu_of_file_or_companion(component, scratch)
+                for component in components
             }
-            self._open_session(binding, self.parameters(), Wiring(self._structure(fmus)))
+            self._open_session(binding, self.parameters(), Wiring(self._system_structure(fmus)))
         return binding
 
     def _pack_fmus(self, progress: Progress) -> dict[str, Path]:
@@ -269,7 +270,7 @@ class CoupledSource(SeveralSource):
         if fmu.exists():
             return fmu
         if component.design is None:
-            return _file_or_companion(component, fmu.parent)
+            return _fmu_of_file_or_companion(component, fmu.parent)
         if component.design == CALIBRATED_DESIGN_NAME:
             from calibration.result.file import load_calibration, tailoring
 
@@ -288,9 +289,9 @@ class CoupledSource(SeveralSource):
         fmus = {}
         for component in self.section.component:
             fmus[component.name] = self.path(component.copies()["fmu"])
-        return Wiring(self._structure(fmus))
+        return Wiring(self._system_structure(fmus))
 
-    def _structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
+    def _system_structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
         """Return the system of the components and connections of the scenario.
 
         Parameters
@@ -304,7 +305,7 @@ class CoupledSource(SeveralSource):
             connections += expand_connection(**entry.model_dump(), components=names)
         components = []
         for section in self.section.component:
-            settings = _settings(section)
+            settings = _component_settings(section)
             component = Component(section.name, fmus[section.name], settings, section.substeps)
             components.append(component)
         return SystemStructure(
@@ -331,7 +332,7 @@ def _system_connectors(connections: list[Connection]) -> tuple[Connector, ...]:
     return tuple(dict.fromkeys([*outputs, *inputs]))
 
 
-def _file_or_companion(component: ComponentSection, folder: Path) -> Path:
+def _fmu_of_file_or_companion(component: ComponentSection, folder: Path) -> Path:
     """Return the FMU of a component: its file, or a companion that is packed in a folder."""
     from fmu_asset.companions.build import companion_bytes
 
@@ -341,7 +342,7 @@ def _file_or_companion(component: ComponentSection, folder: Path) -> Path:
     return atomic_write_bytes(folder / f"{component.name}.fmu", companion_bytes(component.fmu))
 
 
-def _settings(component: ComponentSection) -> dict[str, ComponentSetting]:
+def _component_settings(component: ComponentSection) -> dict[str, ComponentSetting]:
     """Return the parameters of a component by name; patterns are expanded."""
     settings: dict[str, ComponentSetting] = {}
     where = f"the component `{component.name}`"

@@ -382,7 +382,7 @@ class DesignSource(_Wing, ReducedModelSource):
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
         """Return the predicted strains (E, S, U, G) with all effects of the patch."""
-        return self._strains(draws, model, self.patch)
+        return self._predict_strains(draws, model, self.patch)
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
         """Return the strains of the structure (E, S, U, G), without the effects of its gauges.
@@ -394,9 +394,9 @@ class DesignSource(_Wing, ReducedModelSource):
         structural_patch = self.patch.of_structure
         if structural_patch == self.patch:
             return None
-        return self._strains(draws, model, structural_patch)
+        return self._predict_strains(draws, model, structural_patch)
 
-    def _strains(
+    def _predict_strains(
         self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None"
     ) -> Float:
         """Return the strains (E, S, U, G) that the twin predicts with the effects of a patch.

@@ -252,7 +252,7 @@ class FmuSource(AssetSource):
         binding = self.binding()
         self._check_calibration(binding)
         self._check_names(binding)
-        binding = self._binding_checked_with_fmu(binding)
+        binding = self._fit_binding(binding)
         self._observation_slice(binding)
         self._find_truth_outputs(binding)
         self._check_state_units(binding)
@@ -288,7 +288,7 @@ class FmuSource(AssetSource):
         )
         check_names("the scenario has the", f"the binding {binding.name}", names_by_sort)
 
-    def _binding_checked_with_fmu(self, binding: Binding) -> Binding:
+    def _fit_binding(self, binding: Binding) -> Binding:
         """Return the binding with the lengths of arrays that the FMU has, after both are checked.
 
         If the FMU refuses a parameter, the error also names those that the calibration sets.

@@ -102,14 +102,14 @@ class ObservationLibrary:
         self.settling_steps = int(attributes["settling_steps"])
         self.load: Mapping[str, float] = json.loads(attributes["load"])
         self.parameters: Mapping[str, float] = json.loads(attributes["parameters"])
-        self.sensors = _texts(dataset, "sensor")
-        self.sensor_units = _texts(dataset, "sensor_unit")
-        self.controls = _texts(dataset, "control")
+        self.sensors = _read_texts(dataset, "sensor")
+        self.sensor_units = _read_texts(dataset, "sensor_unit")
+        self.controls = _read_texts(dataset, "control")
         self.control_values: dict[str, Float] = {}
         for name in json.loads(attributes["control_units"]):
-            self.control_values[name] = _finite_values(dataset, f"{_CONTROL_PREFIX}{name}")
+            self.control_values[name] = _read_finite_values(dataset, f"{_CONTROL_PREFIX}{name}")
         if self.parameter:
-            self.draws = _finite_values(dataset, "parameter_value")
+            self.draws = _read_finite_values(dataset, "parameter_value")
         else:
             self.draws = np.asarray(dataset["parameter_value"].values, np.float64)
         self.values = self._read_observations(state_names)
@@ -242,12 +242,12 @@ class ObservationLibrary:
         return np.tensordot(weights.T, self.values[order], axes=1)
 
 
-def _texts(dataset: xr.Dataset, name: str) -> tuple[str, ...]:
+def _read_texts(dataset: xr.Dataset, name: str) -> tuple[str, ...]:
     """Return the values of a variable as texts."""
     return tuple(str(text) for text in dataset[name].values)
 
 
-def _finite_values(dataset: xr.Dataset, name: str) -> Float:
+def _read_finite_values(dataset: xr.Dataset, name: str) -> Float:
     """Return the values of a variable; raise `ValueError` if one is not finite."""
     if not np.all(np.isfinite(dataset[name].values)):
         raise ValueError(f"a value of {name} is not finite")
@@ -395,19 +395,23 @@ class LibrarySource(AssetSource):
         """Refuse a library whose role, sensors, units or load are not those of the scenario."""
         scenario = self._scenario
         observation = scenario.observation
-        self._check_same("observes", [library.role], [observation.role])
+        self._check_same_texts("observes", [library.role], [observation.role])
         vector = self._flown.binding().observation.get(observation.role)
         sensors = () if vector is None else vector.variables
-        self._check_same("has the sensors", library.sensors, sensors)
-        self._check_same("has them in", library.sensor_units, observation.sensor_units)
+        self._check_same_texts("has the sensors", library.sensors, sensors)
+        self._check_same_texts("has them in", library.sensor_units, observation.sensor_units)
         names_and_units = zip(library.states.names, library.state_units, strict=True)
         library_units = sorted(f"{name}: {unit}" for name, unit in names_and_units)
         units = sorted({f"{factor.name}: {factor.unit}" for factor in scenario.state})
-        self._check_same("has the states in", library_units, units)
-        load = _assignments(scenario.asset.constant_load)
-        self._check_same("was sampled under the load", _assignments(library.load), load)
+        self._check_same_texts("has the states in", library_units, units)
+        load = _named_values_as_texts(scenario.asset.constant_load)
+        self._check_same_texts(
+            "was sampled under the load", _named_values_as_texts(library.load), load
+        )
 
-    def _check_same(self, verb: str, of_library: Sequence[str], of_scenario: Sequence[str]) -> None:
+    def _check_same_texts(
+        self, verb: str, of_library: Sequence[str], of_scenario: Sequence[str]
+    ) -> None:
         """Refuse a library that has other texts than the scenario.
 
         The verb says in the message what the library has: "has the sensors".
@@ -484,6 +488,6 @@ class LibrarySource(AssetSource):
         return states, controls
 
 
-def _assignments(values: Mapping[str, float]) -> list[str]:
+def _named_values_as_texts(values: Mapping[str, float]) -> list[str]:
     """Return named values as texts such as "mass = 2", sorted by name."""
     return [f"{name} = {value:g}" for name, value in sorted(values.items())]

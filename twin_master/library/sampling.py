@@ -265,7 +265,7 @@ def _prepare_folder(
             )
         former_plan = plan_file.read_bytes() if plan_file.is_file() else b""
         if former_plan and former_plan != plan.encode("utf-8"):
-            difference = _difference(former_plan, record)
+            difference = _differing_keys(former_plan, record)
             raise MissionInputError(
                 f"{folder} holds blocks of another FMU, binding, grid or version ({difference}): "
                 "give --replace to begin anew."
@@ -276,7 +276,7 @@ def _prepare_folder(
     return folder
 
 
-def _difference(former_plan: bytes, record: dict[str, Any]) -> str:
+def _differing_keys(former_plan: bytes, record: dict[str, Any]) -> str:
     """Return the keys in which a former plan differs from a record, in words."""
     try:
         former = parse_json(former_plan, PLAN_NAME, MissionInputError)
@@ -342,11 +342,11 @@ def sampled_dataset(
         "parameters": json.dumps(dict(grid.parameters), sort_keys=True),
         "control_units": json.dumps(control_units, sort_keys=True),
     }
-    coordinates = _coordinates(grid, binding, control_units)
+    coordinates = _library_coordinates(grid, binding, control_units)
     return xr.Dataset({"observation": observation}, coordinates, attributes)
 
 
-def _coordinates(
+def _library_coordinates(
     grid: SamplingGrid, binding: Binding, control_units: Mapping[str, str]
 ) -> dict[str, xr.Variable]:
     """Return the coordinates of a library: sensors, controls, draws, and levels of the states."""

@@ -23,7 +23,7 @@ LARGEST_SEED = 2**63 - 1
 """The largest integer that the files of a run can hold."""
 
 
-def _at_most(limit: int, reason: str) -> AfterValidator:
+def _limit_validator(limit: int, reason: str) -> AfterValidator:
     """Return a validator that refuses a larger number than the limit, and states the reason."""
 
     def check(value: int) -> int:
@@ -39,13 +39,13 @@ def _at_most(limit: int, reason: str) -> AfterValidator:
 PerSensor = Positive | tuple[Positive, ...]
 """One positive number for all sensors, or one for each."""
 Probability = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0.0, le=1.0)]
-_AT_MOST_LARGEST_COUNT = _at_most(LARGEST_COUNT, "for the twin holds arrays of that length")
+_AT_MOST_LARGEST_COUNT = _limit_validator(LARGEST_COUNT, "for the twin holds arrays of that length")
 Count = Annotated[int, Field(strict=True, ge=1), _AT_MOST_LARGEST_COUNT]
 Step = Annotated[int, Field(strict=True, ge=0), _AT_MOST_LARGEST_COUNT]
 Seed = Annotated[
     int,
     Field(strict=True, ge=0),
-    _at_most(LARGEST_SEED, "for the files of a run hold no larger integer"),
+    _limit_validator(LARGEST_SEED, "for the files of a run hold no larger integer"),
 ]
 Flag = Annotated[bool, Field(strict=True)]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[A-Za-z0-9_.\-]+$")]
@@ -74,7 +74,7 @@ class Section(toml_file.Section):
                 raise ValueError(f"`{field}` was given with and without its unit: keep one of them")
             if unit == "percent":
                 _check_percentage(key, value)
-            converted[field] = _in_si(value, UNIT_DIVISOR[unit]) if unit else value
+            converted[field] = _convert_to_si(value, UNIT_DIVISOR[unit]) if unit else value
         cls._check_required_keys(converted)
         return converted
 
@@ -114,10 +114,10 @@ def _check_percentage(key: object, value: object) -> None:
             raise ValueError(f"`{key}` is in percent, at most 100, and {short_repr(entry)} came")
 
 
-def _in_si(value: object, divisor: float) -> object:
+def _convert_to_si(value: object, divisor: float) -> object:
     """Return a number, or a list of them, divided by the divisor; anything else stays as it is."""
     if isinstance(value, list | tuple):
-        return [_in_si(entry, divisor) for entry in value]
+        return [_convert_to_si(entry, divisor) for entry in value]
     if isinstance(value, bool) or not isinstance(value, int | float):
         return value
     try:
