@@ -12,7 +12,7 @@ from reporting.arrays import Float
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
 from reporting.progress import Progress
-from twin_master.assets.asset_source import AssetSource, calibrated_with
+from twin_master.assets.asset_source import AssetSource, calibration_sentence
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError
 from twin_master.mission.journal import (
@@ -150,7 +150,7 @@ class Watch:
         """Return the model of the beginning, calibrated and planned with."""
         with self.progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(self.scenario, self.source, self.scenario.mission.seed)
-        remark = calibrated_with(
+        remark = calibration_sentence(
             knowledge.draws.record or {}, WATCHED_ASSET, self.source.origin.model, self._inputs
         )
         if remark is not None:

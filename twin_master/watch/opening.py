@@ -14,8 +14,8 @@ from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
 from twin_master.assets.resolution import (
     Overrides,
+    as_overrides,
     believed_source,
-    given_overrides,
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, NotResumableError
@@ -177,7 +177,7 @@ def copy_of_run_until(
         shutil.copytree(folder / "asset", copy / "asset")
         with journal.open("rb") as file:
             (copy / JOURNAL_NAME).write_bytes(file.read(journal_end))
-        scenario = run_folder.kept_scenario(folder).moved(copy)
+        scenario = run_folder.kept_scenario(folder).with_paths_from(copy)
         store_watch(Watch(copy, config, scenario, progress), Counts(), report=False)
         yield copy
 
@@ -324,7 +324,7 @@ def watch(
         If the watch cannot go on, with one clear sentence; what was observed is kept.
     """
     loaded = None if scenario is None else load_scenario(scenario)
-    overrides = given_overrides(overrides)
+    overrides = as_overrides(overrides)
     progress = progress or SilentProgress()
     patch = _given_patch(model_patch, from_step, resume=resume)
     if loaded is None and (folder is None or not resume):
@@ -383,11 +383,11 @@ def _scenario_for_reading(
 ) -> Scenario:
     """Return the scenario by which observations are read, with its paths located."""
     if loaded is None:
-        scenario = run_folder.kept_scenario(folder).moved(folder)
+        scenario = run_folder.kept_scenario(folder).with_paths_from(folder)
     else:
-        scenario = loaded.scenario.moved(loaded.path.parent)
+        scenario = loaded.scenario.with_paths_from(loaded.path.parent)
     if allow_unknown:
-        scenario = scenario.having("watch", allow_unknown=True)
+        scenario = scenario.with_changes("watch", allow_unknown=True)
     return scenario
 
 

@@ -97,7 +97,7 @@ def patched_model(
         raise MissionInputError(
             "only a twin that believes a design can be given a patch of its model."
         )
-    scenario = scenario.having("belief", patch=str(patch))
+    scenario = scenario.with_changes("belief", patch=str(patch))
     source: AssetSource = scenario.belief.source(scenario, None)
     return BelievedModel(from_step, prepared_alone(scenario, source, progress), patch)
 
