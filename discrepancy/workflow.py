@@ -34,8 +34,8 @@ from discrepancy.judgement.proof import prove
 from discrepancy.judgement.remarks import NO_GAP, look_alike_remark, with_date, with_untested
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.port_force import MissingForce, seen_force
-from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
+from discrepancy.missing_force.port_force import MissingForce, missing_force_of_verdict
+from discrepancy.missing_force.windows import add_window_sizes, gap_windows, windows_of_residuals
 from discrepancy.model_choice import load_model
 from discrepancy.proof_record import Proof
 from discrepancy.search.starts import OnProgress
@@ -188,13 +188,15 @@ def investigate(
             location = locate(before, seed=seed)
             windows = gap_windows(problem, fit, before, seed=seed)
             if after is not before:
-                windows += residual_windows(after, seed=seed, with_effect=True)
-            windows = sized_windows(windows, before, after)
+                windows += windows_of_residuals(after, seed=seed, with_effect=True)
+            windows = add_window_sizes(windows, before, after)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP and not verdict.unfitted:
         with stage("Seeing the missing force", "force"):
-            missing = seen_force(problem, search.force_search, search.force_hypotheses, fit)
+            missing = missing_force_of_verdict(
+                problem, search.force_search, search.force_hypotheses, fit
+            )
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, effects=added_effects(fit), seed=seed)

@@ -186,7 +186,7 @@ class Comparison(ABC, Generic[H]):
         """
         if self.has_held_out:
             held_out_share = self.share(hypothesis, held_out=True)
-            if held_out_share.tested:
+            if held_out_share.is_tested:
                 return held_out_share
         return self.share(hypothesis, held_out=False)
 
@@ -246,7 +246,7 @@ class Comparison(ABC, Generic[H]):
             The least lower end of the interval of its share in held-out trials.
         """
         share = self.share(hypothesis, held_out=True)
-        if share.tested:
+        if share.is_tested:
             return not _is_small(share, least_low_end)
         return share.value > LEAST_CONTRADICTING
 

@@ -11,7 +11,7 @@ from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit
 from discrepancy.location.residuals import FittedTrial
 from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
-from discrepancy.missing_force.shares import SHORTEST, WINDOWS
+from discrepancy.missing_force.shares import LEAST_BLOCK_SAMPLES, MOST_BLOCKS
 from discrepancy.search.starts import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search.wide_noise import refit_under_wide_noise, unrecorded_noise_levels
@@ -87,7 +87,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             sample_count = len(before.used)
             block_count = 1
             if before.trial.is_dynamic:
-                block_count = min(WINDOWS, max(1, sample_count // SHORTEST))
+                block_count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
             for block in np.array_split(np.arange(sample_count), block_count):
                 sums = [
                     float(squares[block].sum())
@@ -97,15 +97,15 @@ class SimulationComparison(Comparison[CandidateFit]):
             trial_count += 1
         sums_before, sums_after, noise_sums = np.array(blocks).T
         return GapShare(
-            before=sums_before,
-            after=sums_after,
-            noise=noise_sums,
+            squares_before=sums_before,
+            squares_after=sums_after,
+            noise_squares=noise_sums,
             held_out=held_out,
             trial_count=trial_count,
             remaining_rms=_rms_beyond_noise(sums_after, noise_sums),
             total_rms=_rms_beyond_noise(sums_before, noise_sums),
             kind=OF_READINGS,
-            tested=True,
+            is_tested=True,
         )
 
     def fit_followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:

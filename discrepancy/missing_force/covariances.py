@@ -10,7 +10,9 @@ STEADY = 1e-9
 
 
 @callable_when_compiled
-def is_steady(one: FloatArray, other: FloatArray) -> bool:
+def is_steady(covariance: FloatArray, previous_covariance: FloatArray) -> bool:
     """Return whether two covariances (n, n) differ by no more than `STEADY`, entry by entry."""
-    variances = np.diag(one)
-    return not np.any(np.abs(one - other) > STEADY * np.sqrt(np.outer(variances, variances)))
+    variances = np.diag(covariance)
+    return not np.any(
+        np.abs(covariance - previous_covariance) > STEADY * np.sqrt(np.outer(variances, variances))
+    )

@@ -18,9 +18,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray
 
-from .backward import later
-from .kalman import FilterSteps, discretised, forward
-from .trial import SeenTrial
+from .backward import smoother_corrections
+from .kalman import RecordFilter, discretise, filter_forward
+from .trial import PortedTrial
 
 
 @dataclass(frozen=True)
@@ -29,30 +29,37 @@ class Process:
 
     Attributes
     ----------
-    size : float
+    standard_deviation : float
         The standard deviation of the force [N, N m or the port's flow].
-    time : float
+    correlation_time : float
         The correlation time [s].
-    rough : bool
+    may_jump : bool
         Whether the force may jump (Matern 1/2). Otherwise it is differentiable (Matern 3/2).
     """
 
-    size: float
-    time: float
-    rough: bool = False
+    standard_deviation: float
+    correlation_time: float
+    may_jump: bool = False
 
     @property
     def generator(self) -> FloatArray:
-        """The rate matrix (1 or 2 rows) [1/s]; the first state is the force over `size`."""
-        if self.rough:
-            return np.array([[-1.0 / self.time]])
-        rate = np.sqrt(3.0) / self.time
+        """The rate matrix [1/s] of one or two states.
+
+        The first state is the force over its standard deviation.
+        """
+        if self.may_jump:
+            return np.array([[-1.0 / self.correlation_time]])
+        rate = np.sqrt(3.0) / self.correlation_time
         return np.asarray(rate * np.array([[0.0, 1.0], [-1.0, -2.0]]))
 
     @property
     def intensity(self) -> float:
         """Spectral density of the white noise that drives the last state."""
-        return 2.0 / self.time if self.rough else 4.0 * np.sqrt(3.0) / self.time
+        return (
+            2.0 / self.correlation_time
+            if self.may_jump
+            else 4.0 * np.sqrt(3.0) / self.correlation_time
+        )
 
 
 class ForceStateSpace(NamedTuple):
@@ -67,24 +74,24 @@ class ForceStateSpace(NamedTuple):
     output_rows : (C, n) ndarray
         The readings for a unit of each state, divided by the deviation of the white part of their
         noise.
-    start_covariance : (n, n) ndarray
+    initial_covariance : (n, n) ndarray
         The covariance of the state at the first sample.
     """
 
     generator: FloatArray
     intensity: FloatArray
     output_rows: FloatArray
-    start_covariance: FloatArray
+    initial_covariance: FloatArray
 
 
-class Smoothed(NamedTuple):
+class SmoothedForces(NamedTuple):
     """The added state and the missing forces of a trial given all of its readings.
 
     Shapes: F fine stamps, N samples, n states of the system, P missing forces.
 
     Attributes
     ----------
-    state : (F, n) ndarray
+    added_state : (F, n) ndarray
         The state that the missing forces add to the response of the model.
     forces : (P, F) ndarray
         The missing forces [N, N m or the port's flow].
@@ -93,7 +100,7 @@ class Smoothed(NamedTuple):
         ports.
     """
 
-    state: FloatArray
+    added_state: FloatArray
     forces: FloatArray
     deviations: FloatArray
 
@@ -104,17 +111,17 @@ class ForceFilter:
 
     Attributes
     ----------
-    trial : SeenTrial
+    trial : PortedTrial
         The trial.
     processes : sequence of (int, Process)
         The missing forces, each with the number of its port. Several may act at one port.
     """
 
-    trial: SeenTrial
+    trial: PortedTrial
     processes: Sequence[tuple[int, Process]]
 
     @cached_property
-    def units(self) -> FloatArray:
+    def state_units(self) -> FloatArray:
         """The unit (n,) of each state of the system, by which the state is divided.
 
         A force of `size` at the highest natural frequency moves a speed by (force / frequency) and
@@ -126,7 +133,7 @@ class ForceFilter:
             float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9
         )
         largest_rates = [
-            np.abs(system.actions[port]).max(initial=0.0) * process.size
+            np.abs(system.actions[port]).max(initial=0.0) * process.standard_deviation
             for port, process in self.processes
         ]
         largest_rate = max(*largest_rates, 1e-300)
@@ -138,7 +145,7 @@ class ForceFilter:
         return units
 
     @cached_property
-    def places(self) -> list[int]:
+    def force_state_indices(self) -> list[int]:
         """The index of each missing force in the whole state.
 
         A force that may not jump has a second state, which follows it.
@@ -150,47 +157,51 @@ class ForceFilter:
         ]
 
     @cached_property
-    def white(self) -> FloatArray:
+    def white_noise_scale(self) -> FloatArray:
         """The standard deviation (C,) of each channel's noise divided by that of its white part.
 
-        The filter counts readings in deviations of the white part, while `SeenTrial` counts them in
-        deviations of the whole noise: this is the factor between both.
+        The filter counts readings in deviations of the white part, while `PortedTrial` counts them
+        in deviations of the whole noise: this is the factor between both.
         """
         ratios = np.ones(len(self.trial.deviation))
-        for channel, coloured_share, _ in self.trial.coloured:
+        for channel, coloured_share, _ in self.trial.coloured_noises:
             ratios[channel] = 1.0 / np.sqrt(1.0 - coloured_share)
         return ratios
 
     @cached_property
-    def system(self) -> ForceStateSpace:
+    def state_space(self) -> ForceStateSpace:
         """The state space: states of the system, missing forces, coloured noises, in this order."""
         trial = self.trial
         system_states = slice(0, len(trial.system.generator))
         first_noise_state = system_states.stop + sum(
             len(process.generator) for _, process in self.processes
         )
-        state_count = first_noise_state + len(trial.coloured)
+        state_count = first_noise_state + len(trial.coloured_noises)
         generator = np.zeros((state_count, state_count))
         intensity = np.zeros((state_count, state_count))
         start_covariance = np.zeros((state_count, state_count))
         output_rows = np.zeros((len(trial.deviation), state_count))
         # the system
         generator[system_states, system_states] = (
-            trial.system.generator * self.units / self.units[:, None]
+            trial.system.generator * self.state_units / self.state_units[:, None]
         )
-        output_rows[:, system_states] = trial.system.outputs * self.units / trial.deviation[:, None]
+        output_rows[:, system_states] = (
+            trial.system.outputs * self.state_units / trial.deviation[:, None]
+        )
         # the missing forces: they drive the system, and an acceleration shows them directly
-        for (port, process), index in zip(self.processes, self.places, strict=True):
+        for (port, process), index in zip(self.processes, self.force_state_indices, strict=True):
             force_states = slice(index, index + len(process.generator))
             generator[system_states, index] = (
-                -trial.system.actions[port] * process.size / self.units
+                -trial.system.actions[port] * process.standard_deviation / self.state_units
             )
             generator[force_states, force_states] = process.generator
             intensity[force_states.stop - 1, force_states.stop - 1] = process.intensity
-            output_rows[:, index] = -trial.system.through[port] * process.size / trial.deviation
+            output_rows[:, index] = (
+                -trial.system.through[port] * process.standard_deviation / trial.deviation
+            )
             start_covariance[force_states, force_states] = np.eye(len(process.generator))
             # a settled trial begins at rest under the missing force f: A s + b f = 0
-            if trial.settled:
+            if trial.begins_at_rest:
                 at_rest = np.linalg.lstsq(
                     generator[system_states, system_states],
                     -generator[system_states, index],
@@ -200,34 +211,40 @@ class ForceFilter:
                 start_covariance[system_states, index] = at_rest
                 start_covariance[index, system_states] = at_rest
         # the correlated parts of noises: first-order processes of variance one
-        for index, (channel, coloured_share, rate) in enumerate(trial.coloured, first_noise_state):
+        for index, (channel, coloured_share, rate) in enumerate(
+            trial.coloured_noises, first_noise_state
+        ):
             generator[index, index] = -rate
             intensity[index, index] = 2.0 * rate
             start_covariance[index, index] = 1.0
             output_rows[channel, index] = np.sqrt(coloured_share)
-        output_rows *= self.white[:, None]
+        output_rows *= self.white_noise_scale[:, None]
         return ForceStateSpace(generator, intensity, output_rows, start_covariance)
 
     @property
-    def key(self) -> tuple[bytes, ...]:
+    def filter_key(self) -> tuple[bytes, ...]:
         """A key that is equal for trials with the same system, steps and used readings.
 
         Such trials have the same gains, and are filtered in one pass.
         """
         return tuple(
-            array.tobytes() for array in (*self.system, *self.trial.steps, self.trial.used)
+            array.tobytes() for array in (*self.state_space, *self.trial.intervals, self.trial.used)
         )
 
-    def steps(self, columns: FloatArray) -> FilterSteps:
+    def record_filter(self, columns: FloatArray) -> RecordFilter:
         """Return the filter's matrices by kind of step, with columns (K, N, C) to filter."""
-        lengths, _ = self.trial.steps
-        transitions, noises = discretised(self.system.generator, self.system.intensity, lengths)
-        scaled_columns = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
-        return FilterSteps(
-            transitions, noises, self.system.output_rows, self.trial.used, scaled_columns
+        lengths, _ = self.trial.intervals
+        transitions, noises = discretise(
+            self.state_space.generator, self.state_space.intensity, lengths
+        )
+        scaled_columns = np.ascontiguousarray(
+            np.moveaxis(columns, 0, -1) * self.white_noise_scale[:, None]
+        )
+        return RecordFilter(
+            transitions, noises, self.state_space.output_rows, self.trial.used, scaled_columns
         )
 
-    def products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def whitened_products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the products of whitened columns, and half the log determinant of the readings.
 
         Parameters
@@ -243,15 +260,19 @@ class ForceFilter:
             Half the sum of the logarithms of the variances of the readings, each given those before
             it [nat]. It is infinite if a force is so large that rounding loses the readings.
         """
-        steps = self.steps(columns)
-        _, step_of_sample = self.trial.steps
+        record_filter = self.record_filter(columns)
+        _, step_of_sample = self.trial.intervals
         end = np.array([len(step_of_sample)])
-        begin = steps.begin(self.system.start_covariance)
-        _, _, products, half_log_determinants = steps.before(step_of_sample, 0, begin, end)
+        begin = record_filter.initial_state(self.state_space.initial_covariance)
+        _, _, products, half_log_determinants = record_filter.filter_before(
+            step_of_sample, 0, begin, end
+        )
         # the filter's readings are multiplied by `white`, which multiplies their deviations too
-        return products[0], half_log_determinants[0] - np.sum(np.log(self.white) * self.trial.used)
+        return products[0], half_log_determinants[0] - np.sum(
+            np.log(self.white_noise_scale) * self.trial.used
+        )
 
-    def smoothed(self, readings: FloatArray) -> Smoothed:
+    def smooth(self, readings: FloatArray) -> SmoothedForces:
         """Return the added state and the missing forces given all readings.
 
         Parameters
@@ -259,29 +280,41 @@ class ForceFilter:
         readings : (N, C) array
             The residuals that the missing forces are to explain, divided by the noise deviations.
         """
-        steps = self.steps(readings[None])
-        _, step_of_sample = self.trial.steps
-        covariance, mean, *_ = steps.begin(self.system.start_covariance)
+        record_filter = self.record_filter(readings[None])
+        _, step_of_sample = self.trial.intervals
+        covariance, mean, *_ = record_filter.initial_state(self.state_space.initial_covariance)
         every_sample = np.arange(1, len(readings) + 1)
-        record = (steps.moves, steps.noises, step_of_sample, steps.rows, steps.used)
-        covariances, means, white, _, gains, variances = forward(
-            *record, steps.columns, 0, covariance, mean, every_sample
+        record = (
+            record_filter.transitions,
+            record_filter.noises,
+            step_of_sample,
+            record_filter.output_rows,
+            record_filter.used,
         )
-        additions, informations = later(
-            steps.moves, step_of_sample, steps.rows, steps.used, white, gains, variances
+        covariances, means, white, _, gains, variances = filter_forward(
+            *record, record_filter.columns, 0, covariance, mean, every_sample
         )
-        states = self._between_samples(means, covariances, additions)
-        # de Jong's smoother: the covariance given all readings, see `later`
+        corrections, informations = smoother_corrections(
+            record_filter.transitions,
+            step_of_sample,
+            record_filter.output_rows,
+            record_filter.used,
+            white,
+            gains,
+            variances,
+        )
+        states = self._states_at_fine_stamps(means, covariances, corrections)
+        # de Jong's smoother: the covariance given all readings, see `smoother_corrections`
         posterior = covariances - covariances @ informations @ covariances
-        sizes = np.array([process.size for _, process in self.processes])
-        return Smoothed(
-            state=states[:, : len(self.units)] * self.units,
-            forces=states[:, self.places].T * sizes[:, None],
+        sizes = np.array([process.standard_deviation for _, process in self.processes])
+        return SmoothedForces(
+            added_state=states[:, : len(self.state_units)] * self.state_units,
+            forces=states[:, self.force_state_indices].T * sizes[:, None],
             deviations=self._deviations(posterior),
         )
 
-    def _between_samples(
-        self, means: FloatArray, covariances: FloatArray, additions: FloatArray
+    def _states_at_fine_stamps(
+        self, means: FloatArray, covariances: FloatArray, corrections: FloatArray
     ) -> FloatArray:
         """Return the smoothed state (F, n) at all fine stamps, from the results at the samples.
 
@@ -289,20 +322,20 @@ class ForceFilter:
         ----------
         means, covariances : (N, n, 1), (N, n, n) ndarray
             The filtered state: after the readings of each sample.
-        additions : (N, n) ndarray
+        corrections : (N, n) ndarray
             De Jong's vector r of each sample, by which later readings correct the state; see
-            `later`.
+            `smoother_corrections`.
         """
-        parts = self.trial.parts
-        lengths, step_of_sample = self.trial.steps
-        fine_transitions, fine_noises = discretised(
-            self.system.generator, self.system.intensity, lengths / parts
+        substeps = self.trial.substeps
+        lengths, step_of_sample = self.trial.intervals
+        fine_transitions, fine_noises = discretise(
+            self.state_space.generator, self.state_space.intensity, lengths / substeps
         )
         step_kind = step_of_sample[1:]
         transitions = fine_transitions[step_kind]
         # what later readings add, carried back from the next sample to each fine stamp before it
-        carried_back = [additions[1:, :, None]]
-        for _ in range(parts):
+        carried_back = [corrections[1:, :, None]]
+        for _ in range(substeps):
             carried_back.append(transitions.mT @ carried_back[-1])
         # the state, carried forward from each sample with what it may have gathered on the way
         state = means[:-1] + covariances[:-1] @ carried_back[-1]
@@ -328,9 +361,9 @@ class ForceFilter:
         force_count = len(self.processes)
         output_rows = np.zeros((2 * force_count, covariances.shape[-1]))
         for number, (port, process) in enumerate(self.processes):
-            output_rows[number, self.places[number]] = process.size
-            output_rows[force_count + number, : len(self.units)] = (
-                self.trial.system.speeds[port] * self.units
+            output_rows[number, self.force_state_indices[number]] = process.standard_deviation
+            output_rows[force_count + number, : len(self.state_units)] = (
+                self.trial.system.speeds[port] * self.state_units
             )
         variances = np.sum((output_rows @ covariances) * output_rows, axis=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
@@ -348,7 +381,7 @@ class Solution:
 
     Attributes
     ----------
-    evidence : float
+    log_evidence : float
         The log evidence [nat], up to a constant.
     mean : (K,) ndarray
         The posterior mean.
@@ -356,7 +389,7 @@ class Solution:
         The posterior covariance.
     """
 
-    evidence: float
+    log_evidence: float
     mean: FloatArray
     covariance: FloatArray
 
@@ -370,25 +403,25 @@ class Regression:
     products : (1 + K, 1 + K) ndarray
         The inner products of the whitened residual (first) and of the whitened columns of the
         unknowns. Unknowns of single trials have been eliminated.
-    log_determinant : float
+    half_log_determinant : float
         Half the log determinant of the covariance of the readings, with the contribution of the
         eliminated unknowns [nat].
     """
 
     products: FloatArray
-    log_determinant: float
+    half_log_determinant: float
 
-    def solve(self, chosen: Sequence[int], precision: FloatArray) -> Solution:
+    def solve(self, unknowns: Sequence[int], precision: FloatArray) -> Solution:
         """Return evidence and values of some of the unknowns; the others are zero.
 
         Parameters
         ----------
-        chosen : sequence of int
+        unknowns : sequence of int
             The K numbers of the unknowns.
         precision : (K,) array
             Their prior precisions.
         """
-        rows = np.array([0, *(1 + k for k in chosen)])
+        rows = np.array([0, *(1 + k for k in unknowns)])
         products = self.products[np.ix_(rows, rows)]
         prior_precision = np.maximum(precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
@@ -406,15 +439,15 @@ class Regression:
         misfit = float(
             residual_weights @ products @ residual_weights + mean @ (prior_precision * mean)
         )
-        evidence = -0.5 * misfit - self.log_determinant
+        evidence = -0.5 * misfit - self.half_log_determinant
         # half the log determinant of the unscaled normal equations
         log_determinant = np.sum(np.log(np.diag(factor[0]) / column_scale))
         evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior_precision)))
         return Solution(evidence, mean, covariance)
 
 
-def without(
-    products: FloatArray, halves: FloatArray, precision: FloatArray
+def integrate_out_last(
+    products: FloatArray, half_log_determinants: FloatArray, precision: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return products and half log determinants with the last unknowns integrated out.
 
@@ -422,7 +455,7 @@ def without(
     ----------
     products : (..., W, W) array
         The inner products of the whitened residual and the columns of the unknowns.
-    halves : (...) array
+    half_log_determinants : (...) array
         Half the log determinants of the covariance of the readings [nat].
     precision : (L,) array
         The prior precisions of the last L unknowns.
@@ -431,46 +464,50 @@ def without(
     -------
     products : (..., W - L, W - L) array
         The products with the last L columns projected out (Schur complement).
-    halves : (...) array
+    half_log_determinants : (...) array
         Half the log determinants, with the contribution of these unknowns [nat].
     """
     if not len(precision):
-        return products, halves
+        return products, half_log_determinants
     prior_precision = np.maximum(precision, LEAST_PRECISION)
     kept_count = products.shape[-1] - len(prior_precision)
     # Schur complement of the last columns
     root = np.linalg.cholesky(products[..., kept_count:, kept_count:] + np.diag(prior_precision))
     projected = np.asarray(np.linalg.solve(root, products[..., kept_count:, :kept_count]))
-    half_log_determinants = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
-    remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior_precision).sum()
-    return products[..., :kept_count, :kept_count] - projected.mT @ projected, remaining_halves
+    half_log_det_of_block = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
+    remaining_half_log_dets = (
+        half_log_determinants + half_log_det_of_block - 0.5 * np.log(prior_precision).sum()
+    )
+    return products[
+        ..., :kept_count, :kept_count
+    ] - projected.mT @ projected, remaining_half_log_dets
 
 
-def regression(filtered: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:
+def sum_regressions(filters: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:
     """Return the normal equations of all trials, without the unknowns of single trials.
 
     Parameters
     ----------
-    filtered : sequence of ForceFilter
+    filters : sequence of ForceFilter
         The filter of each trial.
     rows : sequence of (1 + K + L, N, C) array
         The residual of each trial, and its columns of the K common and the trial's own L unknowns.
     """
     groups: dict[tuple[bytes, ...], list[tuple[ForceFilter, FloatArray]]] = {}
-    for trial_filter, columns in zip(filtered, rows, strict=True):
-        groups.setdefault(trial_filter.key, []).append((trial_filter, columns))
+    for trial_filter, columns in zip(filters, rows, strict=True):
+        groups.setdefault(trial_filter.filter_key, []).append((trial_filter, columns))
     total: FloatArray | float = 0.0
     log_determinant = 0.0
     # trials of one group have the same gains: one pass of the filter whitens the columns of all
     for group in groups.values():
         first_filter, _ = group[0]
-        products_of_group, half_log_determinant = first_filter.products(
+        products_of_group, half_log_determinant = first_filter.whitened_products(
             np.concatenate([columns for _, columns in group])
         )
         ends = np.cumsum([0, *(len(columns) for _, columns in group)]).tolist()
         for (trial_filter, _), (begin, end) in zip(group, pairwise(ends), strict=True):
             products_of_trial = products_of_group[begin:end, begin:end]
-            products, half_with_local_unknowns = without(
+            products, half_with_local_unknowns = integrate_out_last(
                 products_of_trial, half_log_determinant, trial_filter.trial.local_precision
             )
             total = total + products

@@ -20,19 +20,19 @@ import numpy as np
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from fe.compilation import callable_when_compiled, compiled
 
-from .backward import backward
+from .backward import filter_backward
 from .covariances import is_steady
 
-SMALL_PART, ORDERS = 0.25, 12
+SERIES_NORM, SERIES_TERMS = 0.25, 12
 """Norm of the rate matrix times the time up to which its exponential is summed as a series, and the
 number of terms: the remainder is 1e-16."""
-LEAST_SIZE = 0.5
+LEAST_INNOVATION_VARIANCE = 0.5
 """Variance of an innovation over that of the noise below which a far too large force has lost it to
 rounding. Exactly it is at least one."""
 
 
 @compiled
-def discretised(
+def discretise(
     generator: FloatArray, intensity: FloatArray, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return transitions and process noises (J, n, n) of steps of given lengths.
@@ -57,7 +57,7 @@ def discretised(
     for k in range(len(lengths)):
         doublings = 0
         part_length = lengths[k]
-        while norm * part_length > SMALL_PART:
+        while norm * part_length > SERIES_NORM:
             doublings += 1
             part_length = 0.5 * part_length
         # Taylor series of both for the part
@@ -65,7 +65,7 @@ def discretised(
         transition_term = np.eye(n)
         noise = intensity * part_length
         noise_term = intensity * part_length
-        for order in range(1, ORDERS):
+        for order in range(1, SERIES_TERMS):
             transition_term = (generator @ transition_term) * (part_length / order)
             transition = transition + transition_term
             noise_term = (generator @ noise_term + noise_term @ generator.T) * (
@@ -134,17 +134,17 @@ def update_mean(gain: FloatArray, innovation: FloatArray, mean: FloatArray) -> N
 
 
 @compiled
-def forward(
+def filter_forward(
     transitions: FloatArray,
     noises: FloatArray,
     step_of_sample: IntArray,
-    rows: FloatArray,
+    output_rows: FloatArray,
     used: BoolArray,
     columns: FloatArray,
     first: int,
     covariance: FloatArray,
     mean: FloatArray,
-    places: IntArray,
+    query_samples: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the filtered state before some samples, from the readings since sample `first`.
 
@@ -156,37 +156,37 @@ def forward(
         The transitions of the different steps, and the covariances of their process noise.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
-    rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+    output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     first : int
         The first sample whose readings are taken in.
     covariance, mean : (n, n), (n, W) ndarray
         The state after the sample before `first`; for the first sample of a record, the state at
         that sample before its readings.
-    places : (B,) ndarray
+    query_samples : (B,) ndarray
         The samples before which the state is asked for, ascending.
 
     Returns
     -------
     covariances, means : (B, n, n), (B, n, W) ndarray
         The state after the last sample before each place.
-    white : (places[-1] - first, c, W) ndarray
+    whitened : (places[-1] - first, c, W) ndarray
         The innovations of the columns, divided by their standard deviations.
-    halves : (B,) ndarray
+    half_log_determinants : (B,) ndarray
         Half the sum of the logarithms of the variances of the innovations; infinite if a variance
         has been lost to rounding.
     gains, variances : (B, c, n), (B, c) ndarray
         The gains and the variances of the innovations of that last sample.
     """
     n, column_count = mean.shape
-    channel_count = len(rows)
-    place_count = len(places)
-    covariances = np.zeros((place_count, n, n))
-    means = np.zeros((place_count, n, column_count))
-    white = np.zeros((places[-1] - first, channel_count, column_count))
-    halves = np.full(place_count, np.inf)
-    all_gains = np.zeros((place_count, channel_count, n))
-    all_variances = np.ones((place_count, channel_count))
+    channel_count = len(output_rows)
+    query_count = len(query_samples)
+    covariances = np.zeros((query_count, n, n))
+    means = np.zeros((query_count, n, column_count))
+    whitened = np.zeros((query_samples[-1] - first, channel_count, column_count))
+    half_log_determinants = np.full(query_count, np.inf)
+    all_gains = np.zeros((query_count, channel_count, n))
+    all_variances = np.ones((query_count, channel_count))
 
     covariance = covariance.copy()
     mean = mean.copy()
@@ -194,18 +194,18 @@ def forward(
     gains = np.zeros((channel_count, n))
     variances = np.ones(channel_count)
     half_log_determinant = 0.0
-    place = 0
+    query = 0
     steady = False
-    for k in range(first, places[-1] + 1):
+    for k in range(first, query_samples[-1] + 1):
         # store the state before a place
-        while place < place_count and places[place] == k:
-            covariances[place] = covariance
-            means[place] = mean
-            halves[place] = half_log_determinant
-            all_gains[place] = gains
-            all_variances[place] = variances
-            place += 1
-        if place == place_count:
+        while query < query_count and query_samples[query] == k:
+            covariances[query] = covariance
+            means[query] = mean
+            half_log_determinants[query] = half_log_determinant
+            all_gains[query] = gains
+            all_variances[query] = variances
+            query += 1
+        if query == query_count:
             break
         # a steady covariance stays so while the step and the used readings are the same
         same_step = k > first + 1 and step_of_sample[k] == step_of_sample[k - 1]
@@ -225,60 +225,67 @@ def forward(
             if not used[k, c]:
                 continue
             if not steady:
-                variances[c] = update_covariance(covariance, rows[c], gains[c])
+                variances[c] = update_covariance(covariance, output_rows[c], gains[c])
                 # this place and later ones keep their infinite half log determinant
-                if not variances[c] > LEAST_SIZE:
-                    return covariances, means, white, halves, all_gains, all_variances
-            innovation = white[k - first, c]
+                if not variances[c] > LEAST_INNOVATION_VARIANCE:
+                    return (
+                        covariances,
+                        means,
+                        whitened,
+                        half_log_determinants,
+                        all_gains,
+                        all_variances,
+                    )
+            innovation = whitened[k - first, c]
             innovation[:] = columns[k, c]
-            subtract_prediction(rows[c], mean, innovation)
+            subtract_prediction(output_rows[c], mean, innovation)
             update_mean(gains[c], innovation, mean)
             innovation /= np.sqrt(variances[c])
             half_log_determinant += 0.5 * np.log(variances[c])
         steady = steady or (is_like_previous and is_steady(covariance, previous_covariance))
-    return covariances, means, white, halves, all_gains, all_variances
+    return covariances, means, whitened, half_log_determinants, all_gains, all_variances
 
 
 @compiled
-def driven(
-    parts: int,
+def simulate_inputs(
+    substeps: int,
     transitions: FloatArray,
-    push_at_begin: FloatArray,
-    push_at_end: FloatArray,
+    by_input_at_begin: FloatArray,
+    by_input_at_end: FloatArray,
     step_of_sample: IntArray,
     start: FloatArray,
-    pushes: FloatArray,
+    inputs: FloatArray,
 ) -> FloatArray:
     """Return the state (F, n) at the fine stamps under inputs that are linear between these.
 
     Parameters
     ----------
-    parts : int
+    substeps : int
         The number of fine steps between two samples.
     transitions : (J, n, n) ndarray
         The transitions of the fine steps of different lengths.
-    push_at_begin, push_at_end : (J, n, d) ndarray
+    by_input_at_begin, by_input_at_end : (J, n, d) ndarray
         The change of the state over a fine step for a unit of an input at its start, or at its end.
     step_of_sample : (N,) ndarray
         The index of the length of the interval that ends at each sample.
     start : (n,) ndarray
         The state at the first fine stamp.
-    pushes : (F, d) ndarray
+    inputs : (F, d) ndarray
         The d inputs at the fine stamps.
     """
-    n, input_count = push_at_begin.shape[1], pushes.shape[1]
-    states = np.zeros((len(pushes), n))
+    n, input_count = by_input_at_begin.shape[1], inputs.shape[1]
+    states = np.zeros((len(inputs), n))
     states[0] = start
-    for k in range(len(pushes) - 1):
-        step = step_of_sample[k // parts + 1]
+    for k in range(len(inputs) - 1):
+        step = step_of_sample[k // substeps + 1]
         for i in range(n):
             next_state = 0.0
             for j in range(n):
                 next_state += transitions[step, i, j] * states[k, j]
             for d in range(input_count):
                 next_state += (
-                    push_at_begin[step, i, d] * pushes[k, d]
-                    + push_at_end[step, i, d] * pushes[k + 1, d]
+                    by_input_at_begin[step, i, d] * inputs[k, d]
+                    + by_input_at_end[step, i, d] * inputs[k + 1, d]
                 )
             states[k + 1, i] = next_state
     return states
@@ -291,31 +298,34 @@ information vectors (.., n, W), products of whitened columns (.., W, W), and hal
 
 
 @dataclass(frozen=True, eq=False)
-class FilterSteps:
-    """The arrays of a record that `forward` and `backward` take, without the step of each sample.
+class RecordFilter:
+    """A Kalman filter of a record, forwards and backwards in time.
+
+    The kind of the step that leads to each sample is given to its methods, so that one filter can
+    be used for several paths of a switched force.
 
     Attributes
     ----------
-    moves, noises : (S, n, n) ndarray
+    transitions, noises : (S, n, n) ndarray
         The transitions of the different steps, and the covariances of their process noise.
-    rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+    output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     """
 
-    moves: FloatArray
+    transitions: FloatArray
     noises: FloatArray
-    rows: FloatArray
+    output_rows: FloatArray
     used: BoolArray
     columns: FloatArray
 
     @cached_property
     def noise_roots(self) -> FloatArray:
         """The roots (S, n, n) of the process noises: root @ root.T is the covariance."""
-        return _roots(self.noises)
+        return _covariance_roots(self.noises)
 
-    def begin(self, covariance: FloatArray) -> FilterState:
+    def initial_state(self, covariance: FloatArray) -> FilterState:
         """Return the state of the filter before the first sample, with a covariance (n, n)."""
-        n, column_count = self.rows.shape[1], self.columns.shape[2]
+        n, column_count = self.output_rows.shape[1], self.columns.shape[2]
         return (
             covariance,
             np.zeros((n, column_count)),
@@ -323,8 +333,12 @@ class FilterSteps:
             np.zeros(()),
         )
 
-    def before(
-        self, step_of_sample: IntArray, first: int, state: Sequence[FloatArray], places: IntArray
+    def filter_before(
+        self,
+        step_of_sample: IntArray,
+        first: int,
+        state: Sequence[FloatArray],
+        query_samples: IntArray,
     ) -> FilterState:
         """Return the states of the filter before the steps into some samples.
 
@@ -336,59 +350,65 @@ class FilterSteps:
             The first sample whose readings are taken in.
         state : sequence of array
             The state of the filter before that sample, as `FilterState`.
-        places : (B,) array
+        query_samples : (B,) array
             The samples before which the state is asked for, ascending.
         """
         covariance, mean, products_before, halves_before = state
-        covariances, means, white, halves, *_ = forward(
-            self.moves,
+        covariances, means, white, halves, *_ = filter_forward(
+            self.transitions,
             self.noises,
             step_of_sample,
-            self.rows,
+            self.output_rows,
             self.used,
             self.columns,
             first,
             covariance,
             mean,
-            places,
+            query_samples,
         )
         # sums of the products of whitened columns, from the first sample up to each place
         white_by_place = np.split(
-            white.reshape(-1, white.shape[-1]), len(self.rows) * (places[:-1] - first)
+            white.reshape(-1, white.shape[-1]), len(self.output_rows) * (query_samples[:-1] - first)
         )
         products = np.cumsum(
             [white_columns.T @ white_columns for white_columns in white_by_place], axis=0
         )
         return covariances, means, products + products_before, halves + halves_before
 
-    def after(self, step_of_sample: IntArray, places: IntArray) -> FilterState:
+    def information_after(self, step_of_sample: IntArray, query_samples: IntArray) -> FilterState:
         """Return the information on the state at some samples, from these and later readings.
 
         Parameters
         ----------
         step_of_sample : (N,) array
             The step that leads to each sample.
-        places : (B,) array
+        query_samples : (B,) array
             The samples, ascending.
         """
-        return backward(
-            self.moves, self.noise_roots, step_of_sample, self.rows, self.used, self.columns, places
+        return filter_backward(
+            self.transitions,
+            self.noise_roots,
+            step_of_sample,
+            self.output_rows,
+            self.used,
+            self.columns,
+            query_samples,
         )
 
 
-def _roots(covariances: FloatArray) -> FloatArray:
+def _covariance_roots(covariances: FloatArray) -> FloatArray:
     """Return roots (..., n, n) of covariances: root @ root.T is the covariance."""
     eigenvalues, eigenvectors = np.linalg.eigh(covariances)
     return np.ascontiguousarray(eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))[..., None, :])
 
 
-def joined(
+def join_filters(
     before: Sequence[FloatArray], after: Sequence[FloatArray]
 ) -> tuple[FloatArray, FloatArray]:
     """Return the products and half log determinants of whole records from those of two parts.
 
     The state z at the joint is integrated out. It is Gaussian given the readings before; those
-    after have the log density of `backward`.
+    after have the log density of `filter_backward`.
 
     Parameters
     ----------
@@ -409,7 +429,7 @@ def joined(
     J, h, later_products, later_half = after
     # with covariance R R^T and residual information h - J m of the mean m, completing the square
     # in z leaves (h - J m)^T R (I + R^T J R)^-1 R^T (h - J m), and half log det (I + R^T J R)
-    root = _roots(covariance)
+    root = _covariance_roots(covariance)
     inner_root = np.linalg.cholesky(np.eye(covariance.shape[-1]) + root.mT @ J @ root)
     explained = np.asarray(np.linalg.solve(inner_root, root.mT @ (h - J @ mean)))
     mean_by_h = mean.mT @ h

@@ -15,14 +15,14 @@ import numpy as np
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
-from discrepancy.estimation.refinement import refined
+from discrepancy.estimation.refinement import refine_hypotheses
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
 from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit, time_step_error
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.hypotheses import sees_forces
+from discrepancy.missing_force.hypotheses import can_estimate_forces
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
@@ -67,7 +67,7 @@ class Search(FittedCandidates):
     @cached_property
     def force_search(self) -> ForceSearch | None:
         """The search for missing forces in the trials in motion; None if they show no force."""
-        if not sees_forces(self.problem):
+        if not can_estimate_forces(self.problem):
             return None
         self.on_progress("looking for the missing force")
         try:
@@ -182,11 +182,11 @@ class Search(FittedCandidates):
         point = self.problem.start(base.candidate)
         force_search = self.force_search if self.is_all_in_motion else None
         if force_search is not None:
-            hypothesis = force_search.whole
+            hypothesis = force_search.hypothesis_of_all_ports
             if base.candidate.terms:
-                followed = force_search.followed(hypothesis, base.candidate, base.effect)
+                followed = force_search.fit_along_motion(hypothesis, base.candidate, base.effect)
                 hypothesis = followed or hypothesis
-            point = force_search.whole_point(hypothesis)
+            point = force_search.point_with_effects(hypothesis)
         return replace(base, point=replace(point, effect=base.effect), linearisations=())
 
     def _fit_from_starts(
@@ -307,8 +307,10 @@ class Search(FittedCandidates):
         """
         self.exact_fits = {(): self.no_effect}
         self.rough_fits = {}
-        named = force_search.name(self.effects, self.on_progress)
-        self.force_hypotheses = refined(force_search, named, len(self.effects), self.on_progress)
+        named = force_search.rank_hypotheses(self.effects, self.on_progress)
+        self.force_hypotheses = refine_hypotheses(
+            force_search, named, len(self.effects), self.on_progress
+        )
         eligible = []
         for hypothesis in self.force_hypotheses:
             candidate = hypothesis.candidate
@@ -325,7 +327,7 @@ class Search(FittedCandidates):
             leading[: SEARCH.far_fits],
             lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
         ):
-            start = force_search.whole_point(hypothesis)
+            start = force_search.point_with_effects(hypothesis)
             fit = attempt(self.problem, hypothesis.candidate, start)
             if fit is not None:
                 self.record(fit, exact=True)
@@ -356,7 +358,7 @@ class Search(FittedCandidates):
         for hypothesis in canonical_relatives(leading, self.force_hypotheses):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
-            start = force_search.whole_point(hypothesis)
+            start = force_search.point_with_effects(hypothesis)
             for point in points_at_other_sizes(self.problem, candidate, start):
                 fit = attempt(self.problem, candidate, point)
                 if fit is None:

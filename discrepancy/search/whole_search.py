@@ -60,7 +60,7 @@ def search(
     if len(own_laws) and result.force_search is not None and result.is_unexplained():
         # a nonlinear law of the model itself, such as dry friction that ends a motion, has many
         # optima: fit again from the unknowns of a fit that includes a missing force
-        start = result.force_search.whole_point(result.force_search.whole)
+        start = result.force_search.point_with_effects(result.force_search.hypothesis_of_all_ports)
         second_fit = attempt(problem, Candidate(), start)
         least_gain = SEARCH.worth_fitting
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:

@@ -257,7 +257,7 @@ def test_coloured_noise_with_a_short_record_is_no_gap(seed):
 
 def share_of(after, gap, noise):
     """Return the share that a law is of a gap, by what is left of it, in trials that were held out."""
-    return GapShare(noise + gap, after, noise, True, 4, 1.0, 2.0, OF_READINGS, tested=True)
+    return GapShare(noise + gap, after, noise, True, 4, 1.0, 2.0, OF_READINGS, is_tested=True)
 
 
 def test_shares_and_their_interval():
