@@ -38,12 +38,12 @@ def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):
     assert found.log_evidence == pytest.approx(seen.log_evidence, abs=0.05)
     for one, motion in zip(found.trials, seen.motions, strict=True):
         scale = np.abs(motion.forces[0]).max()
-        np.testing.assert_allclose(one.missing[0], motion.forces[0], atol=0.02 * scale)
+        np.testing.assert_allclose(one.missing_forces[0], motion.forces[0], atol=0.02 * scale)
 
 
 def test_friction_that_ends_a_motion_leads_over_a_free_exponent(friction):
     search, effects = friction
-    followed = search.name(effects)
+    followed = search.rank_hypotheses(effects)
     assert followed[0].candidate.identifiers != ("coulomb_friction",)  # along a motion taken as known
     ranked = refine_hypotheses(search, followed, len(effects))
     assert ranked[0].candidate.identifiers == ("coulomb_friction",)

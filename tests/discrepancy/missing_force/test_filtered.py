@@ -34,7 +34,7 @@ def gaussian(covariance, readings):
 def evidence(filtered):
     """Return the log evidence of a trial's residuals."""
     trial = filtered.trial
-    found = sum_regressions([filtered], [np.concatenate((trial.residual[None], trial.local))])
+    found = sum_regressions([filtered], [np.concatenate((trial.residual[None], trial.local_derivatives))])
     return -0.5 * found.products[0, 0] - found.half_log_determinant
 
 
@@ -75,12 +75,12 @@ def dense(trial, process, per_second=2000, window=(-np.inf, np.inf)):
     step = 1.0 / per_second
     moments = np.arange(0.0, trial.time[-1] + 0.5 * step, step) + 0.5 * step
     apart = np.abs(moments[:, None] - moments)
-    rate = np.sqrt(3.0) / process.time
-    kernel = process.size**2 * np.exp(-rate * apart)
-    if not process.rough:
+    rate = np.sqrt(3.0) / process.correlation_time
+    kernel = process.standard_deviation**2 * np.exp(-rate * apart)
+    if not process.may_jump:
         kernel *= 1.0 + rate * apart
     else:
-        kernel = process.size**2 * np.exp(-apart / process.time)
+        kernel = process.standard_deviation**2 * np.exp(-apart / process.correlation_time)
     inside = (moments > window[0]) & (moments < window[1])
     kernel *= np.outer(inside, inside)
     answers = np.zeros((len(trial.time), 2, len(moments)))
@@ -153,7 +153,7 @@ def test_steady_gains_are_those_of_every_step():
     trial = trial_of(time, random.standard_normal((900, 2)))
     filtered = ForceFilter(trial, [(0, PROCESS)])
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
-    object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
+    object.__setattr__(jittered, "intervals", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
     every = ForceFilter(jittered, [(0, PROCESS)])
     late = [states(one)[0][[200, 899]] for one in (filtered, every)]
     assert [np.array_equal(*covers) for covers in late] == [True, False]
@@ -164,8 +164,9 @@ def test_steady_gains_are_those_of_every_step():
 
 def states(filtered):
     """Return the states of a trial after each of its samples."""
-    steps, which = filtered.steps(filtered.trial.residual[None]), filtered.trial.steps[1]
-    return steps.before(which, 0, steps.begin(filtered.system[3]), np.arange(1, len(which) + 1))
+    record, which = filtered.record_filter(filtered.trial.residual[None]), filtered.trial.intervals[1]
+    begin = record.initial_state(filtered.state_space.initial_covariance)
+    return record.filter_before(which, 0, begin, np.arange(1, len(which) + 1))
 
 
 def test_states_and_noise_by_closed_forms():
@@ -178,8 +179,8 @@ def test_states_and_noise_by_closed_forms():
     trial = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
     generator, push = trial.system.generator, -trial.system.actions[0]
     wanted = [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
-    np.testing.assert_allclose(trial.pushed(0, np.ones(len(wanted))), wanted, atol=1e-12)
-    still = replace(trial, settled=True).pushed(0, np.ones(len(wanted)))
+    np.testing.assert_allclose(trial.state_under_force(0, np.ones(len(wanted))), wanted, atol=1e-12)
+    still = replace(trial, begins_at_rest=True).state_under_force(0, np.ones(len(wanted)))
     np.testing.assert_allclose(still - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
     # noise of a deviation of one, part of it coloured
     count = 5000

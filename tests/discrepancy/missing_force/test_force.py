@@ -247,8 +247,9 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tm
 def drawn_through(search, effect, place):
     """Return an effect along the missing force, from where it is first seen."""
     term = EffectTerm(effect, place)
-    start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2][0]
-    return search.followed(search.whole, Candidate((term,)), start)
+    base = search.hypothesis_of_all_ports
+    start = next(item for item in search.screen_effects(base, [effect]) if item[1] == term)[2][0]
+    return search.fit_along_motion(base, Candidate((term,)), start)
 
 
 @pytest.mark.parametrize("high", [3.0, 1.05])
