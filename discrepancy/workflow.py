@@ -24,7 +24,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import time_step_error
-from discrepancy.fits.predictive import held_out_fit, residual_set
+from discrepancy.fits.predictive import fit_held_out, residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
@@ -323,11 +323,11 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     reading is reported by a remark.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    from_start = fit_to(problem, Candidate(), problem.start(Candidate()))
+    from_start = fit_to(problem, Candidate(), problem.prior_mean_point(Candidate()))
     none = refit_from_first_readings(problem, from_start)
     fits = [(problem, none)]
     if problem.campaign.held_out:
-        fits.append(held_out_fit(problem, none))
+        fits.append(fit_held_out(problem, none))
     trials = {trial.name: trial for trial in problem.campaign.trials}
     new_remarks: list[str] = []
     for problem_of_trials, fitted in fits:
@@ -365,7 +365,9 @@ def _accepts_outliers(campaign: Campaign, trial: Trial) -> BoolArray:
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:
     """Return the most probable sets of effects: the best fit and the probability of each."""
     ranked = list(search.set_probabilities().items())[:count]
-    return [(search.best_of(identifiers), probability) for identifiers, probability in ranked]
+    return [
+        (search.best_fit_of_set(identifiers), probability) for identifiers, probability in ranked
+    ]
 
 
 def patch_draws(
@@ -396,7 +398,7 @@ def patch_draws(
     if fit.draws is not None:
         draws = generator.choice(fit.draws, count)
     else:
-        size = fit.candidate.size
+        size = fit.candidate.parameter_count
         # covariance = L L^T, so that L times a standard normal vector has this covariance; the
         # diagonal is raised slightly, in case the matrix is singular to rounding
         factor = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))

@@ -49,7 +49,7 @@ class EffectLaws:
     @property
     def effect_unknown_count(self) -> int:
         """The number E of unknowns of the effects."""
-        return self.candidate.size
+        return self.candidate.parameter_count
 
     def linearise_along_trajectory(
         self,
@@ -201,7 +201,7 @@ class EffectLaws:
             self.column_builder.trial_indices[trial_index]
         ].trial
         patch = ModelPatch()
-        for term, term_values in self.candidate.split(effect):
+        for term, term_values in self.candidate.split_by_term(effect):
             if trial.kind in term.effect.acts_on:
                 patch = patch + term.patch(
                     self.column_builder.problem.setting, term_values
@@ -261,7 +261,7 @@ class EffectLaws:
         slopes: dict[int, FloatArray] = {}
         first_unknown = len(trial.shared_derivatives)
         motion = motion_for_columns(trajectory)
-        for term, term_values in self.candidate.split(effect):
+        for term, term_values in self.candidate.split_by_term(effect):
             # an effect without a law at a port changes readings only
             if not len(term.patch(self.column_builder.problem.setting, term_values).of(PortForce)):
                 change = change + self._readings_change_by_effect(

@@ -125,7 +125,7 @@ def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
     laws_at_point = search.evaluate_model_laws(shared)
     return tuple(
         number
-        for number in range(search.problem.shared.count)
+        for number in range(search.problem.shared.parameter_count)
         if search.evaluate_model_laws(with_step(shared, number, HALF_DIFFERENCE)) != laws_at_point
     )
 

@@ -59,7 +59,7 @@ class MissingForces:
         self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear_model.ports)
         self.hypothesis_by_port: dict[str, ForceHypothesis] = {}
-        self.point = self.problem.start(NO_EFFECTS)
+        self.point = self.problem.prior_mean_point(NO_EFFECTS)
         linear_trials = self._linearise_trials()
         for port, name in enumerate(self.ports):
             processes = self.prior_processes((port,))
@@ -189,10 +189,10 @@ class MissingForces:
 
     def _clipped_point(self, hypothesis: ForceHypothesis) -> Point:
         """Return the unknowns of a hypothesis without its effects, clipped to their ranges."""
-        local = [np.zeros(data.unknowns.size) for data in self.problem.trials]
+        local = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
         for number, values in zip(self.trial_indices, hypothesis.local, strict=True):
             local[number] = values
-        low, high = self.problem.shared.ends
+        low, high = self.problem.shared.bounds
         # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
         # within two prior standard deviations
         low = np.maximum(low + PARAMETER_STEP, -2.0)

@@ -17,7 +17,7 @@ from discrepancy.campaign.records import FloatArray, TrialKind
 from discrepancy.catalogue.entry import Setting
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point
-from discrepancy.fits.gates import SHAPE_GAIN
+from discrepancy.fits.gates import LEAST_SHAPE_GAIN
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 from discrepancy.system.response import Response
@@ -74,7 +74,7 @@ def log_prior(candidate: Candidate, effect_count: int, setting: Setting) -> floa
     if not terms:
         return log(SEARCH.prior_none)
     log_places = sum(log(len(term.effect.places(setting))) for term in terms)
-    shape_price = sum(SHAPE_GAIN for term in terms if term.free_shape)
+    shape_price = sum(LEAST_SHAPE_GAIN for term in terms if term.free_shape)
     probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_shares[len(terms) - 1]
     number_of_sets = comb(max(effect_count, len(terms)), len(terms))
     return log(probability_of_length / number_of_sets) - log_places - shape_price
@@ -301,7 +301,7 @@ class ColumnBuilder:
             The sum of the changes by all effects; None if an effect cannot act with these values.
         """
         columns = []
-        for term, term_values in candidate.split(values):
+        for term, term_values in candidate.split_by_term(values):
             try:
                 patch = term.patch(self.problem.setting, term_values)
             except DiscrepancyError:

@@ -224,7 +224,7 @@ class ForceSearch(MissingForces):
         for number, (log_evidence, factor) in self._weigh_columns(base, columns, terms).items():
             term = terms[number]
             values = values_of_columns[number]
-            start = term.rescaled(values, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
+            start = term.multiply_magnitudes(values, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
             starts_of_terms.setdefault(term, []).append((log_evidence, start))
         screened_effects = []
         for term, starts in starts_of_terms.items():
@@ -404,7 +404,7 @@ class ForceSearch(MissingForces):
             reverses = step @ last_step < -0.5 * (last_step @ last_step)
             damping = max(0.5 * damping, LEAST_DAMPING) if reverses else min(1.0, 1.5 * damping)
             move = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
+            effect = np.clip(candidate.add_step(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
             is_settled = step_number > 0 and _has_converged(step, last_step)
             processes = hypothesis.processes
             motions = hypothesis.motions

@@ -61,7 +61,7 @@ class ForceShares:
         if held_out:
             problem = search.problem.with_trials(held_out)
             numbers = range(len(problem.trials))
-            local = problem.start(search.hypothesis_of_all_ports.candidate).local
+            local = problem.prior_mean_point(search.hypothesis_of_all_ports.candidate).local
             point = Point(search.point.shared, local, np.zeros(0))
             columns = ColumnBuilder(problem, numbers, point, search.model_laws)
             self._held_out = (columns, columns.trials_without_effects())

@@ -414,14 +414,16 @@ def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTria
     substeps = _substep_count(system, trial.time)
     positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
     residual, by_shared, by_local = _residual_and_derivatives(problem, trial_index, point)
-    deviation = trial.noise_factor * np.array([noise.static_deviation for noise in data.noise])
+    deviation = trial.noise_factor * np.array(
+        [noise.static_deviation for noise in data.noise_models]
+    )
     return PortedTrial(
         name=trial.name,
         time=trial.time,
         residual=residual / deviation * trial.used,
         used=trial.used,
         deviation=deviation,
-        coloured_noises=_coloured_noises(data.noise, trial.whitened_at),
+        coloured_noises=_coloured_noises(data.noise_models, trial.whitened_at),
         shared_derivatives=by_shared / deviation * trial.used,
         local_derivatives=by_local / deviation * trial.used,
         local_precision=data.unknowns.precision,
@@ -467,9 +469,9 @@ def _residual_and_derivatives(
     derivatives, shared_of_column = problem.prediction_derivatives(
         trial_index, point, linear_response, Candidate()
     )
-    by_local = derivatives[: data.unknowns.size]
-    by_shared = np.zeros((problem.shared.size, *linear_response.response.shape))
-    by_shared[shared_of_column] = derivatives[data.unknowns.size :]
+    by_local = derivatives[: data.unknowns.unknown_count]
+    by_shared = np.zeros((problem.shared.unknown_count, *linear_response.response.shape))
+    by_shared[shared_of_column] = derivatives[data.unknowns.unknown_count :]
     residual = data.trial.values - problem.prediction(trial_index, point, linear_response.response)
     # the linear prediction is p(u_0) + D (u - u_0); at u = 0 it is p(u_0) - D u_0
     residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(
@@ -496,7 +498,7 @@ def _gain_unknowns(
     unknowns = []
     for index, channel_name in enumerate(shared.gain_channels):
         if channel_name in trial.channels:
-            number = shared.count + index
+            number = shared.parameter_count + index
             channel = trial.channels.index(channel_name)
             unknowns.append((number, channel, float(shared.scale[number]) / float(gains[channel])))
     return unknowns
@@ -569,12 +571,12 @@ def _port_motion(
     local = point.local[trial_index]
     at_point = motion(point.shared, local)
     by_unknowns = {}
-    for k in range(shared.count):
+    for k in range(shared.parameter_count):
         by_unknowns[k] = (motion(with_step(point.shared, k), local) - at_point) / PARAMETER_STEP
     # the first unknowns of a trial are the zeros of its channels, which do not move the ports
-    for k in range(data.unknowns.zeros, data.unknowns.size):
+    for k in range(data.unknowns.zero_count, data.unknowns.unknown_count):
         stepped_motion = motion(point.shared, with_step(local, k))
-        by_unknowns[shared.size + k] = (stepped_motion - at_point) / PARAMETER_STEP
+        by_unknowns[shared.unknown_count + k] = (stepped_motion - at_point) / PARAMETER_STEP
     return at_point, by_unknowns
 
 
@@ -607,11 +609,11 @@ def _ported_system(
         return problem.model.ported(trial, outputs, unknowns.parameters(u))
 
     derivatives: list[PortedSystem | None] = []
-    for k in range(unknowns.count):
+    for k in range(unknowns.parameter_count):
         above = system(with_step(shared, k, HALF_DIFFERENCE))
         below = system(with_step(shared, k, -HALF_DIFFERENCE))
         derivatives.append(_system_derivative(above, below))
-    derivatives += [None] * (unknowns.size - len(derivatives))
+    derivatives += [None] * (unknowns.unknown_count - len(derivatives))
     return system(shared), derivatives
 
 

@@ -122,7 +122,7 @@ def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float
     laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
     if not laws:
         return -np.inf
-    candidate, effect = fit.candidate.subset(laws, fit.effect)
+    candidate, effect = fit.candidate.subset_of_terms(laws, fit.effect)
     law = search.fit_along_motion(search.hypothesis_by_port[port], candidate, effect)
     return -np.inf if law is None else law.log_evidence
 

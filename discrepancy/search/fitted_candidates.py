@@ -7,7 +7,7 @@ from scipy.special import logsumexp
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, CandidateKey
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.explained import ForceHypothesis
@@ -65,7 +65,7 @@ class FittedCandidates:
         """Return the most probable candidate."""
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
-    def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
+    def best_fit_of_set(self, identifiers: tuple[str, ...]) -> CandidateFit:
         """Return the fit of the highest score of a set of effects, at any places."""
         fits = self.compared_fits().values()
         return max(
@@ -97,7 +97,7 @@ class FittedCandidates:
         ordered = sorted(log_weights.items(), key=lambda entry: -entry[1])
         return {identifiers: min(exp(value - log_total), 1.0) for identifiers, value in ordered}
 
-    def record(self, fit: CandidateFit, *, exact: bool) -> None:
+    def record_fit(self, fit: CandidateFit, *, exact: bool) -> None:
         """Record a fit if its evidence is above that of an earlier fit of the same candidate."""
         fits = self.exact_fits if exact else self.rough_fits
         key = fit.candidate.key
@@ -127,7 +127,7 @@ class FittedCandidates:
             return self.wide_fits[key]
         known = self.exact_fits.get(key)
         if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
-            exact = attempt(self.problem, rough.candidate, rough.point)
+            exact = try_fit(self.problem, rough.candidate, rough.point)
             # the rough fit may be at a point from which the model cannot be fitted further
-            self.record(rough if exact is None else exact, exact=True)
+            self.record_fit(rough if exact is None else exact, exact=True)
         return self.exact_fits[key]

@@ -211,7 +211,7 @@ def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_o
     places = {"coulomb_friction": "joint", "load_cell": "", "gauge_gain": "g1"}
     friction, cell, gain = (EffectTerm(kit.chosen(key)[0], place) for key, place in places.items())
     for terms in ((cell,), (friction, gain), (cell, gain)):
-        found.record(kit.fitted(problem, *terms), exact=True)
+        found.record_fit(kit.fitted(problem, *terms), exact=True)
     right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
     outcome = Case(found, {more: 0.7, right: 0.3}).common_effects()
     assert outcome[0].kind is VerdictKind.NAMED

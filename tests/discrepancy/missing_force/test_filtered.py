@@ -267,7 +267,7 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
 def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(settled):
     """Of a settled trial, too, whose state before is what the forces that act make of it."""
     random = np.random.default_rng(3)
-    trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), settled=settled)
+    trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), begins_at_rest=settled)
     search = EventSearch(LinearTrials([trial], np.zeros(0)), 0, EVENT)
     for on, forces in ((False, [REST]), (True, [EVENT, REST])):
         wanted = evidence(ForceFilter(trial, [(0, one) for one in forces]))

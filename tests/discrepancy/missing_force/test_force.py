@@ -148,7 +148,7 @@ def test_a_law_with_a_free_shape_has_the_name_of_its_family(tmp_path):
     port, *_ = problem.model.ports
     free = Candidate((EffectTerm(friction, port, free_shape=True),))
     force = ForceSearch(problem)
-    law = force.fit_along_motion(force.hypothesis_of_all_ports, free, free.terms[0].start())
+    law = force.fit_along_motion(force.hypothesis_of_all_ports, free, free.terms[0].start_values())
     family = f"a law of the family {friction.family}"
     missing = missing_force(force, law)
     assert missing.law == missing.at_port.law == family
@@ -271,7 +271,7 @@ def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(hi
 def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, number):
     """To first order: a heavier body moves less under the same force, and a reaction shows another part."""
     problem = blind(tmp_path, number)
-    point = problem.start(Candidate())
+    point = problem.prior_mean_point(Candidate())
     here = ported_trial(problem, 0, point)
     forces = {0: np.sin(0.7 * np.arange(len(here.fine_time)) / here.substeps)}
 
@@ -348,7 +348,7 @@ def test_one_law_stands_where_several_follow_the_jumps_that_an_accelerometer_sho
         Search(found.problem, FEW[:3], found.no_effect),
     )
     begun = replace(alone.point, effect=np.append(alone.effect, 0.0))
-    again.record(fit(found.problem, both, begun), exact=True)  # the other one was found first
+    again.record_fit(fit(found.problem, both, begun), exact=True)  # the other one was found first
     again.search_sets()
     assert again.best().candidate.identifiers == ("coulomb_friction",)
 
