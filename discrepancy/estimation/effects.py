@@ -1,4 +1,4 @@
-"""The effects of a hypothesis as forces at ports and errors of sensors along a trajectory."""
+"""The effects of a hypothesis along a trajectory: forces at ports and errors of sensors."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from .laws import LawForce, force_and_tangents
 from .linearised import LinearisedForce, LinearisedSensorErrors, Trajectory
 
 HALF_DIFFERENCE = 0.02
-"""Half the difference of a standard normal unknown in derivatives by it."""
+"""Half the difference of an unknown in a derivative by it; unknowns are standard normal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +29,13 @@ class EffectLaws:
     Attributes
     ----------
     column_builder : ColumnBuilder
-        The builder of the changes of readings by errors of sensors.
+        The object that computes the changes of readings by errors of sensors.
     trials : tuple of PortedTrial
         The dynamic trials.
     candidate : Candidate
         The effects at their places.
     evaluate_model_laws : callable
-        The function that takes shared unknowns (K,), and returns the model's own laws.
+        The function that takes the shared unknowns (K,) and returns the model's own laws at ports.
     unknowns_of_model_laws : tuple of int
         The numbers of the shared unknowns that change the model's own laws.
     """
@@ -111,7 +111,7 @@ class EffectLaws:
 
         Returns
         -------
-        mapping of int to ForceAlong or None
+        mapping of int to LawForce or None
             The forces by the number of the port; None if an effect is not possible at these values.
         """
         try:
@@ -143,31 +143,29 @@ class EffectLaws:
         shared: FloatArray,
         speed_window: float,
     ) -> dict[int, LinearisedForce]:
-        """Return the forces of all laws, by port, with their central differences by unknowns.
+        """Return the forces of all laws, by port, with their derivatives by unknowns.
 
-        The parameters are those of `fill_force_and_tangents`. Unknowns are numbered with the K
-        shared ones first, then those of the effects.
+        The parameters are those of `linearise_along_trajectory`. The derivatives are central
+        differences. The K shared unknowns are numbered first, then those of the effects.
         """
 
-        def at(values: FloatArray, parameters: FloatArray) -> dict[int, LawForce]:
-            return self._checked_forces(trial_index, trajectory, values, parameters, speed_window)
+        def forces_at(effect_values: FloatArray, shared_values: FloatArray) -> dict[int, LawForce]:
+            return self._checked_forces(
+                trial_index, trajectory, effect_values, shared_values, speed_window
+            )
 
-        forces = at(effect, shared)
-        slopes_by_port: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
+        forces = forces_at(effect, shared)
+        derivatives: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
         for k in range(self.effect_unknown_count):
-            above, below = (
-                at(with_step(effect, k, HALF_DIFFERENCE), shared),
-                at(with_step(effect, k, -HALF_DIFFERENCE), shared),
-            )
-            self._store_derivatives(slopes_by_port, len(shared) + k, above, below)
+            above = forces_at(with_step(effect, k, HALF_DIFFERENCE), shared)
+            below = forces_at(with_step(effect, k, -HALF_DIFFERENCE), shared)
+            self._store_derivatives(derivatives, len(shared) + k, above, below)
         for k in self.unknowns_of_model_laws:
-            above, below = (
-                at(effect, with_step(shared, k, HALF_DIFFERENCE)),
-                at(effect, with_step(shared, k, -HALF_DIFFERENCE)),
-            )
-            self._store_derivatives(slopes_by_port, k, above, below)
+            above = forces_at(effect, with_step(shared, k, HALF_DIFFERENCE))
+            below = forces_at(effect, with_step(shared, k, -HALF_DIFFERENCE))
+            self._store_derivatives(derivatives, k, above, below)
         return {
-            port: LinearisedForce(force_at_port, slopes_by_port[port])
+            port: LinearisedForce(force_at_port, derivatives[port])
             for port, force_at_port in forces.items()
         }
 
@@ -178,12 +176,12 @@ class EffectLaws:
         above: Mapping[int, LawForce],
         below: Mapping[int, LawForce],
     ) -> None:
-        """Store the derivatives of forces by an unknown in `derivatives`, unless they are zero.
+        """Store the derivatives of the forces at ports by one unknown, unless they are zero.
 
         Parameters
         ----------
         derivatives : mapping of int to dict of int to (F,) array
-            The derivatives by port and unknown, which are extended.
+            The derivatives by port and unknown, to which those of the unknown are added.
         unknown : int
             The number of the unknown.
         above, below : mapping of int to LawForce
@@ -197,16 +195,17 @@ class EffectLaws:
 
     def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
-        trial = self.column_builder.problem.trials[
-            self.column_builder.trial_indices[trial_index]
-        ].trial
+        problem = self.column_builder.problem
+        trial = problem.trials[self._index_in_problem(trial_index)].trial
         patch = ModelPatch()
         for term, term_values in self.candidate.split_by_term(effect):
             if trial.kind in term.effect.acts_on:
-                patch = patch + term.patch(
-                    self.column_builder.problem.setting, term_values
-                ).in_trial(trial.name)
+                patch = patch + term.patch(problem.setting, term_values).in_trial(trial.name)
         return patch
+
+    def _index_in_problem(self, trial_index: int) -> int:
+        """Return the index in the problem, which has static trials too, of a dynamic trial."""
+        return self.column_builder.trial_indices[trial_index]
 
     def _forces_of_patch(
         self, trial_index: int, trajectory: Trajectory, patch: ModelPatch, speed_window: float
@@ -257,26 +256,27 @@ class EffectLaws:
             The values of the effects' unknowns.
         """
         trial = self.trials[trial_index]
-        change = np.zeros_like(trial.residual)
-        slopes: dict[int, FloatArray] = {}
-        first_unknown = len(trial.shared_derivatives)
+        setting = self.column_builder.problem.setting
         motion = motion_for_columns(trajectory)
-        for term, term_values in self.candidate.split_by_term(effect):
+
+        def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
+            return self._readings_change_by_effect(trial_index, motion, term, values)
+
+        change = np.zeros_like(trial.residual)
+        derivatives: dict[int, FloatArray] = {}
+        # the unknowns of effects follow the shared ones
+        first_unknown = len(trial.shared_derivatives)
+        for term, values in self.candidate.split_by_term(effect):
+            has_law = bool(len(term.patch(setting, values).of(PortForce)))
             # an effect without a law at a port changes readings only
-            if not len(term.patch(self.column_builder.problem.setting, term_values).of(PortForce)):
-                change = change + self._readings_change_by_effect(
-                    trial_index, motion, term, term_values
-                )
-                for k in range(len(term_values)):
-                    above = self._readings_change_by_effect(
-                        trial_index, motion, term, with_step(term_values, k, HALF_DIFFERENCE)
-                    )
-                    below = self._readings_change_by_effect(
-                        trial_index, motion, term, with_step(term_values, k, -HALF_DIFFERENCE)
-                    )
-                    slopes[first_unknown + k] = (above - below) / (2.0 * HALF_DIFFERENCE)
-            first_unknown += len(term_values)
-        return LinearisedSensorErrors(change, slopes)
+            if not has_law:
+                change = change + change_by_effect(term, values)
+                for k in range(len(values)):
+                    above = change_by_effect(term, with_step(values, k, HALF_DIFFERENCE))
+                    below = change_by_effect(term, with_step(values, k, -HALF_DIFFERENCE))
+                    derivatives[first_unknown + k] = (above - below) / (2.0 * HALF_DIFFERENCE)
+            first_unknown += len(values)
+        return LinearisedSensorErrors(change, derivatives)
 
     def _readings_change_by_effect(
         self, trial_index: int, motion: TrialMotion, term: EffectTerm, values: FloatArray
@@ -296,16 +296,20 @@ class EffectLaws:
         """
         patch = term.patch(self.column_builder.problem.setting, values)
         column = self.column_builder.column_in_trial(
-            self.trials[trial_index], motion, trial_index, patch, term.effect.acts_on
+            self.trials[trial_index],
+            motion,
+            self._index_in_problem(trial_index),
+            patch,
+            term.effect.acts_on,
         )
         return column.readings
 
 
 def motion_for_columns(trajectory: Trajectory) -> TrialMotion:
-    """Return the motion that sensors measure along a trajectory, for the columns of sensor errors.
+    """Return a trajectory in the form in which `ColumnBuilder` takes the motion of a trial.
 
-    All that laws and missing forces add counts as explained here, since it is part of the
-    trajectory.
+    All that laws and missing forces add counts as explained: it is part of the trajectory, so that
+    sensors measure it.
     """
     return TrialMotion(
         added_state=trajectory.added_state,

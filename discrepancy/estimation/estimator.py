@@ -1,11 +1,11 @@
 """The joint estimate of trajectory, missing force and unknowns of a hypothesis, with its evidence.
 
-It is Gauss-Newton on the trajectory: the trials are linearised along the last trajectory, and one
-filter and one smoother give the next one, until nothing changes. This is the iterated Kalman
-smoother (Bell 1994, SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It
-begins with a large missing force, with which the trajectory follows the readings whatever the law,
-and lowers that force in steps (continuation). The innovations at the end give the evidence by
-Laplace's approximation, and the size of the missing force is that with the largest evidence.
+The estimator is Gauss-Newton's method on the trajectory: the trials are linearised along the last
+trajectory, and one filter and one smoother give the next one, until nothing changes. This is the
+iterated Kalman smoother (Bell 1994, SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson
+2020, ICASSP). It begins with a large missing force, with which the trajectory follows the readings
+whatever the law is, and lowers that force in steps (continuation). The innovations at the end give
+the evidence by Laplace's approximation. The missing force with the largest evidence is returned.
 """
 
 from collections.abc import Mapping
@@ -121,7 +121,7 @@ class HypothesisLaws(Protocol):
 
         Returns
         -------
-        mapping of int to ForceAlong or None
+        mapping of int to LawForce or None
             The forces by the number of the port; None if an effect is not possible at these values.
         """
 
@@ -344,8 +344,8 @@ class MotionEstimator:
     def _tune_processes(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
         """Return an estimate with the most probable sizes and times of its missing forces.
 
-        A pattern search with decreasing factors. In it the trials stay linear along one trajectory;
-        the result is then estimated anew, and returned if it is more probable.
+        This is a pattern search with decreasing factors, in which the trials stay linear along one
+        trajectory. The result is then estimated anew, and returned if it is more probable.
 
         Parameters
         ----------
@@ -375,14 +375,14 @@ class MotionEstimator:
                         processes, largest_evidence = changed_processes, evidence
                         break
         tuned = self._iterate(laws, replace(start, processes=processes), SPEED_WINDOWS[-1])
-        return (
-            tuned if tuned is not None and tuned.log_evidence > estimate.log_evidence else estimate
-        )
+        if tuned is None or tuned.log_evidence <= estimate.log_evidence:
+            return estimate
+        return tuned
 
     def _iterate(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> MotionEstimate | None:
-        """Return the estimate with given missing forces, by damped Gauss-Newton steps.
+        """Return the estimate under given missing forces, by damped Gauss-Newton steps.
 
         Parameters
         ----------
@@ -406,43 +406,64 @@ class MotionEstimator:
             linear = self.linearise(laws, current, speed_window)
             if linear is None:
                 return estimate
-            solution, local = linear.solve()
-            if not np.isfinite(solution.log_evidence):
+            new_estimate = self._estimate_of_linearisation(linear, current, last_evidence)
+            if new_estimate is None:
                 return estimate
-            shared_count = len(self.shared_precision)
-            unknowns = solution.mean
-            smoothed = tuple(
-                trial.smooth(np.concatenate((unknowns, local_unknowns)))
-                for trial, local_unknowns in zip(linear.trials, local, strict=True)
-            )
-            evidence = solution.log_evidence + self._log_prior(start.processes)
-            # converged if neither an unknown, in posterior deviations, nor the evidence changes
-            last_unknowns = np.concatenate((current.shared, current.effect))
-            deviations = np.sqrt(np.diag(solution.covariance))
-            largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
-            is_settled = (
-                largest_step < CONVERGED_STEP and abs(evidence - last_evidence) < CONVERGED_EVIDENCE
-            )
-            estimate = MotionEstimate(
-                effect=unknowns[shared_count:],
-                shared=unknowns[:shared_count],
-                local=tuple(local),
-                covariance=solution.covariance,
-                processes=start.processes,
-                log_evidence=evidence,
-                trials=smoothed,
-                converged=is_settled,
-            )
-            last_evidence = evidence
-            next_start = (
-                None
-                if is_settled
-                else self._take_step(laws, current, estimate, linear, speed_window)
-            )
+            estimate = new_estimate
+            if estimate.converged:
+                return estimate
+            last_evidence = estimate.log_evidence
+            next_start = self._take_step(laws, current, estimate, linear, speed_window)
             if next_start is None:
                 return estimate
             current = next_start
         return estimate
+
+    def _estimate_of_linearisation(
+        self, linear: Linearisation, start: EstimatorStart, last_evidence: float
+    ) -> MotionEstimate | None:
+        """Return the estimate of linear trials, after a whole Gauss-Newton step from a start.
+
+        Parameters
+        ----------
+        linear : Linearisation
+            The trials, linear about the start.
+        start : EstimatorStart
+            The values and trajectories about which they are linear.
+        last_evidence : float
+            The log evidence of the previous estimate [nat]. The iteration has converged if neither
+            the evidence nor an unknown changes notably.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if its evidence is not finite.
+        """
+        solution, local = linear.solve()
+        if not np.isfinite(solution.log_evidence):
+            return None
+        unknowns = solution.mean
+        smoothed = tuple(
+            trial.smooth(np.concatenate((unknowns, local_unknowns)))
+            for trial, local_unknowns in zip(linear.trials, local, strict=True)
+        )
+        evidence = solution.log_evidence + self._log_prior(start.processes)
+        # the change of each unknown in posterior standard deviations
+        last_unknowns = np.concatenate((start.shared, start.effect))
+        deviations = np.sqrt(np.diag(solution.covariance))
+        largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
+        evidence_change = abs(evidence - last_evidence)
+        shared_count = len(self.shared_precision)
+        return MotionEstimate(
+            effect=unknowns[shared_count:],
+            shared=unknowns[:shared_count],
+            local=tuple(local),
+            covariance=solution.covariance,
+            processes=start.processes,
+            log_evidence=evidence,
+            trials=smoothed,
+            converged=largest_step < CONVERGED_STEP and evidence_change < CONVERGED_EVIDENCE,
+        )
 
     def _evidence_with_processes(
         self, linear: Linearisation, processes: Mapping[int, Process]
@@ -479,24 +500,24 @@ class MotionEstimator:
             The linear trials; None if the laws are not possible in one of them.
         """
         linear_trials = []
-        for number, trial in enumerate(self.trials):
-            forces_and_sensors = laws.linearise_along_trajectory(
-                number, start.trajectories[number], start.effect, start.shared, speed_window
+        for trial_index, trial in enumerate(self.trials):
+            trajectory = start.trajectories[trial_index]
+            forces_and_sensor_errors = laws.linearise_along_trajectory(
+                trial_index, trajectory, start.effect, start.shared, speed_window
             )
-            if forces_and_sensors is None:
+            if forces_and_sensor_errors is None:
                 return None
-            forces, sensors = forces_and_sensors
-            linear_trials.append(
-                LinearisedTrial(
-                    trial,
-                    start.processes,
-                    start.trajectories[number],
-                    forces,
-                    sensors,
-                    start.effect,
-                    start.shared,
-                )
+            forces, sensor_errors = forces_and_sensor_errors
+            linear_trial = LinearisedTrial(
+                trial=trial,
+                processes=start.processes,
+                trajectory=trajectory,
+                forces=forces,
+                sensor_errors=sensor_errors,
+                effect=start.effect,
+                shared=start.shared,
             )
+            linear_trials.append(linear_trial)
         # the unknowns of effects have standard normal priors, of precision one
         precision = np.concatenate((self.shared_precision, np.ones(laws.effect_unknown_count)))
         return Linearisation(tuple(linear_trials), precision)
@@ -509,12 +530,12 @@ class MotionEstimator:
         linear: Linearisation,
         speed_window: float,
     ) -> EstimatorStart | None:
-        """Return the start of the next iteration: the longest admissible fraction of a step.
+        """Return the start of the next iteration, after the longest admissible fraction of a step.
 
-        The linear laws differ from the true ones at the end of a step. That difference acts like a
-        further missing force, which the smoother does not know. The rms difference must not be
-        larger than the standard deviation of the missing force. If no fraction of `STEP_FRACTIONS`
-        satisfies this, the smallest one at which the laws are possible is taken.
+        At the end of a step the linear laws differ from the true ones. This difference acts like a
+        further missing force, which is not part of the smoother's model. A fraction is admissible
+        if the rms difference is at most the standard deviation of the missing force. If no fraction
+        of `STEP_FRACTIONS` is, the smallest one at which the laws are possible is taken.
 
         Parameters
         ----------
@@ -523,7 +544,7 @@ class MotionEstimator:
         current : EstimatorStart
             The values and trajectories before the step.
         estimate : MotionEstimate
-            Those at the end of the whole step.
+            The values and trajectories at the end of the whole step.
         linear : Linearisation
             The trials, linear about `current`.
         speed_window : float
@@ -541,16 +562,15 @@ class MotionEstimator:
         next_start: EstimatorStart | None = None
         for fraction in STEP_FRACTIONS:
             fraction_taken = min(fraction, largest_fraction)
+            trajectories = tuple(
+                trajectory.interpolate(smoothed.trajectory, fraction_taken)
+                for trajectory, smoothed in zip(current.trajectories, estimate.trials, strict=True)
+            )
             stepped = EstimatorStart(
-                current.effect + fraction_taken * change,
-                current.shared + fraction_taken * (estimate.shared - current.shared),
-                tuple(
-                    trajectory.interpolate(smoothed.trajectory, fraction_taken)
-                    for trajectory, smoothed in zip(
-                        current.trajectories, estimate.trials, strict=True
-                    )
-                ),
-                current.processes,
+                effect=current.effect + fraction_taken * change,
+                shared=current.shared + fraction_taken * (estimate.shared - current.shared),
+                trajectories=trajectories,
+                processes=current.processes,
             )
             error = self._linearisation_error(laws, current, stepped, linear, speed_window)
             if error is None:
@@ -568,7 +588,7 @@ class MotionEstimator:
         linear: Linearisation,
         speed_window: float,
     ) -> float | None:
-        """Return the largest rms error of the linear laws, over the deviation of the missing force.
+        """Return the rms error of the linear laws after a step, over the missing force's deviation.
 
         Parameters
         ----------
@@ -587,35 +607,27 @@ class MotionEstimator:
             The largest ratio of all trials and ports; None if the laws are not possible after the
             step.
         """
+        unknowns_change = np.concatenate(
+            (stepped.shared - current.shared, stepped.effect - current.effect)
+        )
+        largest_deviation = max(
+            process.standard_deviation for process in stepped.processes.values()
+        )
         largest_ratio = 0.0
-        for number, trial in enumerate(linear.trials):
-            forces_after = laws.forces_along_trajectory(
-                number, stepped.trajectories[number], stepped.effect, stepped.shared, speed_window
+        for trial_index, trial in enumerate(linear.trials):
+            trajectory = stepped.trajectories[trial_index]
+            true_forces = laws.forces_along_trajectory(
+                trial_index, trajectory, stepped.effect, stepped.shared, speed_window
             )
-            if forces_after is None:
+            if true_forces is None:
                 return None
-            unknowns_change = np.concatenate(
-                (stepped.shared - current.shared, stepped.effect - current.effect)
-            )
-            for port, forces in trial.forces.items():
-                position_change = (
-                    stepped.trajectories[number].positions[:, port]
-                    - trial.trajectory.positions[:, port]
+            for port, linearised_force in trial.forces.items():
+                linear_force = linearised_force.extrapolate(
+                    trajectory.positions[:, port] - trial.trajectory.positions[:, port],
+                    trajectory.speeds[:, port] - trial.trajectory.speeds[:, port],
+                    unknowns_change,
                 )
-                speed_change = (
-                    stepped.trajectories[number].speeds[:, port] - trial.trajectory.speeds[:, port]
-                )
-                # the force that the linear law has after the step
-                linear_force = (
-                    forces.law_force.force + forces.law_force.by_position * position_change
-                )
-                linear_force = linear_force + forces.law_force.by_speed * speed_change
-                for unknown, slope in forces.by_unknown.items():
-                    linear_force = linear_force + unknowns_change[unknown] * slope
-                error = float(np.sqrt(np.mean((forces_after[port].force - linear_force) ** 2)))
-                largest_deviation = max(
-                    process.standard_deviation for process in stepped.processes.values()
-                )
+                error = float(np.sqrt(np.mean((true_forces[port].force - linear_force) ** 2)))
                 largest_ratio = max(largest_ratio, error / largest_deviation)
         return largest_ratio
 

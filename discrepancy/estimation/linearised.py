@@ -8,8 +8,8 @@ w, it obeys
     reading = r(w) + C(w) s - sum_p e_p (G_p(x, v; w) + f_p) + noise.
 
 Here x and v are the position and the speed of port p, and r is the reading of the linear model. All
-of it is linearised along a trajectory. A weight is a factor of the linear model: the first weight
-is one and stands for what is known, the others are the unknowns.
+of it is linearised along a trajectory. A weight is a factor of a column of the linear model: the
+first weight is one, that of the constant part, and the others are the unknowns.
 """
 
 from collections.abc import Mapping
@@ -79,6 +79,25 @@ class LinearisedForce:
     law_force: LawForce
     by_unknown: Mapping[int, FloatArray]
 
+    def extrapolate(
+        self, position_change: FloatArray, speed_change: FloatArray, unknowns_change: FloatArray
+    ) -> FloatArray:
+        """Return the force (F,) that the linear laws have after a change of motion and unknowns.
+
+        Parameters
+        ----------
+        position_change, speed_change : (F,) array
+            The change of the motion of the port [m or rad, and per s].
+        unknowns_change : (K + E,) array
+            The change of the shared unknowns, then of those of effects.
+        """
+        law = self.law_force
+        force = law.force + law.by_position * position_change
+        force = force + law.by_speed * speed_change
+        for unknown, derivative in self.by_unknown.items():
+            force = force + unknowns_change[unknown] * derivative
+        return force
+
 
 @dataclass(frozen=True, eq=False)
 class LinearisedSensorErrors:
@@ -100,16 +119,16 @@ class LinearisedSensorErrors:
 class LinearisedTrial:
     """A trial, linear along a trajectory.
 
-    The unknowns are the K shared ones, the E of the hypothesis' effects, and the trial's own, in
-    this order. Shapes: F fine stamps, N samples, C channels, n states, W weights (one and all
-    unknowns), L ports with a law of the hypothesis.
+    The unknowns are the K shared ones, the E ones of the hypothesis' effects, and those of the
+    trial alone, in this order. Shapes: F fine stamps, N samples, C channels, n states, W weights
+    (one, then all unknowns), L ports with a law of the hypothesis.
 
     Attributes
     ----------
     trial : PortedTrial
-        The readings minus the linear model, and how ports move.
+        The trial with its residuals, its linear system, and the motion of its ports.
     processes : mapping of int to Process
-        Missing forces, by the numbers of their ports.
+        The missing forces, by the number of the port.
     trajectory : Trajectory
         The trajectory along which it is linear.
     forces : mapping of int to LinearisedForce
@@ -119,7 +138,7 @@ class LinearisedTrial:
     effect : (E,) ndarray
         The values of the effects' unknowns at which laws and sensors are linearised.
     shared : (K,) ndarray
-        The values of the shared unknowns there.
+        The values of the shared unknowns at which they are linearised.
     """
 
     trial: PortedTrial
@@ -138,13 +157,13 @@ class LinearisedTrial:
         return ForceFilter(self.trial, tuple(self.processes.items()))
 
     @property
-    def structural_states(self) -> int:
-        """The number of states of the structure; missing forces and coloured noises follow them."""
-        return len(self.trial.system.generator)
+    def structure(self) -> slice:
+        """The states of the structure; those of missing forces and coloured noises follow them."""
+        return slice(0, len(self.trial.system.generator))
 
     @property
     def weight_count(self) -> int:
-        """The number W of weights: one for what is known, and one for each unknown."""
+        """The number W of weights: the first is one, the others are the unknowns."""
         return 1 + len(self.shared) + len(self.effect) + len(self.trial.local_derivatives)
 
     def weight_index(self, unknown: int) -> int:
@@ -168,53 +187,51 @@ class LinearisedTrial:
 
     @cached_property
     def force_by_state(self) -> FloatArray:
-        """The derivatives (F, L, n) of the laws' force at their ports by the scaled state."""
-        generator, _, _, _ = self.force_filter.state_space
-        tangents = np.zeros((len(self.trial.fine_time), len(self.law_ports), len(generator)))
+        """The derivatives (F, L, n) of the laws' force at each port by the scaled state."""
+        state_count = len(self.force_filter.state_space.generator)
+        derivatives = np.zeros((len(self.trial.fine_time), len(self.law_ports), state_count))
         system = self.trial.system
         units = self.force_filter.state_units
         for row, port in enumerate(self.law_ports):
             law = self.forces[port].law_force
-            tangents[:, row, : self.structural_states] = (
+            derivatives[:, row, self.structure] = (
                 law.by_position[:, None] * system.positions[port] * units
                 + law.by_speed[:, None] * system.speeds[port] * units
             )
-        return tangents
+        return derivatives
 
     @cached_property
     def force_by_weight(self) -> FloatArray:
-        """The laws' force (F, L, W) at their ports at state zero, for a unit of each weight.
+        """The laws' force (F, L, W) at each port at state zero, for a unit of each weight.
 
         The whole force of the laws is `force_by_weight` times the weights plus `force_by_state`
         times the state.
         """
         trial = self.trial
         trajectory = self.trajectory
-        pushes = np.zeros((len(trial.fine_time), len(self.law_ports), self.weight_count))
+        force = np.zeros((len(trial.fine_time), len(self.law_ports), self.weight_count))
         for row, port in enumerate(self.law_ports):
             law = self.forces[port].law_force
             # motion at state zero and zero unknowns, minus that of the trajectory
             position_offset = trial.port_positions[:, port] - trajectory.positions[:, port]
             speed_offset = trial.port_speeds[:, port] - trajectory.speeds[:, port]
-            for unknown, (position_slopes, speed_slopes) in trial.port_motion_derivatives.items():
-                position_offset = (
-                    position_offset - trial.linearisation_point[unknown] * position_slopes[:, port]
+            # unknowns that move the ports in the model's response
+            for unknown, (positions, speeds) in trial.port_motion_derivatives.items():
+                value = trial.linearisation_point[unknown]
+                position_offset = position_offset - value * positions[:, port]
+                speed_offset = speed_offset - value * speeds[:, port]
+                force[:, row, self.weight_index(unknown)] += (
+                    law.by_position * positions[:, port] + law.by_speed * speeds[:, port]
                 )
-                speed_offset = (
-                    speed_offset - trial.linearisation_point[unknown] * speed_slopes[:, port]
-                )
-                pushes[:, row, self.weight_index(unknown)] += (
-                    law.by_position * position_slopes[:, port]
-                    + law.by_speed * speed_slopes[:, port]
-                )
-            pushes[:, row, 0] = (
+            # the first weight: the force at zero unknowns
+            force[:, row, 0] = (
                 law.force + law.by_position * position_offset + law.by_speed * speed_offset
             )
-            for unknown, slope in self.forces[port].by_unknown.items():
-                pushes[:, row, 1 + unknown] += slope
-                # refer the known force from the present value of the unknown to zero
-                pushes[:, row, 0] -= self._value_of_unknown(unknown) * slope
-        return pushes
+            # unknowns that change the laws; the law's force is that at their present values
+            for unknown, derivative in self.forces[port].by_unknown.items():
+                force[:, row, 1 + unknown] += derivative
+                force[:, row, 0] -= self._value_of_unknown(unknown) * derivative
+        return force
 
     def _value_of_unknown(self, unknown: int) -> float:
         """Return the value of an unknown, shared or of an effect, about which laws are linear."""
@@ -222,36 +239,40 @@ class LinearisedTrial:
 
     @cached_property
     def state_rate_by_force(self) -> FloatArray:
-        """The rate (n, L) of the scaled state for a unit force at each of the laws' ports."""
-        generator, _, _, _ = self.force_filter.state_space
-        directions = np.zeros((len(generator), len(self.law_ports)))
+        """The rate (n, L) of the scaled state by a unit force at each port with a law."""
+        state_count = len(self.force_filter.state_space.generator)
+        rates = np.zeros((state_count, len(self.law_ports)))
+        # a force acts against the motion: s' = A s - b force, see `PortedSystem`
         for row, port in enumerate(self.law_ports):
-            directions[: self.structural_states, row] = (
+            rates[self.structure, row] = (
                 -self.trial.system.actions[port] / self.force_filter.state_units
             )
-        return directions
+        return rates
 
     # ------------------------------------------------------------ steps
 
     def _substep_matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return transitions, process noises and drifts of all fine steps, with the laws in them.
+        """Return transitions, process noises and drifts of all substeps, with the laws in them.
 
         Returns
         -------
-        transition, noise : (F - 1, n, n) array
-            The transition of each fine step, and the covariance of its process noise.
-        drift : (F - 1, n, W) array
-            The state that each weight adds in a fine step.
+        transitions, noises : (F - 1, n, n) array
+            The transition of each substep, and the covariance of its process noise.
+        drifts : (F - 1, n, W) array
+            The state that a unit of each weight adds in each substep.
         """
-        generator, intensity, _, _ = self.force_filter.state_space
+        state_space = self.force_filter.state_space
         lengths, interval_of_sample = self.trial.intervals
-        fine_lengths = lengths / self.trial.substeps
-        free_transition, free_noise = discretise(generator, intensity, fine_lengths)
-        by_input_at_begin, by_input_at_end = input_matrices(generator, fine_lengths)
-        drift = self._drift_by_system_parameters(
+        substep_lengths = lengths / self.trial.substeps
+        free_transition, free_noise = discretise(
+            state_space.generator, state_space.intensity, substep_lengths
+        )
+        by_input_at_begin, by_input_at_end = input_matrices(state_space.generator, substep_lengths)
+        drifts = self._drift_by_system_parameters(
             by_input_at_begin, by_input_at_end, interval_of_sample
         )
-        transition, noise = substep_matrices_with_laws(
+        # adds the drift by the laws
+        transitions, noises = substep_matrices_with_laws(
             self.trial.substeps,
             interval_of_sample,
             free_transition,
@@ -260,9 +281,9 @@ class LinearisedTrial:
             np.ascontiguousarray(by_input_at_end @ self.state_rate_by_force),
             self.force_by_state,
             self.force_by_weight,
-            drift,
+            drifts,
         )
-        return transition, noise, drift
+        return transitions, noises, drifts
 
     def _drift_by_system_parameters(
         self,
@@ -275,32 +296,33 @@ class LinearisedTrial:
         Parameters
         ----------
         by_input_at_begin, by_input_at_end : (K, n, n) array
-            The change of the state over a fine step for a unit input at its start, or at its end,
-            by the kind of step.
+            The change of the state over a substep for a unit input at its start, or at its end,
+            for each of the K lengths of intervals.
         interval_of_sample : (N,) array of int
-            The kind of step that leads to each sample; steps of one kind have one length.
+            The index of the length of the interval that ends at each sample.
         """
         trial = self.trial
-        structural_states = self.structural_states
+        structure = self.structure
         step_count = len(trial.fine_time) - 1
         drift = np.zeros((step_count, len(by_input_at_begin[0]), self.weight_count))
         interval_of_substep = interval_of_sample[np.arange(step_count) // trial.substeps + 1]
-        for unknown, slope in enumerate(trial.system_derivatives):
-            if slope is None:
+        for unknown, derivative in enumerate(trial.system_derivatives):
+            if derivative is None:
                 continue
             # derivative of A s - sum_p b_p force_p by the parameter, along the trajectory
-            rate_change = self.trajectory.added_state @ slope.generator.T
+            rate_change = self.trajectory.added_state @ derivative.generator.T
             for port, force in self.trajectory.forces.items():
-                rate_change = rate_change - np.outer(force, slope.actions[port])
+                rate_change = rate_change - np.outer(force, derivative.actions[port])
             rate_change = rate_change / self.force_filter.state_units
+            # over each substep j: matrix (a, b) of the scaled states times rate (b,)
             state_change = np.einsum(
                 "jab,jb->ja",
-                by_input_at_begin[interval_of_substep, :, :structural_states],
+                by_input_at_begin[interval_of_substep, :, structure],
                 rate_change[:-1],
             )
             state_change += np.einsum(
                 "jab,jb->ja",
-                by_input_at_end[interval_of_substep, :, :structural_states],
+                by_input_at_end[interval_of_substep, :, structure],
                 rate_change[1:],
             )
             drift[:, :, 1 + unknown] += state_change
@@ -312,36 +334,36 @@ class LinearisedTrial:
 
         The mean has one column for each weight.
         """
-        generator, _, _, covariance = self.force_filter.state_space
+        generator = self.force_filter.state_space.generator
+        covariance = self.force_filter.state_space.initial_covariance
         mean = np.zeros((len(generator), self.weight_count))
         if not self.trial.begins_at_rest:
             return covariance, mean
-        # At rest s' = 0 under the laws and the missing forces f, whose first values are not known:
-        # (A + directions tangents) s + directions pushes + (column of A for f) f = 0
-        structural_states = self.structural_states
-        state_rate_by_force = self.state_rate_by_force[:structural_states]
+        # At rest s' = 0 under the laws and the missing forces f, whose first values are not known.
+        # With the rates B by the laws' forces T s + u:  (A + B T) s + B u + (column of A for f) f =
+        # 0
+        structure = self.structure
+        state_rate_by_force = self.state_rate_by_force[structure]
         rate_matrix = (
-            generator[:structural_states, :structural_states]
-            + state_rate_by_force @ self.force_by_state[0][:, :structural_states]
+            generator[structure, structure]
+            + state_rate_by_force @ self.force_by_state[0][:, structure]
         )
-        mean[:structural_states] = np.linalg.lstsq(
+        mean[structure] = np.linalg.lstsq(
             rate_matrix, -state_rate_by_force @ self.force_by_weight[0], rcond=1e-12
         )[0]
         covariance = covariance.copy()
-        covariance[:structural_states, :structural_states] = 0.0
+        covariance[structure, structure] = 0.0
         for index in self.force_filter.force_state_indices:
-            at_rest = np.linalg.lstsq(
-                rate_matrix, -generator[:structural_states, index], rcond=1e-12
-            )[0]
-            covariance[:structural_states, :structural_states] += np.outer(at_rest, at_rest)
-            covariance[:structural_states, index] = at_rest
-            covariance[index, :structural_states] = at_rest
+            at_rest = np.linalg.lstsq(rate_matrix, -generator[structure, index], rcond=1e-12)[0]
+            covariance[structure, structure] += np.outer(at_rest, at_rest)
+            covariance[structure, index] = at_rest
+            covariance[index, structure] = at_rest
         return covariance, mean
 
     # ------------------------------------------------------------ readings
 
     def _observations(self) -> tuple[FloatArray, FloatArray]:
-        """Return the readings as rows on the state and columns of the weights.
+        """Return the readings by the state, and the residuals by the weights.
 
         Returns
         -------
@@ -356,13 +378,12 @@ class LinearisedTrial:
         trial = self.trial
         substeps = trial.substeps
         samples, channels = trial.residual.shape
-        _, _, state_rows, _ = self.force_filter.state_space
-        rows = np.repeat(state_rows[None], samples, axis=0)
+        rows = np.repeat(self.force_filter.state_space.output_rows[None], samples, axis=0)
         columns = np.zeros((samples, channels, self.weight_count))
         columns[:, :, 0] = trial.residual - self.sensor_errors.change
-        for unknown, slope in self.sensor_errors.by_unknown.items():
-            columns[:, :, 1 + unknown] -= slope
-            columns[:, :, 0] += self._value_of_unknown(unknown) * slope
+        for unknown, derivative in self.sensor_errors.by_unknown.items():
+            columns[:, :, 1 + unknown] -= derivative
+            columns[:, :, 0] += self._value_of_unknown(unknown) * derivative
         derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
         for unknown, derivative in enumerate(derivatives):
             columns[:, :, self.weight_index(unknown)] -= derivative
@@ -382,18 +403,18 @@ class LinearisedTrial:
         return np.ascontiguousarray(rows), columns * trial.used[:, :, None]
 
     def _readings_by_shared_unknowns(self) -> dict[int, FloatArray]:
-        """Return the derivatives (N, C) of readings by shared unknowns, along the trajectory.
+        """Return the derivatives (N, C) of the readings by shared unknowns at a fixed added state.
 
-        They are the changes of the output equation, divided by the noise: by parameters that change
-        the system, and by gains of channels.
+        They are divided by the noise. The shared unknowns are parameters that change the output
+        equation, and gains of channels.
         """
         trial = self.trial
         trajectory = self.trajectory
         derivatives: dict[int, FloatArray] = {}
-        for unknown, slope in enumerate(trial.system_derivatives):
-            if slope is not None:
+        for unknown, derivative in enumerate(trial.system_derivatives):
+            if derivative is not None:
                 derivatives[unknown] = trial.divide_by_noise(
-                    trial.outputs_of_state(slope, trajectory.added_state, trajectory.forces)
+                    trial.outputs_of_state(derivative, trajectory.added_state, trajectory.forces)
                 )
         added_readings = trial.readings_of_state(trajectory.added_state, trajectory.forces)
         for unknown, channel, scale in trial.gain_unknowns:
@@ -405,37 +426,45 @@ class LinearisedTrial:
     @cached_property
     def filtered_record(self) -> "FilteredRecord":
         """The results of one pass of the Kalman filter."""
-        transition, noise, drift = self._substep_matrices()
-        rows, columns = self._observations()
+        transitions, noises, drifts = self._substep_matrices()
+        output_rows, columns = self._observations()
         covariance, mean = self._initial_state()
         means, covariances, innovations, gains, variances = filter_record(
             self.trial.substeps,
-            transition,
-            noise,
-            drift,
-            rows,
+            transitions,
+            noises,
+            drifts,
+            output_rows,
             columns,
             self.trial.used,
             covariance,
             mean,
         )
-        return FilteredRecord(transition, rows, means, covariances, innovations, gains, variances)
+        return FilteredRecord(
+            transitions=transitions,
+            output_rows=output_rows,
+            means=means,
+            covariances=covariances,
+            innovations=innovations,
+            gains=gains,
+            variances=variances,
+        )
 
     @cached_property
     def whitened_products(self) -> tuple[FloatArray, float]:
-        """The products (W, W) of whitened residual and derivatives, and half a log determinant.
+        """The inner products (W, W) of the whitened columns, and half a log determinant [nat].
 
-        The second is half the sum of the logarithms of the readings' variances, each given those
-        before it [nat].
+        The columns are the residual and its derivatives by the unknowns. The determinant is that of
+        the covariance of the readings: the product of their variances, each given those before it.
         """
         record = self.filtered_record
         whitened = record.innovations / np.sqrt(record.variances)[:, :, None]
         whitened = whitened.reshape(-1, self.weight_count)
-        # from minus the derivatives of the readings to the derivatives
+        # `_observations` has minus the derivatives of the readings: change the sign
         whitened[:, 1:] *= -1.0
         used = self.trial.used
         half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[used]))
-        # readings were multiplied by `white`, and their deviations with them
+        # readings were multiplied by `white_noise_scale`, and their deviations with them
         half_log_determinant -= float(np.sum(np.log(self.force_filter.white_noise_scale) * used))
         return whitened.T @ whitened, half_log_determinant
 
@@ -447,7 +476,8 @@ class LinearisedTrial:
         unknowns : (W - 1,) ndarray
             The values of all unknowns.
         """
-        record, trial = self.filtered_record, self.trial
+        trial = self.trial
+        record = self.filtered_record
         weights = np.concatenate(([1.0], unknowns))
         states, variance = smooth_record(
             trial.substeps,
@@ -460,7 +490,9 @@ class LinearisedTrial:
             record.gains,
             record.variances,
         )
-        added_state = states[:, : self.structural_states] * self.force_filter.state_units
+        # the states of the structure and of the missing forces, in their units
+        added_state = states[:, self.structure] * self.force_filter.state_units
+        state_deviation = np.sqrt(variance[:, self.structure]) * self.force_filter.state_units
         missing_forces: dict[int, FloatArray] = {}
         deviations: dict[int, FloatArray] = {}
         for (port, process), index in zip(
@@ -468,27 +500,44 @@ class LinearisedTrial:
         ):
             missing_forces[port] = states[:, index] * process.standard_deviation
             deviations[port] = np.sqrt(variance[:, index]) * process.standard_deviation
-        forces = dict(missing_forces)
+        # forces of the laws, at each fine stamp f by the states n there
         law_forces: dict[int, FloatArray] = {}
+        forces = dict(missing_forces)
         for row, port in enumerate(self.law_ports):
-            law_force = self.force_by_weight[:, row] @ weights + np.einsum(
-                "fn,fn->f", self.force_by_state[:, row], states
-            )
-            law_forces[port] = law_force
-            forces[port] = forces.get(port, 0.0) + law_force
+            force_by_states = np.einsum("fn,fn->f", self.force_by_state[:, row], states)
+            law_forces[port] = self.force_by_weight[:, row] @ weights + force_by_states
+            forces[port] = forces.get(port, 0.0) + law_forces[port]
+        # motion of the ports
         shared = unknowns[: len(self.shared)]
         local = unknowns[len(self.shared) + len(self.effect) :]
         positions, speeds = trial.port_motion(np.concatenate((shared, local)), added_state)
         trajectory = Trajectory(added_state, positions, speeds, forces)
-        state_deviation = (
-            np.sqrt(variance[:, : self.structural_states]) * self.force_filter.state_units
+        return SmoothedTrial(
+            trajectory=trajectory,
+            missing_forces=missing_forces,
+            law_forces=law_forces,
+            missing_force_deviations=deviations,
+            state_deviation=state_deviation,
         )
-        return SmoothedTrial(trajectory, missing_forces, law_forces, deviations, state_deviation)
 
 
 @dataclass(frozen=True, eq=False)
 class FilteredRecord:
-    """The results of one pass of the filter over a trial; shapes as in `kernel.filter_record`."""
+    """The results of one pass of the filter over a trial.
+
+    Attributes
+    ----------
+    transitions : (F - 1, n, n) ndarray
+        The transition of each substep.
+    output_rows : (N, C, n) ndarray
+        The readings for a unit of each state.
+    means, covariances : (F, n, W), (F, n, n) ndarray
+        The predicted state at each fine stamp; its mean is that for a unit of each weight.
+    innovations : (N, C, W) ndarray
+        The readings minus their predictions, for a unit of each weight.
+    gains, variances : (N, C, n), (N, C) ndarray
+        The gain of each reading, and the variance of its innovation.
+    """
 
     transitions: FloatArray
     output_rows: FloatArray
@@ -508,9 +557,9 @@ class SmoothedTrial:
     trajectory : Trajectory
         The smoothed motion, and all forces at ports.
     missing_forces : mapping of int to (F,) ndarray
-        The force at each port that no law explains, by the number of the port [N or N m].
+        The missing force at each port, which no law explains, by the number of the port [N or N m].
     law_forces : mapping of int to (F,) ndarray
-        The force of the laws at each port, linear about the trajectory before.
+        The force of the laws at each port, linear about the previous trajectory.
     missing_force_deviations : mapping of int to (F,) ndarray
         The posterior standard deviation of `missing_forces`.
     state_deviation : (F, n) ndarray

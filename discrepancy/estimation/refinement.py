@@ -15,16 +15,17 @@ from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.filtered import Solution
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
-from discrepancy.missing_force.view import TrialMotion
+from discrepancy.missing_force.view import PortDeviations, TrialMotion
 
 from .effects import HALF_DIFFERENCE, EffectLaws
 from .estimator import EstimatorStart, MotionEstimate, MotionEstimator
 from .linearised import SmoothedTrial, Trajectory
 
 MOST_REFINED = 4
-"""Largest number of hypotheses that are estimated, the most probable first."""
+"""Largest number of hypotheses that are estimated together with the motion, the most probable
+first."""
 REFINED_WITHIN = 60.0
-"""Log probability below the best hypothesis from which on none is estimated [nat]."""
+"""Difference to the best score above which no hypothesis is estimated with the motion [nat]."""
 
 
 def refine_hypotheses(
@@ -35,7 +36,7 @@ def refine_hypotheses(
 ) -> list[ForceHypothesis]:
     """Return hypotheses, the most probable first, the best ones estimated with the motion.
 
-    The search follows a law along a motion that is taken as known. That gives wrong values for a
+    The search evaluates a law along a motion that is taken as known. That gives wrong values for a
     law that changes much within a time step, such as dry friction at a reversal of the motion; a
     free exponent then explains more than the true law. A hypothesis is replaced by its estimate
     only if the estimate is more probable.
@@ -47,7 +48,7 @@ def refine_hypotheses(
     ranked : sequence of ForceHypothesis
         The hypotheses, the most probable first.
     effect_count : int
-        The number of effects that were compared, for the prior of a hypothesis.
+        The number of effects that were compared, by which the prior of each is smaller.
     on_progress : callable
         The function that takes a line on what is estimated.
     """
@@ -81,7 +82,7 @@ def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> For
     search : ForceSearch
         The search for the missing force.
     hypothesis : ForceHypothesis
-        The result of the search for this hypothesis, from which the estimate begins.
+        The hypothesis as the search has fitted it, with which the estimate begins.
 
     Returns
     -------
@@ -190,8 +191,10 @@ def _trial_motion(trial: PortedTrial, smoothed: SmoothedTrial) -> TrialMotion:
         state_by_missing_force = state_by_missing_force + trial.state_under_force(port, force)
     deviations = {}
     for port, deviation in smoothed.missing_force_deviations.items():
-        at_samples = deviation[:: trial.substeps]
-        deviations[port] = (at_samples, _speed_deviation(trial, port, smoothed.state_deviation))
+        deviations[port] = PortDeviations(
+            force=deviation[:: trial.substeps],
+            speed=_speed_deviation(trial, port, smoothed.state_deviation),
+        )
     return TrialMotion(
         added_state=trajectory.added_state,
         forces=trajectory.forces,

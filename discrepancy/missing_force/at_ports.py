@@ -68,7 +68,7 @@ class MissingForces:
         linear_trials = self._linearise_trials()
         for port, name in enumerate(self.ports):
             last_processes = self.hypothesis_by_port[name].processes
-            _, _, motions = linear_trials.smooth(last_processes)
+            motions = linear_trials.smooth(last_processes).motions
             along_motion = self.column_builder.trials_along_motions(linear_trials, motions)
             median = self.prior_processes((port,))
             self.hypothesis_by_port[name] = fit_missing_forces(along_motion, median, last_processes)
@@ -161,7 +161,7 @@ class MissingForces:
             linear_trials = self._linearise_trials()
             # the model's own laws and the motion depend on each other: twice
             for _ in range(2):
-                _, _, motions = linear_trials.smooth(hypothesis.processes)
+                motions = linear_trials.smooth(hypothesis.processes).motions
                 linear_trials = self.column_builder.trials_along_motions(linear_trials, motions)
             initial = {}
             for number, process in hypothesis.processes.items():

@@ -1,7 +1,7 @@
-"""Backward passes over a record: what later readings say of the state at a moment.
+"""Backward passes over a record: the information on a state from later readings.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
-derivatives by unknowns), S different steps, B places. A place is a sample whose state is asked for.
+derivatives by unknowns), S different steps, B queried samples (samples whose state is asked for).
 Readings are divided by the deviation of the white part of their noise.
 """
 
@@ -23,7 +23,7 @@ def smoother_corrections(
     gains: FloatArray,
     variances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return, for each sample, the vector and matrix by which later readings correct its state.
+    """Return the vector and matrix by which later readings correct the state at each sample.
 
     This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
     1085-1088), which inverts no covariance. In his letters the addition is r, the information N,
@@ -115,7 +115,7 @@ def filter_backward(
     -------
     J, h, c, half : (B, n, n), (B, n, W), (B, W, W), (B,) ndarray
         The information matrix, the information vectors of the columns, the products of the columns,
-        and half a log determinant. All are zero for a place N, after which there are no readings.
+        and half a log determinant. All are zero for the queried sample N, after the last reading.
     """
     sample_count = len(step_of_sample)
     n = output_rows.shape[1]
@@ -151,7 +151,7 @@ def filter_backward(
             for channel in range(len(output_rows)):
                 if used[k, channel]:
                     J_with_readings += np.outer(output_rows[channel], output_rows[channel])
-        # store the results at a place
+        # store the results at a queried sample
         if query >= 0 and query_samples[query] == k:
             all_J[query] = J_with_readings
             all_h[query] = h

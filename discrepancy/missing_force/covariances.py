@@ -6,7 +6,8 @@ from discrepancy.campaign.records import FloatArray
 from fe.compilation import callable_when_compiled
 
 STEADY = 1e-9
-"""Largest change of a converged covariance, divided by the standard deviations of its entries."""
+"""Largest change of an entry of a converged covariance, over the standard deviations of its row and
+column."""
 
 
 @callable_when_compiled

@@ -166,14 +166,14 @@ def fit_missing_forces(
     processes, log_evidence = linear_trials.most_probable_processes(
         median, initial, skip_grid=skip_grid, most_steps=most_steps
     )
-    solution, local, motions = linear_trials.smooth(processes)
+    smoothed = linear_trials.smooth(processes)
     return ForceHypothesis(
         candidate=candidate,
         effect=effect,
         processes=processes,
         log_evidence=log_evidence,
         linear_trials=linear_trials,
-        solution=solution,
-        local=local,
-        motions=motions,
+        solution=smoothed.solution,
+        local=smoothed.local,
+        motions=smoothed.motions,
     )

@@ -95,14 +95,15 @@ class SmoothedForces(NamedTuple):
         The state that the missing forces add to the response of the model.
     forces : (P, F) ndarray
         The missing forces [N, N m or the port's flow].
-    deviations : (2 P, N) ndarray
-        The posterior standard deviations at the samples: of the forces, then of the speeds of their
+    force_deviations, speed_deviations : (P, N) ndarray
+        The posterior standard deviations, at the samples, of the forces and of the speeds of their
         ports.
     """
 
     added_state: FloatArray
     forces: FloatArray
-    deviations: FloatArray
+    force_deviations: FloatArray
+    speed_deviations: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,10 +123,10 @@ class ForceFilter:
 
     @cached_property
     def state_units(self) -> FloatArray:
-        """The unit (n,) of each state of the system, by which the state is divided.
+        """The unit (n,) by which each state of the structure is divided, so that it is near one.
 
-        A force of `size` at the highest natural frequency moves a speed by (force / frequency) and
-        a position by that over the frequency, so that scaled states are about of size one.
+        A missing force of one standard deviation at the highest natural frequency moves a speed by
+        the rate that it causes over that frequency, and a position by the speed over the frequency.
         """
         system = self.trial.system
         state_count = len(system.generator)
@@ -146,9 +147,9 @@ class ForceFilter:
 
     @cached_property
     def force_state_indices(self) -> list[int]:
-        """The index of each missing force in the whole state.
+        """The index of each missing force in the state.
 
-        A force that may not jump has a second state, which follows it.
+        A force that may not jump has a second state, its scaled rate, which follows it.
         """
         state_counts = [len(process.generator) for _, process in self.processes]
         first_force_state = len(self.trial.system.generator)
@@ -164,62 +165,98 @@ class ForceFilter:
         in deviations of the whole noise: this is the factor between both.
         """
         ratios = np.ones(len(self.trial.deviation))
-        for channel, coloured_share, _ in self.trial.coloured_noises:
-            ratios[channel] = 1.0 / np.sqrt(1.0 - coloured_share)
+        for noise in self.trial.coloured_noises:
+            ratios[noise.channel] = 1.0 / np.sqrt(1.0 - noise.share)
         return ratios
 
     @cached_property
     def state_space(self) -> ForceStateSpace:
-        """The state space: states of the system, missing forces, coloured noises, in this order."""
+        """The state space with the states of the structure, missing forces, and coloured noises."""
         trial = self.trial
-        system_states = slice(0, len(trial.system.generator))
-        first_noise_state = system_states.stop + sum(
-            len(process.generator) for _, process in self.processes
-        )
+        force_state_count = sum(len(process.generator) for _, process in self.processes)
+        first_noise_state = len(trial.system.generator) + force_state_count
         state_count = first_noise_state + len(trial.coloured_noises)
-        generator = np.zeros((state_count, state_count))
-        intensity = np.zeros((state_count, state_count))
-        start_covariance = np.zeros((state_count, state_count))
-        output_rows = np.zeros((len(trial.deviation), state_count))
-        # the system
-        generator[system_states, system_states] = (
-            trial.system.generator * self.state_units / self.state_units[:, None]
+        state_space = ForceStateSpace(
+            generator=np.zeros((state_count, state_count)),
+            intensity=np.zeros((state_count, state_count)),
+            output_rows=np.zeros((len(trial.deviation), state_count)),
+            initial_covariance=np.zeros((state_count, state_count)),
         )
-        output_rows[:, system_states] = (
-            trial.system.outputs * self.state_units / trial.deviation[:, None]
-        )
-        # the missing forces: they drive the system, and an acceleration shows them directly
+        self._fill_structure(state_space)
         for (port, process), index in zip(self.processes, self.force_state_indices, strict=True):
-            force_states = slice(index, index + len(process.generator))
-            generator[system_states, index] = (
-                -trial.system.actions[port] * process.standard_deviation / self.state_units
-            )
-            generator[force_states, force_states] = process.generator
-            intensity[force_states.stop - 1, force_states.stop - 1] = process.intensity
-            output_rows[:, index] = (
-                -trial.system.through[port] * process.standard_deviation / trial.deviation
-            )
-            start_covariance[force_states, force_states] = np.eye(len(process.generator))
-            # a settled trial begins at rest under the missing force f: A s + b f = 0
-            if trial.begins_at_rest:
-                at_rest = np.linalg.lstsq(
-                    generator[system_states, system_states],
-                    -generator[system_states, index],
-                    rcond=1e-12,
-                )[0]
-                start_covariance[system_states, system_states] += np.outer(at_rest, at_rest)
-                start_covariance[system_states, index] = at_rest
-                start_covariance[index, system_states] = at_rest
-        # the correlated parts of noises: first-order processes of variance one
-        for index, (channel, coloured_share, rate) in enumerate(
-            trial.coloured_noises, first_noise_state
-        ):
-            generator[index, index] = -rate
-            intensity[index, index] = 2.0 * rate
-            start_covariance[index, index] = 1.0
-            output_rows[channel, index] = np.sqrt(coloured_share)
-        output_rows *= self.white_noise_scale[:, None]
-        return ForceStateSpace(generator, intensity, output_rows, start_covariance)
+            self._fill_missing_force(state_space, port, process, index)
+        self._fill_coloured_noises(state_space, first_noise_state)
+        # readings in deviations of the white part of their noise
+        return state_space._replace(
+            output_rows=state_space.output_rows * self.white_noise_scale[:, None]
+        )
+
+    def _fill_structure(self, state_space: ForceStateSpace) -> None:
+        """Fill the rates and outputs of the structure's own states, in units of these states."""
+        system = self.trial.system
+        structure = slice(0, len(system.generator))
+        units = self.state_units
+        state_space.generator[structure, structure] = system.generator * units / units[:, None]
+        state_space.output_rows[:, structure] = (
+            system.outputs * units / self.trial.deviation[:, None]
+        )
+
+    def _fill_missing_force(
+        self, state_space: ForceStateSpace, port: int, process: Process, index: int
+    ) -> None:
+        """Fill the states of a missing force, which drives the structure.
+
+        Parameters
+        ----------
+        state_space : ForceStateSpace
+            The state space, whose structure is filled already.
+        port : int
+            The number of the port of the force.
+        process : Process
+            The statistics of the force.
+        index : int
+            The index of the force in the state.
+        """
+        trial = self.trial
+        generator = state_space.generator
+        covariance = state_space.initial_covariance
+        structure = slice(0, len(trial.system.generator))
+        force_states = slice(index, index + len(process.generator))
+        generator[structure, index] = (
+            -trial.system.actions[port] * process.standard_deviation / self.state_units
+        )
+        generator[force_states, force_states] = process.generator
+        last_state = force_states.stop - 1
+        state_space.intensity[last_state, last_state] = process.intensity
+        # an acceleration shows the force directly
+        state_space.output_rows[:, index] = (
+            -trial.system.through[port] * process.standard_deviation / trial.deviation
+        )
+        covariance[force_states, force_states] = np.eye(len(process.generator))
+        # a trial that begins at rest does so under the missing force f: A s + b f = 0
+        if trial.begins_at_rest:
+            state_at_rest = np.linalg.lstsq(
+                generator[structure, structure], -generator[structure, index], rcond=1e-12
+            )[0]
+            covariance[structure, structure] += np.outer(state_at_rest, state_at_rest)
+            covariance[structure, index] = state_at_rest
+            covariance[index, structure] = state_at_rest
+
+    def _fill_coloured_noises(self, state_space: ForceStateSpace, first_state: int) -> None:
+        """Fill the correlated parts of noises: first-order processes of variance one.
+
+        Parameters
+        ----------
+        state_space : ForceStateSpace
+            The state space.
+        first_state : int
+            The index of the first of them in the state.
+        """
+        for index, noise in enumerate(self.trial.coloured_noises, first_state):
+            state_space.generator[index, index] = -noise.decay_rate
+            state_space.intensity[index, index] = 2.0 * noise.decay_rate
+            state_space.initial_covariance[index, index] = 1.0
+            state_space.output_rows[noise.channel, index] = np.sqrt(noise.share)
 
     @property
     def filter_key(self) -> tuple[bytes, ...]:
@@ -262,15 +299,13 @@ class ForceFilter:
         """
         record_filter = self.record_filter(columns)
         _, step_of_sample = self.trial.intervals
-        end = np.array([len(step_of_sample)])
         begin = record_filter.initial_state(self.state_space.initial_covariance)
-        _, _, products, half_log_determinants = record_filter.filter_before(
-            step_of_sample, 0, begin, end
-        )
-        # the filter's readings are multiplied by `white`, which multiplies their deviations too
-        return products[0], half_log_determinants[0] - np.sum(
-            np.log(self.white_noise_scale) * self.trial.used
-        )
+        end = np.array([len(step_of_sample)])
+        at_end = record_filter.filter_before(step_of_sample, 0, begin, end)
+        # the filter's readings are multiplied by `white_noise_scale`, and their deviations with
+        # them
+        log_scale = np.sum(np.log(self.white_noise_scale) * self.trial.used)
+        return at_end.products[0], at_end.half_log_determinants[0] - log_scale
 
     def smooth(self, readings: FloatArray) -> SmoothedForces:
         """Return the added state and the missing forces given all readings.
@@ -282,35 +317,40 @@ class ForceFilter:
         """
         record_filter = self.record_filter(readings[None])
         _, step_of_sample = self.trial.intervals
-        covariance, mean, *_ = record_filter.initial_state(self.state_space.initial_covariance)
-        every_sample = np.arange(1, len(readings) + 1)
-        record = (
+        begin = record_filter.initial_state(self.state_space.initial_covariance)
+        # the state before sample k + 1 is that after the readings of sample k
+        after_every_sample = np.arange(1, len(readings) + 1)
+        covariances, means, whitened, _, gains, variances = filter_forward(
             record_filter.transitions,
             record_filter.noises,
             step_of_sample,
             record_filter.output_rows,
             record_filter.used,
-        )
-        covariances, means, white, _, gains, variances = filter_forward(
-            *record, record_filter.columns, 0, covariance, mean, every_sample
+            record_filter.columns,
+            0,
+            begin.covariance,
+            begin.mean,
+            after_every_sample,
         )
         corrections, informations = smoother_corrections(
             record_filter.transitions,
             step_of_sample,
             record_filter.output_rows,
             record_filter.used,
-            white,
+            whitened,
             gains,
             variances,
         )
         states = self._states_at_fine_stamps(means, covariances, corrections)
         # de Jong's smoother: the covariance given all readings, see `smoother_corrections`
         posterior = covariances - covariances @ informations @ covariances
-        sizes = np.array([process.standard_deviation for _, process in self.processes])
+        units_of_forces = np.array([process.standard_deviation for _, process in self.processes])
+        force_deviations, speed_deviations = np.split(self._deviations(posterior), 2)
         return SmoothedForces(
             added_state=states[:, : len(self.state_units)] * self.state_units,
-            forces=states[:, self.force_state_indices].T * sizes[:, None],
-            deviations=self._deviations(posterior),
+            forces=states[:, self.force_state_indices].T * units_of_forces[:, None],
+            force_deviations=force_deviations,
+            speed_deviations=speed_deviations,
         )
 
     def _states_at_fine_stamps(
@@ -337,21 +377,24 @@ class ForceFilter:
         carried_back = [corrections[1:, :, None]]
         for _ in range(substeps):
             carried_back.append(transitions.mT @ carried_back[-1])
-        # the state, carried forward from each sample with what it may have gathered on the way
+        # predict from each sample: the correction acts by the covariance of the sample, and by that
+        # of the process noise since the sample
         state = means[:-1] + covariances[:-1] @ carried_back[-1]
-        gathered_noise = np.zeros_like(fine_transitions)
+        noise_since_sample = np.zeros_like(fine_transitions)
         fine_states = []
         for correction in carried_back[:0:-1]:
-            fine_states.append(state + gathered_noise[step_kind] @ correction)
+            fine_states.append(state + noise_since_sample[step_kind] @ correction)
             state = transitions @ state
-            gathered_noise = fine_transitions @ gathered_noise @ fine_transitions.mT + fine_noises
+            noise_since_sample = (
+                fine_transitions @ noise_since_sample @ fine_transitions.mT + fine_noises
+            )
         state_count = means.shape[1]
         return np.concatenate(
             (np.stack(fine_states, axis=1).reshape(-1, state_count), means[-1:, :, 0])
         )
 
     def _deviations(self, covariances: FloatArray) -> FloatArray:
-        """Return the deviations (2 P, N) of the forces, then of the speeds of their ports.
+        """Return the standard deviations (2 P, N) of the P forces, then of their ports' speeds.
 
         Parameters
         ----------
@@ -370,9 +413,10 @@ class ForceFilter:
 
 
 ROUNDING = 1e-12
-"""Relative error of the squared norm of a column by rounding."""
+"""Relative rounding error of the squared norm of a column. It is added to the diagonal of the
+normal equations, so that equal columns do not make them singular."""
 LEAST_PRECISION = 1e-10
-"""Prior precision that stands for an unknown of which nothing is known in advance."""
+"""Prior precision of an unknown with a flat prior, whose exact precision of zero is singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,13 +456,13 @@ class Regression:
     half_log_determinant: float
 
     def solve(self, unknowns: Sequence[int], precision: FloatArray) -> Solution:
-        """Return evidence and values of some of the unknowns; the others are zero.
+        """Return values and evidence of a model with only some of the unknowns; others are zero.
 
         Parameters
         ----------
         unknowns : sequence of int
-            The K numbers of the unknowns.
-        precision : (K,) array
+            The numbers of these unknowns.
+        precision : (len(unknowns),) array
             Their prior precisions.
         """
         rows = np.array([0, *(1 + k for k in unknowns)])

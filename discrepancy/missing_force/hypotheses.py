@@ -1,7 +1,7 @@
-"""Sets of effects as hypotheses on the missing force: their priors, trial values and columns.
+"""Sets of effects as hypotheses on the missing force: priors, values to try, and columns.
 
-The force of a law is evaluated along a motion that is taken as known: the estimated motion of its
-port. A column is the change of each trial for a unit of an unknown.
+A column is the change of each trial for a unit of an unknown. The force of a law is evaluated along
+the estimated motion of its port, which is taken as known.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -178,8 +178,8 @@ def law_force(
     """Return the force (F,) of a law along a motion of its port [N or N m].
 
     The force is zero outside of the law's windows in time. A law of the speed with a force at rest,
-    such as dry friction, holds the port if its speed may be zero within its uncertainty: the force
-    is then the holding force, up to the force of the law.
+    such as dry friction, holds the port while the speed is zero within its uncertainty. Its force
+    is then the one that keeps the port at rest, at most as large as the law allows.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def law_force(
 
 
 class ColumnBuilder:
-    """Computes the columns of effects along the motion of a view: their change of each trial.
+    """Computes columns: the changes of trials by effects, along an estimated motion.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ class ColumnBuilder:
         self.model_laws = model_laws
 
     def trials_without_effects(self) -> LinearTrials:
-        """Return the view of the trials without any effect, linear about the point."""
+        """Return the trials without any effect, linear about the point."""
         trials = [ported_trial(self.problem, number, self.point) for number in self.trial_indices]
         return LinearTrials(trials, self.problem.shared.precision)
 
@@ -254,16 +254,16 @@ class ColumnBuilder:
         motions: Sequence[TrialMotion],
         constant_column: EffectColumn | None = None,
     ) -> LinearTrials:
-        """Return a view whose laws and parameters act along motions, with the model's own laws.
+        """Return the trials with columns along new motions, and with the model's own laws.
 
         Parameters
         ----------
         linear_trials : LinearTrials
             The trials.
         motions : sequence of TrialMotion
-            The motion of each trial.
+            The motion of each trial, along which parameters and the model's own laws act.
         constant_column : EffectColumn, optional
-            The part of the hypothesis that has no unknown.
+            The change of the trials by the effects of a hypothesis at zero unknowns.
         """
         model_laws_column = None
         if len(self.model_laws):
@@ -282,7 +282,7 @@ class ColumnBuilder:
         candidate: Candidate,
         values: FloatArray,
     ) -> EffectColumn | None:
-        """Return the column of a candidate along motions.
+        """Return the column of all effects of a candidate together, along motions.
 
         Parameters
         ----------
@@ -319,7 +319,7 @@ class ColumnBuilder:
         patch: ModelPatch,
         acts_on: frozenset[TrialKind] = frozenset(TrialKind),
     ) -> EffectColumn | None:
-        """Return the column of a patch along motions.
+        """Return the column of a change of the model along motions.
 
         Parameters
         ----------
@@ -360,7 +360,7 @@ class ColumnBuilder:
         patch: ModelPatch,
         acts_on: frozenset[TrialKind],
     ) -> TrialColumn:
-        """Return the change of one trial by a patch, along a motion.
+        """Return the change of one trial by a change of the model, along a motion.
 
         Parameters
         ----------
@@ -403,34 +403,34 @@ class ColumnBuilder:
         laws : ModelPatch
             The laws.
         """
-        added_by_all = np.zeros_like(motion.added_state)
+        added_state = np.zeros_like(motion.added_state)
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
         for law in self.problem.model.at_ports(laws):
             if not isinstance(law, PortForce):
                 continue
             port = trial.system.ports.index(law.port)
-            _, speed_deviation = motion.deviations_by_port.get(port, (0.0, 0.0))
+            deviations = motion.deviations_by_port.get(port)
             force = law_force(
                 law,
                 trial.fine_time,
                 motion.positions[:, port],
                 motion.speeds[:, port],
-                speed_deviation,
+                0.0 if deviations is None else deviations.speed,
                 motion.forces.get(port, 0.0),
             )
             added_by_law = trial.state_under_force(port, force)
-            added_by_all += added_by_law
+            added_state += added_by_law
             readings += trial.readings_of_state(added_by_law, {port: force})
             forces[port] = forces.get(port, 0.0) + force
-        return TrialColumn(readings, added_by_all, forces)
+        return TrialColumn(readings, added_state, forces)
 
     def _readings_of_changed_model(
         self, trial: PortedTrial, trial_index: int, patch: ModelPatch
     ) -> FloatArray:
-        """Return the change (N, C) of the readings by a patch in a simulation, over the noise.
+        """Return the simulated change (N, C) of the readings by a patch, divided by the noise.
 
-        It is the model's response with the patch minus that without it; the estimated motion is not
+        It is the response of the patched model minus that of the model. The estimated motion is not
         used.
 
         Parameters
@@ -457,9 +457,9 @@ class ColumnBuilder:
     ) -> FloatArray:
         """Return the change (N, C) of the readings by errors of sensors, divided by the noise.
 
-        The sensors see the explained motion only: the response of the model and what laws add to
-        it. A missing force without a law is left out. As it may have any size, it would fit any
-        gain.
+        The sensors measure the explained motion: the response of the model and what laws add to it.
+        The motion by unexplained forces is left out. As these may have any size, they would fit any
+        gain of a sensor.
 
         Parameters
         ----------
@@ -479,29 +479,38 @@ class ColumnBuilder:
         # the true values at the sensors, and their rates
         response, rates = problem.response(trial_index, shared, local, ModelPatch())
         gains = 1.0 + problem.shared.gains(shared, data.trial.channels)
-        # `readings` are divided by the noise and contain the gains: undo both
-        change_by_laws = (
-            trial.readings_of_state(motion.explained_state, motion.law_forces)
-            * trial.deviation
-            / gains
-        )
-        true_values = response + change_by_laws
+        # readings are divided by the noise and contain the gains: undo both
+        explained_readings = trial.readings_of_state(motion.explained_state, motion.law_forces)
+        true_values = response + explained_readings * trial.deviation / gains
         true_rates = None
         if rates is not None:
-            state_rates = motion.explained_state @ trial.system.generator.T
-            for port, force in motion.law_forces.items():
-                state_rates = state_rates - np.outer(force, trial.system.actions[port])
-            rates_by_laws = (state_rates @ trial.system.outputs.T)[:: trial.substeps] / gains
-            true_rates = rates + rates_by_laws
+            true_rates = rates + _explained_rates(trial, motion) / gains
         # the readings of the sensors with their errors
         conditions = data.unknowns.conditions(data.trial, problem.shared.parameters(shared), local)
         observed = observe_response(
             problem.campaign, data.trial, sensors, conditions, Response(true_values, true_rates)
         )
         change = observed.values - true_values
-        # an error of the clock shifts the readings in time
+        # an error of the clock shifts the readings in time: to first order by their rates
         clock_rate, clock_zero = clock_of(sensors)
         if true_rates is not None:
             clock_error = clock_rate * (trial.time - trial.time[0]) + clock_zero
             change += true_rates * clock_error[:, None]
         return trial.divide_by_noise(change * gains)
+
+
+def _explained_rates(trial: PortedTrial, motion: TrialMotion) -> FloatArray:
+    """Return the rates (N, C) of the outputs by the explained state, with the gains [unit per s].
+
+    Parameters
+    ----------
+    trial : PortedTrial
+        The trial.
+    motion : TrialMotion
+        Its motion.
+    """
+    # s' = A s - sum_p b_p force_p, see `PortedSystem`
+    state_rates = motion.explained_state @ trial.system.generator.T
+    for port, force in motion.law_forces.items():
+        state_rates = state_rates - np.outer(force, trial.system.actions[port])
+    return np.asarray((state_rates @ trial.system.outputs.T)[:: trial.substeps])

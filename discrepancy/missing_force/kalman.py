@@ -1,19 +1,20 @@
-"""The Kalman filter of a record, forwards and backwards, and how both are joined.
+"""The Kalman filter of a record, forwards and backwards in time, and how both are joined.
 
-The forward filter says what is known of the state before a moment, the backward one what the
-readings after it say (Fraser and Potter 1969, IEEE Transactions on Automatic Control 14, 387-390).
-Together they give the evidence of all readings, and the state at that moment. Readings are taken in
-one at a time, so that the forward filter inverts no matrix. Covariance and information are updated
-in Joseph form; once they have converged they are kept.
+The forward filter gives the state at a moment by the readings before it, the backward filter the
+information on that state by the readings after it (Fraser and Potter 1969, IEEE Transactions on
+Automatic Control 14, 387-390). Together they give the evidence of all readings, and the state at
+that moment. Readings are taken in one at a time, so that the forward filter inverts no matrix.
+Covariance and information are updated in Joseph form; once they have converged they are kept.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
-derivatives by unknowns), S different steps, B places (samples whose state is asked for). Readings
-are divided by the deviation of the white part of their noise, which therefore has variance one.
+derivatives by unknowns), S different steps, B queried samples (samples whose state is asked for).
+Readings are divided by the deviation of the white part of their noise, which therefore has variance
+one.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,8 +28,8 @@ SERIES_NORM, SERIES_TERMS = 0.25, 12
 """Norm of the rate matrix times the time up to which its exponential is summed as a series, and the
 number of terms: the remainder is 1e-16."""
 LEAST_INNOVATION_VARIANCE = 0.5
-"""Variance of an innovation over that of the noise below which a far too large force has lost it to
-rounding. Exactly it is at least one."""
+"""Least variance of an innovation over that of the noise. The exact variance is at least one; with
+a missing force that is far too large, rounding errors make the computed one smaller."""
 
 
 @compiled
@@ -148,7 +149,7 @@ def filter_forward(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the filtered state before some samples, from the readings since sample `first`.
 
-    Each such sample is a place: the readings of the sample before it are the last ones taken in.
+    The readings of the sample before a queried one are the last ones that its state contains.
 
     Parameters
     ----------
@@ -169,8 +170,8 @@ def filter_forward(
     Returns
     -------
     covariances, means : (B, n, n), (B, n, W) ndarray
-        The state after the last sample before each place.
-    whitened : (places[-1] - first, c, W) ndarray
+        The state after the last sample before each queried one.
+    whitened : (query_samples[-1] - first, c, W) ndarray
         The innovations of the columns, divided by their standard deviations.
     half_log_determinants : (B,) ndarray
         Half the sum of the logarithms of the variances of the innovations; infinite if a variance
@@ -197,7 +198,7 @@ def filter_forward(
     query = 0
     steady = False
     for k in range(first, query_samples[-1] + 1):
-        # store the state before a place
+        # store the state before a queried sample
         while query < query_count and query_samples[query] == k:
             covariances[query] = covariance
             means[query] = mean
@@ -226,7 +227,7 @@ def filter_forward(
                 continue
             if not steady:
                 variances[c] = update_covariance(covariance, output_rows[c], gains[c])
-                # this place and later ones keep their infinite half log determinant
+                # this query and later ones keep their infinite half log determinant
                 if not variances[c] > LEAST_INNOVATION_VARIANCE:
                     return (
                         covariances,
@@ -291,10 +292,46 @@ def simulate_inputs(
     return states
 
 
-FilterState = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""State of a filter with its sums: covariance or information matrix (.., n, n), means or
-information vectors (.., n, W), products of whitened columns (.., W, W), and half a log determinant
-(..)."""
+class FilterState(NamedTuple):
+    """What the readings up to a moment say of the state, and their part of the evidence.
+
+    Attributes
+    ----------
+    covariance : (..., n, n) ndarray
+        The covariance of the state.
+    mean : (..., n, W) ndarray
+        The mean of the state for a unit of each column.
+    products : (..., W, W) ndarray
+        The inner products of the whitened columns of these readings.
+    half_log_determinants : (...) ndarray
+        Half the log determinant of the covariance of these readings [nat].
+    """
+
+    covariance: FloatArray
+    mean: FloatArray
+    products: FloatArray
+    half_log_determinants: FloatArray
+
+
+class StateInformation(NamedTuple):
+    """What the readings from a moment on say of the state; see `filter_backward` for the density.
+
+    Attributes
+    ----------
+    matrix : (..., n, n) ndarray
+        The information matrix J.
+    vectors : (..., n, W) ndarray
+        The information vectors h, one for each column.
+    products : (..., W, W) ndarray
+        The inner products c of the whitened columns of these readings.
+    half_log_determinants : (...) ndarray
+        Half a log determinant [nat].
+    """
+
+    matrix: FloatArray
+    vectors: FloatArray
+    products: FloatArray
+    half_log_determinants: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,21 +363,21 @@ class RecordFilter:
     def initial_state(self, covariance: FloatArray) -> FilterState:
         """Return the state of the filter before the first sample, with a covariance (n, n)."""
         n, column_count = self.output_rows.shape[1], self.columns.shape[2]
-        return (
-            covariance,
-            np.zeros((n, column_count)),
-            np.zeros((column_count, column_count)),
-            np.zeros(()),
+        return FilterState(
+            covariance=covariance,
+            mean=np.zeros((n, column_count)),
+            products=np.zeros((column_count, column_count)),
+            half_log_determinants=np.zeros(()),
         )
 
     def filter_before(
         self,
         step_of_sample: IntArray,
         first: int,
-        state: Sequence[FloatArray],
+        state: FilterState,
         query_samples: IntArray,
     ) -> FilterState:
-        """Return the states of the filter before the steps into some samples.
+        """Return the states (B, ...) of the filter before the steps that lead to some samples.
 
         Parameters
         ----------
@@ -348,13 +385,12 @@ class RecordFilter:
             The step that leads to each sample.
         first : int
             The first sample whose readings are taken in.
-        state : sequence of array
-            The state of the filter before that sample, as `FilterState`.
+        state : FilterState
+            The state of the filter before that sample.
         query_samples : (B,) array
             The samples before which the state is asked for, ascending.
         """
-        covariance, mean, products_before, halves_before = state
-        covariances, means, white, halves, *_ = filter_forward(
+        covariances, means, whitened, half_log_determinants, *_ = filter_forward(
             self.transitions,
             self.noises,
             step_of_sample,
@@ -362,21 +398,26 @@ class RecordFilter:
             self.used,
             self.columns,
             first,
-            covariance,
-            mean,
+            state.covariance,
+            state.mean,
             query_samples,
         )
-        # sums of the products of whitened columns, from the first sample up to each place
-        white_by_place = np.split(
-            white.reshape(-1, white.shape[-1]), len(self.output_rows) * (query_samples[:-1] - first)
+        # products of the readings since `first`: between two queried samples, then summed up
+        whitened_rows = whitened.reshape(-1, whitened.shape[-1])
+        row_of_query = len(self.output_rows) * (query_samples[:-1] - first)
+        products_between = [rows.T @ rows for rows in np.split(whitened_rows, row_of_query)]
+        products = np.cumsum(products_between, axis=0)
+        return FilterState(
+            covariance=covariances,
+            mean=means,
+            products=products + state.products,
+            half_log_determinants=half_log_determinants + state.half_log_determinants,
         )
-        products = np.cumsum(
-            [white_columns.T @ white_columns for white_columns in white_by_place], axis=0
-        )
-        return covariances, means, products + products_before, halves + halves_before
 
-    def information_after(self, step_of_sample: IntArray, query_samples: IntArray) -> FilterState:
-        """Return the information on the state at some samples, from these and later readings.
+    def information_after(
+        self, step_of_sample: IntArray, query_samples: IntArray
+    ) -> StateInformation:
+        """Return the information (B, ...) on the state at some samples, from readings since then.
 
         Parameters
         ----------
@@ -385,7 +426,7 @@ class RecordFilter:
         query_samples : (B,) array
             The samples, ascending.
         """
-        return filter_backward(
+        matrix, vectors, products, half_log_determinants = filter_backward(
             self.transitions,
             self.noise_roots,
             step_of_sample,
@@ -394,6 +435,7 @@ class RecordFilter:
             self.columns,
             query_samples,
         )
+        return StateInformation(matrix, vectors, products, half_log_determinants)
 
 
 def _covariance_roots(covariances: FloatArray) -> FloatArray:
@@ -402,21 +444,18 @@ def _covariance_roots(covariances: FloatArray) -> FloatArray:
     return np.ascontiguousarray(eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))[..., None, :])
 
 
-def join_filters(
-    before: Sequence[FloatArray], after: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the products and half log determinants of whole records from those of two parts.
+def join_filters(before: FilterState, after: StateInformation) -> tuple[FloatArray, FloatArray]:
+    """Return the products and half log determinants of whole records, from those of two parts.
 
-    The state z at the joint is integrated out. It is Gaussian given the readings before; those
-    after have the log density of `filter_backward`.
+    The state z at the moment between both parts is integrated out. Given the readings before, it is
+    Gaussian; the readings after have the log density that `filter_backward` gives.
 
     Parameters
     ----------
-    before : sequence of array
-        Covariance, means, products and half log determinants of the readings before.
-    after : sequence of array
-        Information matrix, information vectors, products and half log determinants of the readings
-        after.
+    before : FilterState
+        The state z by the readings before the moment.
+    after : StateInformation
+        The information on z by the readings after the moment.
 
     Returns
     -------
@@ -425,21 +464,25 @@ def join_filters(
     half_log_determinants : (...) array
         Half the log determinant of the covariance of all its readings [nat].
     """
-    covariance, mean, products, earlier_half = before
-    J, h, later_products, later_half = after
+    mean = before.mean
+    J = after.matrix
+    h = after.vectors
     # with covariance R R^T and residual information h - J m of the mean m, completing the square
     # in z leaves (h - J m)^T R (I + R^T J R)^-1 R^T (h - J m), and half log det (I + R^T J R)
-    root = _covariance_roots(covariance)
-    inner_root = np.linalg.cholesky(np.eye(covariance.shape[-1]) + root.mT @ J @ root)
+    root = _covariance_roots(before.covariance)
+    inner_root = np.linalg.cholesky(np.eye(before.covariance.shape[-1]) + root.mT @ J @ root)
     explained = np.asarray(np.linalg.solve(inner_root, root.mT @ (h - J @ mean)))
     mean_by_h = mean.mT @ h
-    all_products = (
-        products
-        + later_products
+    products = (
+        before.products
+        + after.products
         - mean_by_h
         - mean_by_h.mT
         + mean.mT @ J @ mean
         - explained.mT @ explained
     )
     half_log_determinant = np.log(np.diagonal(inner_root, axis1=-2, axis2=-1)).sum(-1)
-    return all_products, earlier_half + later_half + half_log_determinant
+    half_log_determinants = (
+        before.half_log_determinants + after.half_log_determinants + half_log_determinant
+    )
+    return products, half_log_determinants

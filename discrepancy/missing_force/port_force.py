@@ -211,7 +211,6 @@ def _forces_by_trial(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -
         samples = slice(None, None, trial.substeps)
         force = motion.forces[port][samples]
         law = force - motion.unexplained_forces[port][samples] if has_law else None
-        force_deviation, _ = motion.deviations_by_port[port]
         trial_forces.append(
             TrialForce(
                 trial=trial.name,
@@ -219,7 +218,7 @@ def _forces_by_trial(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -
                 position=motion.positions[samples, port],
                 speed=motion.speeds[samples, port],
                 force=force,
-                deviation=force_deviation,
+                deviation=motion.deviations_by_port[port].force,
                 law=law,
             )
         )

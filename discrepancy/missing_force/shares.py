@@ -217,12 +217,12 @@ class ForceShares:
         """
         processes = {**hypothesis.processes, **self.search.hypothesis_of_all_ports.processes}
         if not held_out:
-            _, _, motions = hypothesis.linear_trials.smooth(processes, hypothesis.solution)
-            return hypothesis.linear_trials, motions
+            smoothed = hypothesis.linear_trials.smooth(processes, hypothesis.solution)
+            return hypothesis.linear_trials, smoothed.motions
         assert self._held_out is not None
         builder, linear_trials = self._held_out
         solution = replace(hypothesis.solution, mean=hypothesis.shared)
-        _, _, motions = linear_trials.smooth(processes, solution)
+        motions = linear_trials.smooth(processes, solution).motions
         for _ in range(SMOOTHING_ROUNDS):
             effects_column = None
             if len(hypothesis.effect):
@@ -230,7 +230,7 @@ class ForceShares:
                     linear_trials, motions, hypothesis.candidate, hypothesis.effect
                 )
             linear_trials = builder.trials_along_motions(linear_trials, motions, effects_column)
-            _, _, motions = linear_trials.smooth(processes, solution)
+            motions = linear_trials.smooth(processes, solution).motions
         return linear_trials, motions
 
 
@@ -278,14 +278,14 @@ def _simulated_noise(trial: PortedTrial) -> FloatArray:
     """
     generator = np.random.default_rng(SEED)
     noise = generator.standard_normal(trial.residual.shape)
-    for channel, coloured_share, rate in trial.coloured_noises:
-        # an autoregression of first order at the trial's stamps
-        decay = np.exp(-rate * np.diff(trial.time, prepend=-np.inf))
+    for coloured in trial.coloured_noises:
+        # an autoregression of first order at the trial's stamps; nothing comes before the first one
+        decay = np.exp(-coloured.decay_rate * np.diff(trial.time, prepend=-np.inf))
         correlated_noise = np.zeros(len(noise))
         for k, innovation in enumerate(generator.standard_normal(len(noise))):
             correlated_noise[k] = (
                 decay[k] * correlated_noise[k - 1] + np.sqrt(1.0 - decay[k] ** 2) * innovation
             )
-        white_noise = np.sqrt(1.0 - coloured_share) * noise[:, channel]
-        noise[:, channel] = white_noise + np.sqrt(coloured_share) * correlated_noise
+        white_noise = np.sqrt(1.0 - coloured.share) * noise[:, coloured.channel]
+        noise[:, coloured.channel] = white_noise + np.sqrt(coloured.share) * correlated_noise
     return np.asarray(noise * trial.used)

@@ -1,4 +1,4 @@
-"""A trial in which a force is on or off: the evidence of all stretches in which it may be on.
+"""A trial in which a force is on or off: the evidence of every stretch in which it may be on.
 
 A path (N,) says for each sample whether the force of events is on; a stretch is a range of samples
 in which it stays on, or off. The filter of the readings before a moment and the backward filter of
@@ -15,26 +15,27 @@ import numpy as np
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 
 from .filtered import ForceFilter, ForceStateSpace, Process, integrate_out_last
-from .kalman import RecordFilter, discretise, join_filters
+from .kalman import FilterState, RecordFilter, StateInformation, discretise, join_filters
 from .view import LinearTrials
 
 CHANGE_PRICE = 4.0
-"""Log odds against a change of a path, besides the prior of its place [nat]."""
+"""Log odds against a change of a path, besides the prior of the sample at which it lies [nat]. With
+4, one change in about 55 is believed without any evidence."""
 MOST_GRID_INTERVALS = 40
-"""Largest number of places in a grid between which a stretch is looked for."""
+"""Largest number of intervals of the grid on which stretches begin and end."""
 MOST_FILTER_STEPS = 400_000
-"""Largest number of steps of the filter for one such grid; a long record has fewer places."""
+"""Largest number of steps of the filter for one such grid; a long record has fewer intervals."""
 COMPARED_SAMPLES = 80
-"""Number of places of a change that are compared at once."""
+"""Number of samples that are compared at once as the place of a change."""
 EVIDENCE_RANGE = 12.0
-"""Log evidence below the largest [nat] from which on a place is taken as impossible."""
+"""Difference to the largest log evidence above which a sample is taken as impossible [nat]."""
 
 ForcePair = tuple[Process, Process]
 """The force of events, and the force that may be missing throughout."""
 
 
 class TrialProducts(NamedTuple):
-    """The information of a trial on the K shared unknowns, as the products of its whitened columns.
+    """What a trial says of the K shared unknowns: the inner products of its whitened columns.
 
     Attributes
     ----------
@@ -120,7 +121,10 @@ class SwitchedRecord:
         trial = trials.trials[trial_index]
         self.local_precision = trial.local_precision
         force_filter = ForceFilter(trial, [(trials.port, force) for force in forces])
-        event = len(trial.system.generator)  # index of the event's force in the state
+        state_space = force_filter.state_space
+        # the states of the missing forces follow those of the structure; that of events is first
+        event_state = len(trial.system.generator)
+        # between two samples there are `substeps` steps, at whose ends nothing is read
         lengths, step_of_sample = trial.intervals
         used = np.zeros(((len(trial.time) - 1) * substeps + 1, trial.used.shape[1]), dtype=bool)
         used[::substeps] = trial.used
@@ -134,17 +138,13 @@ class SwitchedRecord:
             (step_of_sample[:1], np.repeat(step_of_sample[1:], substeps))
         )
         self.length_count = len(lengths)
-        transitions, noises = switched_step_matrices(
-            force_filter.state_space, event, lengths / substeps
-        )
+        transitions, noises = switched_step_matrices(state_space, event_state, lengths / substeps)
         self.record_filter = RecordFilter(
-            transitions, noises, force_filter.state_space.output_rows, used, columns
+            transitions, noises, state_space.output_rows, used, columns
         )
-        off, on = initial_covariances(force_filter.state_space, event)
-        self.states_off_and_on = [
-            self.record_filter.initial_state(off),
-            self.record_filter.initial_state(on),
-        ]
+        off, on = initial_covariances(state_space, event_state)
+        self._state_with_force_off = self.record_filter.initial_state(off)
+        self._state_with_force_on = self.record_filter.initial_state(on)
 
     def step_kinds(self, on: BoolArray) -> IntArray:
         """Return the kind (N,) of the step that leads to each sample of a path (N,).
@@ -157,16 +157,20 @@ class SwitchedRecord:
     def products(self, on: BoolArray) -> TrialProducts:
         """Return the information of the trial on the shared unknowns, given a path (N,)."""
         end = np.array([len(on)])
-        begin = self.states_off_and_on[int(on[0])]
-        *_, products, half_log_determinants = self.record_filter.filter_before(
-            self.step_kinds(on), 0, begin, end
+        at_end = self.record_filter.filter_before(
+            self.step_kinds(on), 0, self._initial_state(bool(on[0])), end
         )
-        return TrialProducts(
-            *integrate_out_last(products[0], half_log_determinants[0], self.local_precision)
+        products, half_log_determinant = integrate_out_last(
+            at_end.products[0], at_end.half_log_determinants[0], self.local_precision
         )
+        return TrialProducts(products, half_log_determinant)
+
+    def _initial_state(self, is_on: bool) -> FilterState:
+        """Return the state of the filter before the first sample, with the force on or off."""
+        return self._state_with_force_on if is_on else self._state_with_force_off
 
     def evidence_of_stretches(self, on: BoolArray, starts: IntArray, ends: IntArray) -> FloatArray:
-        """Return the log evidence of all trials if the force is switched in one more stretch.
+        """Return the log evidence of all trials if a path is inverted in one more stretch.
 
         Parameters
         ----------
@@ -183,47 +187,52 @@ class SwitchedRecord:
             The log evidence of each start with each end [nat]; -inf if the end is not after the
             start.
         """
-        product_count = 1 + len(self.trials.linear_trials.shared_precision)
-        products = np.zeros((len(starts), len(ends), product_count, product_count))
+        column_count = 1 + len(self.trials.linear_trials.shared_precision)
+        products = np.zeros((len(starts), len(ends), column_count, column_count))
         # an infinite determinant is an evidence of -inf, which stays if an end is not after the
         # start
         half_log_determinants = np.full((len(starts), len(ends)), np.inf)
         kinds = self.step_kinds(on)
         states_at_starts = self.record_filter.filter_before(
-            kinds, 0, self.states_off_and_on[int(on[0])], starts
+            kinds, 0, self._initial_state(bool(on[0])), starts
         )
-        after_ends = self.record_filter.information_after(kinds, ends)
+        information_at_ends = self.record_filter.information_after(kinds, ends)
         transitions, noises = self._steps_at_ends(on, ends)
         for k, start in enumerate(starts.tolist()):
             # a stretch from the first sample on: the force begins off instead of on, or on instead
             # of off
             if start == 0:
-                state = self.states_off_and_on[int(not on[0])]
+                state = self._initial_state(not on[0])
             else:
-                covariance, mean, known_products, known_half = states_at_starts
-                state = (covariance[k], mean[k], known_products[k], known_half[k])
+                state = FilterState(*(array[k] for array in states_at_starts))
+            # filter the readings of the stretch, in which the path is inverted
             is_later = ends > start
-            switched = on.copy()
-            switched[start:] ^= True
-            covariance, mean, *sums = self.record_filter.filter_before(
-                self.step_kinds(switched), start, state, ends[is_later]
+            inverted = on.copy()
+            inverted[start:] ^= True
+            state_before_ends = self.record_filter.filter_before(
+                self.step_kinds(inverted), start, state, ends[is_later]
             )
-            # the step into the sample `end`, from which on the path is not inverted any more
+            # predict over the step that ends the stretch
             transition = transitions[is_later]
-            covariance = transition @ covariance @ transition.mT + noises[is_later]
-            state_at_ends = (covariance, transition @ mean, *sums)
-            products_of_trial = join_filters(
-                state_at_ends, [array[is_later] for array in after_ends]
+            covariance = transition @ state_before_ends.covariance @ transition.mT
+            state_at_ends = state_before_ends._replace(
+                covariance=covariance + noises[is_later], mean=transition @ state_before_ends.mean
+            )
+            # join with the readings after the stretch
+            products_of_record, half_of_record = join_filters(
+                state_at_ends, StateInformation(*(array[is_later] for array in information_at_ends))
             )
             products[k, is_later], half_log_determinants[k, is_later] = integrate_out_last(
-                *products_of_trial, self.local_precision
+                products_of_record, half_of_record, self.local_precision
             )
         return self.trials.log_evidence(
             [TrialProducts(products, half_log_determinants), *self.products_of_others]
         )
 
     def _steps_at_ends(self, on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (B, n, n) of the steps by which inverted stretches end.
+        """Return transitions and noises (B, n, n) of the steps that end inverted stretches.
+
+        Such a step leads to the first sample at which the path is not inverted any more.
 
         Parameters
         ----------
@@ -246,10 +255,10 @@ class SwitchedRecord:
         return transitions, noises
 
     def invert_best_stretch(self, on: BoolArray) -> BoolArray | None:
-        """Return the path with that one stretch inverted which makes it most probable.
+        """Return the path after the most probable inversion of one stretch.
 
-        Inverting turns the force on where it was off, and off where it was on. The begin and the
-        end of the stretch are taken from a grid over the record.
+        An inversion turns the force on where it was off, and off where it was on. The stretch
+        begins and ends at samples of a grid over the record, or at changes of the path.
 
         Parameters
         ----------
@@ -262,7 +271,8 @@ class SwitchedRecord:
             The new path; None if no stretch raises the evidence by more than its changes cost.
         """
         sample_count = len(on)
-        # each start needs one pass of the filter, of up to `sample_count` steps
+        # each start needs one pass of the filter, of up to `sample_count` steps; 12 intervals are
+        # the least with which a stretch is found
         interval_count = min(
             max(MOST_FILTER_STEPS // sample_count, 12), MOST_GRID_INTERVALS, sample_count
         )
@@ -283,79 +293,81 @@ class SwitchedRecord:
             - prices[None, 1:]
         )
         first_edge, last_interval = np.unravel_index(np.argmax(scores), scores.shape)
-        if scores[first_edge, last_interval] <= self.trials.log_evidence(
-            [self.products(on), *self.products_of_others]
-        ):
+        present_evidence = self.trials.log_evidence([self.products(on), *self.products_of_others])
+        if scores[first_edge, last_interval] <= present_evidence:
             return None
-        switched = on.copy()
-        switched[edges[first_edge] : edges[last_interval + 1]] ^= True
-        return switched
+        inverted = on.copy()
+        inverted[edges[first_edge] : edges[last_interval + 1]] ^= True
+        return inverted
 
     def place_changes(self, on: BoolArray) -> BoolArray:
-        """Return a path (N,) whose changes are moved to their most probable places.
+        """Return a path (N,) whose changes are moved to their most probable samples.
 
         They are moved one after the other. This is repeated, three times at most, since the best
-        place of one change depends on the others.
+        sample of one change depends on the others.
         """
         for _ in range(3):
             previous = on.copy()
-            for number, old in enumerate(change_samples(on)):
-                places, log_evidence = self.evidence_of_change_samples(on, number)
-                new = places[np.argmax(log_evidence)]
+            for change_index, old_sample in enumerate(change_samples(on)):
+                samples, log_evidence = self.evidence_of_change_samples(on, change_index)
+                new_sample = samples[np.argmax(log_evidence)]
                 on = on.copy()
-                # between old and new place: an earlier change extends the state after it, a later
-                # one extends the state before it
-                on[min(old, new) : max(old, new)] = on[old] if new < old else on[old - 1]
+                # an earlier change extends the stretch after it, a later one that before it
+                if new_sample < old_sample:
+                    on[new_sample:old_sample] = on[old_sample]
+                else:
+                    on[old_sample:new_sample] = on[old_sample - 1]
             if np.array_equal(on, previous):
                 break
         return on
 
-    def evidence_of_change_samples(self, on: BoolArray, number: int) -> tuple[IntArray, FloatArray]:
-        """Return places of a change of a path, and the log evidence of each.
+    def evidence_of_change_samples(
+        self, on: BoolArray, change_index: int
+    ) -> tuple[IntArray, FloatArray]:
+        """Return samples to which a change of a path may be moved, and the log evidence of each.
 
-        Places are refined from a coarse grid to all samples around the most probable ones.
+        The samples lie between the neighbouring changes. A coarse grid of them is refined around
+        the most probable ones, until it contains every sample there.
 
         Parameters
         ----------
         on : (N,) array of bool
             The path: whether the force is on at each sample.
-        number : int
+        change_index : int
             The index of the change among the changes of the path.
 
         Returns
         -------
-        places : (B,) array of int
-            Samples at which the change may lie, ascending.
+        samples : (B,) array of int
+            The samples, ascending.
         log_evidence : (B,) array
-            The log evidence of all trials with the change there [nat].
+            The log evidence of all trials with the change at each of them [nat].
         """
-        previous_change, change, next_change = np.r_[0, change_samples(on), len(on)][
-            number : number + 3
-        ]
-        # the path whose change is as early as the previous one; inverting it from there to a place
-        # delays the change to that place
+        bounds = np.r_[0, change_samples(on), len(on)]
+        previous_change, change, next_change = bounds[change_index : change_index + 3]
+        # `earliest_path` has the change where the previous one is. If it is inverted from there up
+        # to a sample, the change lies at that sample.
         earliest_path = on.copy()
         earliest_path[previous_change:next_change] = on[change]
-        places = np.zeros(0, dtype=np.int64)
+        samples = np.zeros(0, dtype=np.int64)
         log_evidence = np.zeros(0)
-        first_place, last_place = previous_change + 1, next_change - 1
+        first, last = previous_change + 1, next_change - 1
         while True:
-            candidate_places = (
-                np.linspace(first_place, last_place, COMPARED_SAMPLES).round().astype(np.int64)
+            grid = np.linspace(first, last, COMPARED_SAMPLES).round().astype(np.int64)
+            new_samples = np.setdiff1d(grid, samples)
+            if not len(new_samples):
+                return samples, log_evidence
+            (evidence_of_new,) = self.evidence_of_stretches(
+                earliest_path, np.array([previous_change]), new_samples
             )
-            new_places = np.setdiff1d(candidate_places, places)
-            if not len(new_places):
-                return places, log_evidence
-            evidence_of_new = self.evidence_of_stretches(
-                earliest_path, np.array([previous_change]), new_places
-            )[0]
-            places = np.r_[places, new_places]
+            samples = np.r_[samples, new_samples]
             log_evidence = np.r_[log_evidence, evidence_of_new]
-            order = np.argsort(places)
-            places, log_evidence = places[order], log_evidence[order]
+            order = np.argsort(samples)
+            samples, log_evidence = samples[order], log_evidence[order]
+            # the next grid: one compared sample beyond the probable ones on either side
             probable = np.flatnonzero(log_evidence >= log_evidence.max() - EVIDENCE_RANGE)
-            first_place = places[max(probable[0] - 1, 0)]
-            last_place = places[min(probable[-1] + 1, len(places) - 1)]
+            first = samples[max(probable[0] - 1, 0)]
+            last = samples[min(probable[-1] + 1, len(samples) - 1)]
 
 
 def switched_step_matrices(
@@ -409,22 +421,22 @@ def initial_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray
 
 
 def zero_state(matrix: FloatArray, index: int) -> FloatArray:
-    """Return a matrix with the row and the column of a state set to zero."""
-    remaining = matrix.copy()
-    remaining[index] = 0.0
-    remaining[:, index] = 0.0
-    return remaining
+    """Return a matrix (n, n) with the row and the column of one state set to zero."""
+    changed = matrix.copy()
+    changed[index] = 0.0
+    changed[:, index] = 0.0
+    return changed
 
 
 def change_samples(on: BoolArray) -> IntArray:
-    """Return the samples at which a path (N,) changes: the first ones with the new value."""
+    """Return the samples at which a path (N,) changes: each the first one with the new value."""
     return np.flatnonzero(np.diff(on)) + 1
 
 
 def change_price(sample_count: int) -> float:
     """Return the price of a change in a record of `sample_count` samples [nat].
 
-    It is minus the log prior of a change: of its place among the samples, and that there is one.
+    It is minus the log prior of a change: that there is one, and that it lies at this sample.
     """
     return float(np.log(sample_count)) + CHANGE_PRICE
 

@@ -1,13 +1,12 @@
-"""A dynamic trial in which a missing force is looked for: its residuals, and their derivatives.
+"""A trial in motion as a linear system with ports, whose missing forces are estimated.
 
-The trial is linear in its unknowns. Residuals and derivatives are divided by the standard
-deviations of the noise. The unknowns are those of `fits.trial_data`, with prior mean zero. A
-calibrated parameter changes the motion of the model (a column of derivatives of the readings) and
-the motion that missing forces add to it (`slopes`); both together are exact along the actual
-motion.
+The trial is linear in its unknowns, which are those of `fits.trial_data`, with prior mean zero.
+Residuals and derivatives are divided by the standard deviations of the noise. A calibrated
+parameter changes the response of the model (`shared_derivatives`) and the motion that missing
+forces add to it (`system_derivatives`); both together are exact along the actual motion.
 
 Terms and shapes: a port is a place where a force can act. An interval between two of the N samples
-is divided into `parts` fine steps; their ends are the F = (N - 1) parts + 1 fine stamps. The added
+is divided into `parts` substeps; their ends are the F = (N - 1) parts + 1 fine stamps. The added
 state (F, n) is the state of the linear system that forces at ports add to the model's response. A
 column is the change of the readings (N, C) for a unit of one unknown.
 """
@@ -16,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -33,17 +33,86 @@ from fe.runtime.patch import ModelPatch
 from .kalman import simulate_inputs
 
 MOST_SUBSTEPS, FEWEST_SUBSTEPS = 16, 4
-"""Largest and smallest number of fine steps in an interval between two samples."""
+"""Largest and smallest number of substeps in an interval between two samples."""
 LARGEST_SUBSTEP_PHASE = 0.15
-"""Largest phase of the fastest mode in a fine step [rad]."""
+"""Largest phase of the fastest mode in a substep [rad]."""
 LONGEST_CORRELATION, LEAST_WHITE_SHARE = 2000, 1e-3
-"""Largest number of samples over which the correlation of a noise is computed; least share of its
-variance that is taken as white."""
+"""Largest number of samples over which the correlation of a noise is computed. Least share of its
+variance that is taken as white, so that the filter does not divide by zero."""
 HALF_DIFFERENCE = 1e-3
 """Half the difference of a parameter in the derivative of a system [prior standard deviations]."""
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 """Forces by port of a trial without any."""
+
+
+class ColouredNoise(NamedTuple):
+    """The part of a channel's noise that is correlated in time, as a process of first order.
+
+    Attributes
+    ----------
+    channel : int
+        The index of the channel in the trial.
+    share : float
+        The share of this part in the variance of the noise.
+    decay_rate : float
+        The rate at which its correlation decays [1/s].
+    """
+
+    channel: int
+    share: float
+    decay_rate: float
+
+
+class GainUnknown(NamedTuple):
+    """A shared unknown that is the gain of a channel of a trial.
+
+    Attributes
+    ----------
+    unknown : int
+        The number of the unknown.
+    channel : int
+        The index of the channel in the trial.
+    scale : float
+        The relative change of the channel's readings for a unit of the unknown.
+    """
+
+    unknown: int
+    channel: int
+    scale: float
+
+
+class SampleIntervals(NamedTuple):
+    """The intervals between the N samples of a trial.
+
+    Attributes
+    ----------
+    lengths : (J,) ndarray
+        The different lengths [s].
+    length_of_sample : (N,) ndarray of int
+        The index in `lengths` of the interval that ends at each sample; that of sample 0 is not
+        used.
+    """
+
+    lengths: FloatArray
+    length_of_sample: IntArray
+
+
+class SubstepMatrices(NamedTuple):
+    """The matrices by which the state advances over a substep, by the length of the interval.
+
+    Attributes
+    ----------
+    transitions : (J, n, n) ndarray
+        The transitions of the state.
+    by_input_at_begin, by_input_at_end : (J, n, n) ndarray
+        The derivatives of the next state by an input to the state's rate at the start and at the
+        end of the substep. The input is linear over the substep (first-order hold).
+    """
+
+    transitions: FloatArray
+    by_input_at_begin: FloatArray
+    by_input_at_end: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,29 +167,28 @@ class PortedTrial:
         Whether each reading counts.
     deviation : (C,) ndarray
         The standard deviation of the noise of each channel [unit of the channel].
-    coloured_noises : sequence of (int, float, float)
-        The channels whose noise has a part correlated in time: the number of the channel, the share
-        of that part in the variance, and its decay rate [1/s].
+    coloured_noises : sequence of ColouredNoise
+        The parts of noises that are correlated in time.
     shared_derivatives, local_derivatives : (K, N, C), (L, N, C) ndarray
         The derivatives of the readings by the shared unknowns, and by those of this trial alone,
         divided by the noise deviations.
     local_precision : (L,) ndarray
         The prior precisions of the unknowns of this trial alone.
     system : PortedSystem
-        The linear system at the values `linearisation_point`, with the gains of the channels.
+        The linear system at the values `linearisation_point`; the gains of the channels are
+        contained in its outputs.
     system_derivatives : sequence of PortedSystem or None
         The derivatives of the system by each shared unknown; None if the derivative is zero.
     substeps : int
-        The number of fine steps in an interval between two samples.
+        The number of substeps in an interval between two samples.
     port_positions, port_speeds : (F, P) ndarray
         The motion of the ports by the model without missing forces [m or rad, and per s].
     begins_at_rest : bool
         Whether the trial begins at rest under the forces that act at its first sample.
     linearisation_point : (K + L,) ndarray
         The values of the unknowns about which the trial is linear.
-    gain_unknowns : sequence of (int, int, float)
-        The shared unknowns that are gains: the number of the unknown, the number of the channel,
-        and the relative change of its reading for a unit of the unknown.
+    gain_unknowns : sequence of GainUnknown
+        The shared unknowns that are gains of its channels.
     port_motion_derivatives : mapping of int to (2, F, P) ndarray
         The derivatives of `port_positions` and `port_speeds`, by the number of the unknown in
         `linearisation_point`.
@@ -131,7 +199,7 @@ class PortedTrial:
     residual: FloatArray
     used: BoolArray
     deviation: FloatArray
-    coloured_noises: Sequence[tuple[int, float, float]]
+    coloured_noises: Sequence[ColouredNoise]
     shared_derivatives: FloatArray
     local_derivatives: FloatArray
     local_precision: FloatArray
@@ -142,35 +210,33 @@ class PortedTrial:
     port_speeds: FloatArray
     begins_at_rest: bool
     linearisation_point: FloatArray = field(default_factory=lambda: np.zeros(0))
-    gain_unknowns: Sequence[tuple[int, int, float]] = ()
+    gain_unknowns: Sequence[GainUnknown] = ()
     port_motion_derivatives: Mapping[int, FloatArray] = field(default_factory=dict)
 
     @cached_property
-    def intervals(self) -> tuple[FloatArray, IntArray]:
-        """The different lengths (J,) of intervals between samples [s], and an index (N,) into them.
+    def intervals(self) -> SampleIntervals:
+        """The intervals between samples.
 
-        Entry k of the index is for the interval that ends at sample k; entry 0 is not used.
         Intervals within 0.1 % of their mean are taken as equal, so that they share the matrices of
         a step.
         """
         lengths = np.diff(self.time)
         mean = float(lengths.mean())
         if np.all(np.abs(lengths - mean) < 1e-3 * mean):
-            return np.array([mean]), np.zeros(len(self.time), dtype=np.int64)
+            return SampleIntervals(np.array([mean]), np.zeros(len(self.time), dtype=np.int64))
         relative_lengths, index = np.unique(np.round(lengths / mean, 9), return_inverse=True)
-        return relative_lengths * mean, np.concatenate(([0], index)).astype(np.int64)
+        length_of_sample = np.concatenate(([0], index)).astype(np.int64)
+        return SampleIntervals(relative_lengths * mean, length_of_sample)
 
     @cached_property
-    def substep_matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The matrices (J, n, n) by which the state advances over a fine step of each length.
+    def substep_matrices(self) -> SubstepMatrices:
+        """The matrices by which the state advances over a substep.
 
-        They are the transition, and the derivatives of the next state by an input to the state's
-        rate at the start and at the end of the step. The input is linear over the step (first-order
-        hold). One exponential of the system, with the input and its rate as further states, gives
-        all three (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
+        One exponential of the system, with the input and its rate as further states, gives all of
+        them (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
         """
         n = len(self.system.generator)
-        lengths = self.intervals[0][:, None, None] / self.substeps
+        lengths = self.intervals.lengths[:, None, None] / self.substeps
         blocks = np.zeros((len(lengths), 3 * n, 3 * n))
         state, input_, input_rate = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
         blocks[:, state, state] = self.system.generator * lengths
@@ -182,7 +248,7 @@ class PortedTrial:
         by_rising_input = np.ascontiguousarray(exponential[:, state, input_rate])
         # an input that rises from 0 to 1 stands for its value at the end of the step; a constant
         # input minus a rising one falls from 1 to 0, which stands for its value at the start
-        return transition, by_constant_input - by_rising_input, by_rising_input
+        return SubstepMatrices(transition, by_constant_input - by_rising_input, by_rising_input)
 
     @cached_property
     def fine_time(self) -> FloatArray:
@@ -209,7 +275,7 @@ class PortedTrial:
         ] + added_state @ self.system.speeds.T
 
     def state_under_force(self, port: int, force: FloatArray) -> FloatArray:
-        """Return the state (F, n) that a force at a port adds.
+        """Return the state (F, n) that a force at a port adds to the response of the model.
 
         Parameters
         ----------
@@ -219,7 +285,8 @@ class PortedTrial:
             The force at the fine stamps [N, N m or the port's flow].
         """
         direction = -self.system.actions[port]
-        # s' = A s + direction force (see `PortedSystem`); at rest s' = 0 at the first sample
+        # s' = A s + direction * force (see `PortedSystem`); at rest s' = 0 at the first sample. A
+        # rigid motion makes A singular: least squares give the equilibrium without it.
         start = np.zeros(len(direction))
         if self.begins_at_rest and force[0] != 0.0:
             start = np.linalg.lstsq(self.system.generator, -direction * force[0], rcond=1e-12)[0]
@@ -286,14 +353,14 @@ class PortedTrial:
             The index in `intervals` of the length of the interval that ends at each of the N
             samples that are simulated; by default all samples of the trial.
         """
-        transitions, by_input_at_begin, by_input_at_end = self.substep_matrices
+        matrices = self.substep_matrices
         if step_of_sample is None:
-            _, step_of_sample = self.intervals
+            step_of_sample = self.intervals.length_of_sample
         states = simulate_inputs(
             self.substeps,
-            transitions,
-            np.ascontiguousarray(by_input_at_begin @ directions),
-            np.ascontiguousarray(by_input_at_end @ directions),
+            matrices.transitions,
+            np.ascontiguousarray(matrices.by_input_at_begin @ directions),
+            np.ascontiguousarray(matrices.by_input_at_end @ directions),
             step_of_sample,
             start,
             np.ascontiguousarray(inputs),
@@ -303,18 +370,26 @@ class PortedTrial:
     def readings_of_state(
         self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES
     ) -> FloatArray:
-        """Return the readings (N, C), over the noise, of an added state (F, n) and forces (F,)."""
+        """Return the readings (N, C) by an added state and forces, divided by the noise.
+
+        Parameters
+        ----------
+        states : (F, n) array
+            The added state.
+        forces : mapping of int to (F,) array
+            The forces at ports, which an acceleration shows directly, by the number of the port.
+        """
         return self.divide_by_noise(self.outputs_of_state(self.system, states, forces))
 
     def outputs_of_state(
         self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
     ) -> FloatArray:
-        """Return the outputs (N, C) of an added state and of forces, in the units of the channels.
+        """Return the outputs (N, C) of a system by an added state and forces [unit of the channel].
 
         Parameters
         ----------
         system : PortedSystem
-            The system whose outputs are meant, or its derivative by a parameter.
+            The system of the trial, or its derivative by a parameter.
         states : (F, n) array
             The added state.
         forces : mapping of int to (F,) array
@@ -328,7 +403,7 @@ class PortedTrial:
     def readings_of_forces_in_block(
         self, forces: Mapping[int, FloatArray], begin: int, end: int
     ) -> FloatArray:
-        """Return the change of readings (B, C) by forces in a block of B samples, over the noise.
+        """Return the readings (B, C) by forces in a block of B samples, divided by the noise.
 
         The system is at rest at the start of the block, so that forces before it have no effect.
 
@@ -342,8 +417,7 @@ class PortedTrial:
         fine_stamps_of_block = slice(begin * self.substeps, (end - 1) * self.substeps + 1)
         forces_in_block = {port: force[fine_stamps_of_block] for port, force in forces.items()}
         directions = -np.array([self.system.actions[port] for port in forces_in_block]).T
-        _, index_of_all = self.intervals
-        step_of_sample = np.ascontiguousarray(index_of_all[begin:end])
+        step_of_sample = np.ascontiguousarray(self.intervals.length_of_sample[begin:end])
         inputs = np.array([*forces_in_block.values()]).T
         states = self._state_under_inputs(
             np.zeros(len(directions)), directions, inputs, step_of_sample
@@ -352,28 +426,26 @@ class PortedTrial:
         return np.asarray(readings / self.deviation * self.used[begin:end])
 
     def divide_by_noise(self, columns: FloatArray) -> FloatArray:
-        """Return columns (..., N, C) divided by the noise; 0 if a reading does not count."""
+        """Return columns (..., N, C) over the noise deviation; 0 if a reading does not count."""
         return np.asarray(columns / self.deviation * self.used)
 
 
-def correlated_noise_part(noise: NoiseModel, interval: float | None) -> tuple[float, float] | None:
-    """Return the part of a noise that is correlated in time: share of the variance, and rate.
+def correlated_noise_part(
+    channel: int, noise: NoiseModel, interval: float | None
+) -> ColouredNoise | None:
+    """Return the part of a channel's noise that is correlated in time, or None if it is white.
 
     The noise is taken as white noise plus an autoregression of first order. The autocovariance of
     the sum at lags of one and two samples determines both parts.
 
     Parameters
     ----------
+    channel : int
+        The index of the channel.
     noise : NoiseModel
-        The noise of a channel, with the coefficients of an autoregression of any order.
+        Its noise, with the coefficients of an autoregression of any order.
     interval : float or None
         The interval between samples [s]; None if the samples are not equally spaced.
-
-    Returns
-    -------
-    (float, float) or None
-        The share of the correlated part in the variance, and its decay rate [1/s]; None if the
-        noise is white.
     """
     if interval is None or not noise.applies(interval):
         return None
@@ -389,9 +461,12 @@ def correlated_noise_part(noise: NoiseModel, interval: float | None) -> tuple[fl
         return None
     # for a first-order autoregression plus white noise, c_1 = share c_0 decay and c_2 = c_1 decay
     decay = covariances[2] / covariances[1]
-    return min(covariances[1] / decay / covariances[0], 1.0 - LEAST_WHITE_SHARE), -float(
-        np.log(decay)
-    ) / interval
+    share = covariances[1] / decay / covariances[0]
+    return ColouredNoise(
+        channel=channel,
+        share=min(share, 1.0 - LEAST_WHITE_SHARE),
+        decay_rate=-float(np.log(decay)) / interval,
+    )
 
 
 def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTrial:
@@ -480,9 +555,7 @@ def _residual_and_derivatives(
     return residual, by_shared, by_local
 
 
-def _gain_unknowns(
-    problem: Problem, trial: Trial, gains: FloatArray
-) -> list[tuple[int, int, float]]:
+def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[GainUnknown]:
     """Return the shared unknowns that are gains of the trial's channels.
 
     Parameters
@@ -500,39 +573,31 @@ def _gain_unknowns(
         if channel_name in trial.channels:
             number = shared.parameter_count + index
             channel = trial.channels.index(channel_name)
-            unknowns.append((number, channel, float(shared.scale[number]) / float(gains[channel])))
+            scale = float(shared.scale[number]) / float(gains[channel])
+            unknowns.append(GainUnknown(number, channel, scale))
     return unknowns
 
 
-def _coloured_noises(
-    noises: Sequence[NoiseModel], interval: float | None
-) -> list[tuple[int, float, float]]:
-    """Return the channels whose noise has a correlated part, as `PortedTrial.coloured_noises`."""
-    coloured = []
-    for channel, noise in enumerate(noises):
-        share_and_rate = correlated_noise_part(noise, interval)
-        if share_and_rate is not None:
-            coloured.append((channel, *share_and_rate))
-    return coloured
+def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> list[ColouredNoise]:
+    """Return the parts of the channels' noises that are correlated in time."""
+    parts = [
+        correlated_noise_part(channel, noise, interval) for channel, noise in enumerate(noises)
+    ]
+    return [part for part in parts if part is not None]
 
 
 def _substep_count(system: PortedSystem, time: FloatArray) -> int:
-    """Return the number of fine steps in an interval between two samples.
+    """Return the number of substeps in an interval between two samples.
 
-    The fastest mode moves by at most `LARGEST_SUBSTEP_PHASE` in a step, within `FEWEST_SUBSTEPS`
-    and `MOST_SUBSTEPS` steps.
+    The phase of the fastest mode changes by at most `LARGEST_SUBSTEP_PHASE` in a substep, if that
+    needs no more than `MOST_SUBSTEPS`; the number is at least `FEWEST_SUBSTEPS`.
     """
     interval = float(np.median(np.diff(time)))
     fastest_angular_frequency = float(
         np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)
     )
-    return int(
-        np.clip(
-            np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE),
-            FEWEST_SUBSTEPS,
-            MOST_SUBSTEPS,
-        )
-    )
+    needed = np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE)
+    return int(np.clip(needed, FEWEST_SUBSTEPS, MOST_SUBSTEPS))
 
 
 def _port_motion(
@@ -549,7 +614,7 @@ def _port_motion(
     point : Point
         The values of the unknowns.
     substeps : int
-        The number of fine steps in an interval between two samples.
+        The number of substeps in an interval between two samples.
 
     Returns
     -------

@@ -1,12 +1,13 @@
-"""The missing forces of all trials together: processes, courses, and the motion with them.
+"""All trials in motion as one linear model: its unknowns, missing forces, and the motion with them.
 
-A view is the set of trials, linear in all unknowns, with the columns of what may act in them. A
-column is the change of the readings for a unit of one unknown.
+A column is the change of the trials for a unit of one unknown. The columns of effects and of
+parameters are those along a motion of the trials that was estimated before.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,8 +26,22 @@ from .process_search import MOST_STEPS, Processes, ProcessSearch, prior_log_dens
 from .trial import PortedTrial, TrialColumn
 
 INFORMING_SAMPLES = 200
-"""Number of samples after a moment by which its smoothed state is as well known as by any more of
-them."""
+"""Number of later samples after which further ones hardly improve a smoothed state."""
+
+
+class PortDeviations(NamedTuple):
+    """The posterior standard deviations of a missing force and of the motion of its port.
+
+    Attributes
+    ----------
+    force : (N,) ndarray
+        The deviation of the force at the samples [N, N m or the port's flow].
+    speed : float
+        The deviation of the speed of the port [m/s or rad/s].
+    """
+
+    force: FloatArray
+    speed: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +61,8 @@ class TrialMotion:
         The part of `added_state` that parameters and laws explain.
     positions, speeds : (F, P) ndarray
         The motion of the ports [m or rad, and per s].
-    deviations_by_port : mapping of int to ((N,) ndarray, float)
-        The posterior standard deviations of the missing force at the samples, and of the speed of
-        its port.
+    deviations_by_port : mapping of int to PortDeviations
+        The posterior standard deviations of each missing force and the speed of its port.
     """
 
     added_state: FloatArray
@@ -57,7 +71,7 @@ class TrialMotion:
     explained_state: FloatArray
     positions: FloatArray
     speeds: FloatArray
-    deviations_by_port: Mapping[int, tuple[FloatArray, float]]
+    deviations_by_port: Mapping[int, PortDeviations]
 
     @property
     def law_forces(self) -> dict[int, FloatArray]:
@@ -69,11 +83,45 @@ class TrialMotion:
 
 
 EffectColumn = Sequence[TrialColumn]
-"""The column of an effect: its change of each trial for a unit of its unknown."""
+"""The column of an effect: the change of each trial, in order, for a unit of the effect's
+unknown."""
+
+
+class UnknownColumn(NamedTuple):
+    """The change of a trial by one unknown.
+
+    Attributes
+    ----------
+    change : TrialColumn
+        The change for a unit of the unknown.
+    zero_value : float
+        The value of the unknown at which nothing is changed: that about which the trial is linear.
+    """
+
+    change: TrialColumn
+    zero_value: float
+
+
+class SmoothedTrials(NamedTuple):
+    """The unknowns and the motion of all trials, given all readings.
+
+    Attributes
+    ----------
+    solution : Solution
+        The shared unknowns, then those of effects.
+    local : list of (L,) array
+        The unknowns of each trial alone.
+    motions : list of TrialMotion
+        The motion of each trial, with its missing forces.
+    """
+
+    solution: Solution
+    local: list[FloatArray]
+    motions: list[TrialMotion]
 
 
 def sum_of_columns(columns: Sequence[EffectColumn], factors: Sequence[float]) -> EffectColumn:
-    """Return the sum of columns, each multiplied by its factor."""
+    """Return the sum of columns, each multiplied by its factor, trial by trial."""
     first_column, *other_columns = columns
     sum_by_trial = [
         TrialColumn(np.zeros_like(column_in_trial.readings)).plus(column_in_trial, factors[0])
@@ -89,7 +137,7 @@ def sum_of_columns(columns: Sequence[EffectColumn], factors: Sequence[float]) ->
 
 @dataclass(frozen=True, eq=False)
 class LinearTrials:
-    """The trials, linear in all unknowns, with the columns of what may act in them.
+    """The trials in motion, linear in all unknowns, with the columns of a hypothesis' effects.
 
     Attributes
     ----------
@@ -98,15 +146,17 @@ class LinearTrials:
     shared_precision : (K,) ndarray
         The prior precisions of the shared unknowns.
     motions : sequence of TrialMotion
-        The motion of each trial along which laws and parameters act; empty for that of the model.
+        The motion of each trial along which the columns of laws and parameters are computed; empty
+        before any motion has been estimated.
     effect_columns : sequence of EffectColumn
-        The columns of effects, each with one more unknown.
+        The columns of effects; each is multiplied by one more unknown.
     effect_precision : sequence of float
         The prior precisions of these unknowns.
     constant_column : EffectColumn or None
-        The part of the hypothesis that has no unknown.
+        The change of the trials by the effects at zero unknowns; None without effects.
     model_laws_column : EffectColumn or None
-        The forces of the model's own laws, which its linear system does not contain.
+        The change of the trials by the model's own laws at ports, which its linear system does not
+        contain; None if it has no such laws.
     """
 
     trials: Sequence[PortedTrial]
@@ -123,29 +173,21 @@ class LinearTrials:
         return np.concatenate((self.shared_precision, self.effect_precision))
 
     @cached_property
-    def columns_by_unknown(self) -> list[dict[int, tuple[TrialColumn, float]]]:
-        """The change of each trial for a unit of each unknown, by the number of the unknown.
+    def columns_by_unknown(self) -> list[dict[int, UnknownColumn]]:
+        """The columns of parameters, gains and effects in each trial, by the number of the unknown.
 
-        Beside each change stands the value of the unknown at which the change is zero: that about
-        which the trial is linear.
+        The columns of parameters and gains contain only the change of the added state; that of the
+        model's response is in `PortedTrial.shared_derivatives`.
         """
-        by_trial: list[dict[int, tuple[TrialColumn, float]]] = [{} for _ in self.trials]
-        for trial, motion, changes in zip(self.trials, self.motions, by_trial, strict=False):
-            # calibrated parameters change the system, and with it the added state
-            for unknown, slope in enumerate(trial.system_derivatives):
-                if slope is not None:
-                    change = trial.change_by_system_parameter(
-                        slope, motion.added_state, motion.forces
-                    )
-                    changes[unknown] = (change, float(trial.linearisation_point[unknown]))
-            # gains change the readings of their channel
-            readings = trial.readings_of_state(motion.added_state, motion.forces)
-            for unknown, channel, scale in trial.gain_unknowns:
-                change = TrialColumn(readings * scale * np.eye(readings.shape[1])[channel])
-                changes[unknown] = (change, float(trial.linearisation_point[unknown]))
+        # without a motion (no entry in `motions`) nothing is added that parameters could change
+        by_trial = [
+            _columns_along_motion(trial, motion)
+            for trial, motion in zip(self.trials, self.motions, strict=False)
+        ]
+        by_trial += [{} for _ in range(len(self.trials) - len(by_trial))]
         for unknown, column in enumerate(self.effect_columns, start=len(self.shared_precision)):
-            for change, changes in zip(column, by_trial, strict=True):
-                changes[unknown] = (change, 0.0)
+            for change, columns in zip(column, by_trial, strict=True):
+                columns[unknown] = UnknownColumn(change, 0.0)
         return by_trial
 
     @cached_property
@@ -157,21 +199,23 @@ class LinearTrials:
         """
         by_trial = []
         first_local = 1 + len(self.prior_precision)
-        for number, trial in enumerate(self.trials):
+        for trial_index, trial in enumerate(self.trials):
             row_count = first_local + len(trial.local_derivatives)
+            # the rows of one reading lie side by side in memory, as the filter needs them
             rows = np.moveaxis(np.zeros((*trial.residual.shape, row_count)), -1, 0)
-            forces_without_unknown = [
-                column[number].readings
+            readings_without_unknown = [
+                column[trial_index].readings
                 for column in (self.constant_column, self.model_laws_column)
                 if column is not None
             ]
-            rows[0] = trial.residual - sum(forces_without_unknown)
+            rows[0] = trial.residual - sum(readings_without_unknown)
             rows[1 : 1 + len(trial.shared_derivatives)] = trial.shared_derivatives
             rows[first_local:] = trial.local_derivatives
-            for unknown, (change, value) in self.columns_by_unknown[number].items():
+            for unknown, (change, zero_value) in self.columns_by_unknown[trial_index].items():
                 rows[1 + unknown] += change.readings
-                # the change is proportional to (unknown - value): refer the residual to zero
-                rows[0] += value * change.readings
+                # the change is proportional to (unknown - zero_value): refer the residual to an
+                # unknown of zero
+                rows[0] += zero_value * change.readings
             by_trial.append(rows)
         return by_trial
 
@@ -224,10 +268,9 @@ class LinearTrials:
     @cached_property
     def correlation_time_range(self) -> tuple[float, float]:
         """The bounds of a correlation time [s]: shortest sampling interval, longest record."""
-        stamps = [trial.time for trial in self.trials]
-        return min(float(np.median(np.diff(time))) for time in stamps), max(
-            float(time[-1] - time[0]) for time in stamps
-        )
+        intervals = [float(np.median(np.diff(trial.time))) for trial in self.trials]
+        durations = [float(trial.time[-1] - trial.time[0]) for trial in self.trials]
+        return min(intervals), max(durations)
 
     def log_evidence_with_prior(self, median: Processes, processes: Processes) -> float:
         """Return the log of evidence times prior of missing forces [nat].
@@ -243,7 +286,7 @@ class LinearTrials:
 
     def smooth(
         self, processes: Processes, fixed_solution: Solution | None = None
-    ) -> tuple[Solution, list[FloatArray], list[TrialMotion]]:
+    ) -> SmoothedTrials:
         """Return unknowns, motions and missing forces given all readings.
 
         Parameters
@@ -253,30 +296,19 @@ class LinearTrials:
         fixed_solution : Solution, optional
             The values of the shared unknowns and of those of effects; by default the most probable
             ones.
-
-        Returns
-        -------
-        solution : Solution
-            The shared unknowns, then those of effects.
-        local : list of (L,) array
-            The unknowns of each trial alone.
-        motions : list of TrialMotion
-            The motion of each trial.
         """
         solution = fixed_solution or self.solve(processes)
-        local_values, motions = [], []
-        for number, trial_filter in enumerate(self.force_filters(processes)):
-            rows = self.regression_rows[number]
+        local_of_trials = []
+        motions = []
+        for trial_index, force_filter in enumerate(self.force_filters(processes)):
+            rows = self.regression_rows[trial_index]
             unexplained = rows[0] - np.tensordot(solution.mean, rows[1 : 1 + len(solution.mean)], 1)
-            local = _local_unknowns(trial_filter, unexplained)
-            unexplained = unexplained - np.tensordot(local, trial_filter.trial.local_derivatives, 1)
-            motions.append(
-                self._trial_motion(
-                    number, processes, trial_filter.smooth(unexplained), solution, local
-                )
-            )
-            local_values.append(local)
-        return solution, local_values, motions
+            local = _local_unknowns(force_filter, unexplained)
+            unexplained = unexplained - np.tensordot(local, force_filter.trial.local_derivatives, 1)
+            smoothed = force_filter.smooth(unexplained)
+            motions.append(self._trial_motion(trial_index, processes, smoothed, solution, local))
+            local_of_trials.append(local)
+        return SmoothedTrials(solution, local_of_trials, motions)
 
     def _trial_motion(
         self,
@@ -286,7 +318,7 @@ class LinearTrials:
         solution: Solution,
         local: FloatArray,
     ) -> TrialMotion:
-        """Return the motion of a trial with all that missing forces, unknowns and laws add to it.
+        """Return the motion of a trial: the model's, and what forces, unknowns and laws add to it.
 
         Parameters
         ----------
@@ -295,7 +327,7 @@ class LinearTrials:
         processes : mapping of int to Process
             The missing forces, by the number of the port.
         smoothed : SmoothedForces
-            Their courses, and the state that they add.
+            The missing forces in time, and the state that they add.
         solution : Solution
             The shared unknowns and those of effects.
         local : (L,) array
@@ -303,38 +335,54 @@ class LinearTrials:
         """
         trial = self.trials[trial_index]
         missing_forces = dict(zip(processes, smoothed.forces, strict=True))
-        unused_readings = np.zeros_like(trial.residual)
-        total_change = TrialColumn(unused_readings, smoothed.added_state, missing_forces)
-        for unknown, (change, value) in self.columns_by_unknown[trial_index].items():
-            total_change = total_change.plus(change, float(solution.mean[unknown] - value))
+        # only state and forces are summed; the readings of this sum are not used
+        no_readings = np.zeros_like(trial.residual)
+        hypothesis_change = TrialColumn(no_readings, smoothed.added_state, missing_forces)
+        for unknown, (change, zero_value) in self.columns_by_unknown[trial_index].items():
+            unknown_change = float(solution.mean[unknown] - zero_value)
+            hypothesis_change = hypothesis_change.plus(change, unknown_change)
         if self.constant_column is not None:
-            total_change = total_change.plus(self.constant_column[trial_index], 1.0)
-        with_own_laws = (
-            total_change
-            if self.model_laws_column is None
-            else total_change.plus(self.model_laws_column[trial_index], 1.0)
-        )
-        added = with_own_laws.added_state
-        assert added is not None
+            hypothesis_change = hypothesis_change.plus(self.constant_column[trial_index], 1.0)
+        # the model's own laws move the trial, but are not among the forces that the model lacks
+        whole_change = hypothesis_change
+        if self.model_laws_column is not None:
+            whole_change = whole_change.plus(self.model_laws_column[trial_index], 1.0)
+        added_state = whole_change.added_state
+        assert added_state is not None
         unknowns = np.concatenate((solution.mean[: len(self.shared_precision)], local))
-        positions, speeds = trial.port_motion(unknowns, added)
-        force_deviations, speed_deviations = np.split(smoothed.deviations, 2)
-        # the deviation of a speed is taken so long before the end that later readings inform on it
-        deviations = {
-            port: (force, float(speed[-INFORMING_SAMPLES:][0]))
-            for port, force, speed in zip(
-                processes, force_deviations, speed_deviations, strict=True
-            )
-        }
+        positions, speeds = trial.port_motion(unknowns, added_state)
+        deviations = {}
+        for port, force, speed in zip(
+            processes, smoothed.force_deviations, smoothed.speed_deviations, strict=True
+        ):
+            # the last samples have no later readings: their speeds are known less well than others
+            deviations[port] = PortDeviations(force, float(speed[-INFORMING_SAMPLES:][0]))
         return TrialMotion(
-            added_state=added,
-            forces=total_change.forces,
+            added_state=added_state,
+            forces=hypothesis_change.forces,
             unexplained_forces=missing_forces,
-            explained_state=added - smoothed.added_state,
+            explained_state=added_state - smoothed.added_state,
             positions=positions,
             speeds=speeds,
             deviations_by_port=deviations,
         )
+
+
+def _columns_along_motion(trial: PortedTrial, motion: TrialMotion) -> dict[int, UnknownColumn]:
+    """Return the columns of parameters and gains along a motion, by the number of the unknown."""
+    columns = {}
+    # calibrated parameters change the system, and with it the added state
+    for unknown, derivative in enumerate(trial.system_derivatives):
+        if derivative is not None:
+            change = trial.change_by_system_parameter(derivative, motion.added_state, motion.forces)
+            columns[unknown] = UnknownColumn(change, float(trial.linearisation_point[unknown]))
+    # gains change the readings of their channel
+    readings = trial.readings_of_state(motion.added_state, motion.forces)
+    for unknown, channel, scale in trial.gain_unknowns:
+        is_channel = np.eye(readings.shape[1])[channel]
+        change = TrialColumn(readings * scale * is_channel)
+        columns[unknown] = UnknownColumn(change, float(trial.linearisation_point[unknown]))
+    return columns
 
 
 def _local_unknowns(force_filter: ForceFilter, unexplained: FloatArray) -> FloatArray:

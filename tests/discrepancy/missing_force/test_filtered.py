@@ -14,7 +14,7 @@ from discrepancy.missing_force.explained import fit_missing_forces
 from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, sum_regressions
 from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
-from discrepancy.missing_force.trial import PortedTrial, correlated_noise_part
+from discrepancy.missing_force.trial import ColouredNoise, PortedTrial, SampleIntervals, correlated_noise_part
 from discrepancy.missing_force.view import LinearTrials
 from discrepancy.missing_force.windows import _port_or_channel_error, add_window_sizes, windows_of_residuals
 from discrepancy.report.load_and_time_figures import time_line_figure
@@ -119,7 +119,9 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     used = random.uniform(size=(40, 2)) > 0.2
     local, share = random.standard_normal((unknown, 40, 2)) * used, 0.4 * unknown
     process = Process(2.0, 0.15, rough)
-    trial = trial_of(time, residual, used=used, local=local, coloured=((0, share, 12.0),) if share else ())
+    trial = trial_of(
+        time, residual, used=used, local=local, coloured=[ColouredNoise(0, share, 12.0)] if share else ()
+    )
     filtered = ForceFilter(trial, [(0, process)])
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
@@ -139,7 +141,7 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
             sum(one.half_log_determinant for one in each), rel=1e-9
         )
         return
-    _, (force,), (deviation, _) = filtered.smooth(trial.residual)
+    _, (force,), (deviation,), _ = filtered.smooth(trial.residual)
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
     np.testing.assert_allclose(force, mean, atol=0.02 * process.standard_deviation)
     own = cross[::PARTS, at]
@@ -153,7 +155,9 @@ def test_steady_gains_are_those_of_every_step():
     trial = trial_of(time, random.standard_normal((900, 2)))
     filtered = ForceFilter(trial, [(0, PROCESS)])
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
-    object.__setattr__(jittered, "intervals", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
+    object.__setattr__(
+        jittered, "intervals", SampleIntervals(np.full(900, 0.02), np.arange(900))
+    )  # as if each were its own
     every = ForceFilter(jittered, [(0, PROCESS)])
     late = [states(one)[0][[200, 899]] for one in (filtered, every)]
     assert [np.array_equal(*covers) for covers in late] == [True, False]
@@ -184,16 +188,16 @@ def test_states_and_noise_by_closed_forms():
     np.testing.assert_allclose(still - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
     # noise of a deviation of one, part of it coloured
     count = 5000
-    told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=((0, 0.4, 12.0),))
+    told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=(ColouredNoise(0, 0.4, 12.0),))
     made = _simulated_noise(told)
     np.testing.assert_allclose(made.std(axis=0), 1.0, rtol=0.1)
     assert made[1:, 0] @ made[:-1, 0] / count == pytest.approx(0.4 * np.exp(-12.0 * 0.02), abs=0.1)
     # noise of first order is taken apart
     noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
-    assert correlated_noise_part(noise, 0.01) == (
-        pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
+    assert correlated_noise_part(1, noise, 0.01) == (
+        1, pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
     )  # fmt: skip
-    assert correlated_noise_part(noise, 0.02) is None
+    assert correlated_noise_part(1, noise, 0.02) is None
 
 
 def test_evidence_beside_unknowns_is_that_of_their_prior():
