@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import (
     Candidate,
@@ -159,7 +159,9 @@ def fit(
             next_state = descent.descend(state, step)
         if next_state is not None:
             decrease = state.objective - next_state.objective
-            damping = max(damping * (0.1 if decrease > 0.5 * predicted_decrease else 0.5), 1e-9)
+            # the better the prediction, the less damping has the next step
+            reduction = 0.1 if decrease > 0.5 * predicted_decrease else 0.5
+            damping = max(damping * reduction, 1e-9)
             state = next_state
             # a decrease well below the predicted one shows that the derivatives are outdated
             has_current_derivatives = decrease < 0.7 * predicted_decrease
@@ -167,13 +169,11 @@ def fit(
                 state = descent.state_at(state.point)
             # the further decrease is taken to be at most twice the one predicted for this step
             is_near_newton = damping < NEWTON_DAMPING
-            if (
-                objective_limit is not None
-                and is_near_newton
-                and state.objective - 2.0 * predicted_decrease > objective_limit
-            ):
+            expected_end = state.objective - 2.0 * predicted_decrease
+            if objective_limit is not None and is_near_newton and expected_end > objective_limit:
                 break
-        elif not has_current_derivatives:  # no step was found with old derivatives
+        elif not has_current_derivatives:
+            # no step was found with old derivatives: try again with new ones
             state = descent.state_at(state.point)
             has_current_derivatives = True
         elif predicted_decrease < CONVERGED_DECREASE:
@@ -365,13 +365,10 @@ class _Descent:
         covariance_columns = solve_factored(cholesky_factor(equations.matrix), unit_vectors)
         self.effect_deviation = np.sqrt(np.diag(covariance_columns[first_effect:first_local]))
         # unknowns that may move
-        low, high = problem.shared.bounds
-        shared = state.point.shared
+        first_free = first_local if self.local_only else 0
+        is_free = np.arange(size) >= first_free
         downhill = check_finite(equations.gradient)[:first_effect]
-        is_held_low = (shared <= low) & (downhill < 0.0)
-        is_held_high = (shared >= high) & (downhill > 0.0)
-        is_free = np.arange(size) >= (first_local if self.local_only else 0)
-        is_free[:first_effect] &= ~(is_held_low | is_held_high)
+        is_free[:first_effect] &= ~self._is_held_at_bound(state.point.shared, downhill)
         # Levenberg-Marquardt step
         damped_matrix = equations.matrix + damping * np.diag(np.diag(equations.matrix))
         damped_matrix = damped_matrix[np.ix_(is_free, is_free)]
@@ -379,6 +376,21 @@ class _Descent:
         step[is_free] = solve_factored(cholesky_factor(damped_matrix), equations.gradient[is_free])
         predicted_decrease = 0.5 * float(equations.gradient @ step)
         return self._split_step(step), predicted_decrease
+
+    def _is_held_at_bound(self, shared: FloatArray, downhill: FloatArray) -> BoolArray:
+        """Return which shared unknowns (Q,) are at an end of their range and would leave it.
+
+        Parameters
+        ----------
+        shared : (Q,) array
+            The scaled shared unknowns.
+        downhill : (Q,) array
+            The direction in which the objective decreases.
+        """
+        low, high = self.problem.shared.bounds
+        is_held_low = (shared <= low) & (downhill < 0.0)
+        is_held_high = (shared >= high) & (downhill > 0.0)
+        return np.asarray(is_held_low | is_held_high)
 
     def _split_step(self, step: FloatArray) -> Point:
         """Return a step of all unknowns (n,) split into shared, effect and local unknowns."""

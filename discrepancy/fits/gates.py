@@ -130,10 +130,10 @@ def _recorded_colour_factor(problem: Problem, fit: CandidateFit) -> FloatArray:
 def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     """Return χ² tests of whether the unknowns of a fit are consistent with their priors.
 
-    A wrong model can fit the readings by moving calibrated values far from their priors, and a law
-    by extreme parameters that make it another law: a joint that slips at zero force is a soft
-    joint. The magnitude of an effect is not tested, as it may have any value. The tests are
-    conservative, since estimates scatter less than the prior.
+    A wrong model can fit the readings if calibrated parameters move far from their priors. A wrong
+    law can fit them with extreme parameters, which make it another law: a joint that slips at zero
+    force is a soft joint. The magnitude of an effect is not tested, as it may have any value. The
+    tests are conservative, since estimates scatter less than the prior.
     """
     # scaled unknowns are standard normal under their prior: their sum of squares is χ²
     shared = problem.shared
@@ -150,8 +150,10 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
         p_value = float(chi2.sf(gain_deviations @ gain_deviations, gain_deviations.size))
         tests.append(NamedTest("gains beside their priors", p_value))
     for term, values in fit.candidate.split_by_term(fit.effect):
+        # the values of free shape parameters follow those of the effect, and are not tested
         for parameter, u in zip(term.effect.parameters, values.tolist(), strict=False):
-            is_uniform = parameter.prior.shape == "uniform"  # its ends are as likely as its middle
+            # the ends of a uniform prior are as probable as its middle
+            is_uniform = parameter.prior.shape == "uniform"
             if parameter.magnitude or is_uniform:
                 continue
             name = f"{parameter.name} of {term.effect.identifier} beside its prior"

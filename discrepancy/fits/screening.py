@@ -372,19 +372,30 @@ def parameter_grid(
 def _magnitude_levels(
     parameter: EffectParameter | ShapeParameter, *, is_first: bool, with_small_magnitude: bool
 ) -> tuple[float, ...]:
-    """Return the scaled values of a magnitude in the grid.
+    """Return the scaled values at which a magnitude is tried in the grid.
 
-    The first magnitude of an effect needs fewer values, as it only scales the change. A magnitude
-    is signed if the median of its prior is zero.
+    Parameters
+    ----------
+    parameter : EffectParameter or ShapeParameter
+        The magnitude.
+    is_first : bool
+        Whether it is the first magnitude of its effect. The screen finds the best factor on that
+        one, of either sign, so that it needs fewer values than others.
+    with_small_magnitude : bool
+        Whether a first magnitude that may be negative is tried at a small value too.
     """
-    is_signed = parameter.prior.value(0.0) == 0.0
-    if parameter.levels and is_first:
+    has_own_levels = parameter.levels > 0
+    if has_own_levels and is_first:
         return _prior_quantiles(parameter)
-    if not is_signed:
+    # the prior of a magnitude that may have both signs has the median zero
+    may_be_negative = parameter.prior.value(0.0) == 0.0
+    if not may_be_negative:
         return (0.0,)
     if not is_first:
         return (-1.0, 0.0, 1.0)
-    return (1.0, SEARCH.small_magnitude) if with_small_magnitude else (1.0,)
+    if with_small_magnitude:
+        return (1.0, SEARCH.small_magnitude)
+    return (1.0,)
 
 
 def _prior_quantiles(parameter: EffectParameter | ShapeParameter) -> tuple[float, ...]:

@@ -342,7 +342,7 @@ class TrialData:
         The noise standard deviation s0 of each column [unit of the channel]. If the column is
         whitened, it is that of the whitened samples.
     channel_indices : (C,) array of int
-        The index of each column's channel among those of the campaign.
+        The index, among the channels of the campaign, of the channel of each column.
     unknowns : LocalUnknowns
         The layout of the unknowns of this trial.
     weight : (N, C) array
@@ -401,6 +401,8 @@ class TrialData:
         """
         channel_names = list(campaign.channels)
         noise_models = tuple(models_by_channel[name] for name in trial.channels)
+        # a coloured noise is whitened if its coefficients hold for the sampling interval of the
+        # trial; the whitened samples then have the deviation of its innovations
         is_whitened = [noise.applies(trial.whitened_at) for noise in noise_models]
         sample_deviation = [noise.static_deviation for noise in noise_models]
         innovation_deviation = [noise.standard_deviation for noise in noise_models]

@@ -38,9 +38,10 @@ class MissingForces:
     Attributes
     ----------
     hypothesis_by_port : dict of str to ForceHypothesis
-        The missing force at each port alone. It is estimated twice: first along the motion of the
-        model, for the initial states of the trials; then along the motion estimated so, with the
-        parameters linear about their estimates, and with the model's own laws.
+        The missing force at each port alone, by the name of the port. It is estimated twice: first
+        along the motion of the model, which gives the initial states of the trials; then along the
+        motion that was estimated first, with the model's own laws and with the parameters linear
+        about their first estimates.
     ports : tuple of str
         The names of the ports.
     model_laws : ModelPatch
@@ -48,7 +49,7 @@ class MissingForces:
     point : Point
         The unknowns about which the trials are linear.
     column_builder : ColumnBuilder
-        The builder of the columns of effects in these trials.
+        The object that computes the columns of effects in these trials.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -59,11 +60,13 @@ class MissingForces:
         self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear_model.ports)
         self.hypothesis_by_port: dict[str, ForceHypothesis] = {}
+        # first estimate, along the motion of the model at the prior means
         self.point = self.problem.prior_mean_point(NO_EFFECTS)
         linear_trials = self._linearise_trials()
         for port, name in enumerate(self.ports):
             processes = self.prior_processes((port,))
             self.hypothesis_by_port[name] = fit_missing_forces(linear_trials, processes, processes)
+        # second estimate, about the unknowns of the best port
         self.point = self._clipped_point(self.hypothesis_of_best_port())
         linear_trials = self._linearise_trials()
         for port, name in enumerate(self.ports):
@@ -91,7 +94,7 @@ class MissingForces:
         for at_port in best_ports[1:]:
             initial |= scale_processes(at_port.processes, FURTHER_PORT_FACTOR, 1.0)
         linear_trials = best.linear_trials
-        # the second time along the motion that the first one has estimated
+        # twice: the second estimate is along the motion of the first one
         for skip_grid in (False, True):
             median = self.prior_processes(initial)
             hypothesis = fit_missing_forces(linear_trials, median, initial, skip_grid=skip_grid)
@@ -108,8 +111,9 @@ class MissingForces:
     def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
         """Return the prior medians of missing forces, by the number of the port.
 
-        The median size is 5 % of the elastic force at the port; the median time is that of a radian
-        of the vibration, or the duration of the trials if there is no frequency.
+        The median standard deviation is 5 % of the elastic force at the port. The median
+        correlation time is that of one radian of the vibration, or the duration of the trials if
+        the port has no frequency.
 
         Parameters
         ----------
@@ -148,7 +152,7 @@ class MissingForces:
     def hypothesis_with_jumps(self, port: str) -> ForceHypothesis:
         """Return the missing force at a port as a process that may jump.
 
-        The trials are made linear about the motion that it gives, twice.
+        The trials are linearised twice, the second time about the motion of the first estimate.
 
         Parameters
         ----------
@@ -159,13 +163,13 @@ class MissingForces:
         for _ in range(2):
             self.point = self._clipped_point(hypothesis)
             linear_trials = self._linearise_trials()
-            # the model's own laws and the motion depend on each other: twice
+            # the model's own laws depend on the motion, and it on them: iterate twice
             for _ in range(2):
                 motions = linear_trials.smooth(hypothesis.processes).motions
                 linear_trials = self.column_builder.trials_along_motions(linear_trials, motions)
             initial = {}
-            for number, process in hypothesis.processes.items():
-                initial[number] = replace(process, may_jump=True)
+            for port_number, process in hypothesis.processes.items():
+                initial[port_number] = replace(process, may_jump=True)
             hypothesis = fit_missing_forces(linear_trials, self.prior_processes(initial), initial)
         return hypothesis
 

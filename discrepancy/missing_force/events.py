@@ -8,6 +8,7 @@ than the price of the changes. A path (N,) says for each sample whether the forc
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 from scipy.optimize import minimize
@@ -27,8 +28,8 @@ from .switched_record import (
 from .view import LinearTrials
 
 CHANGE_GRID_SIZE = 4000
-"""Approximate number of places of a change in a short record, which then lie between its samples
-too."""
+"""Least number of points of a record at which a change is looked for, when its time is determined.
+In a shorter record some of them lie between samples."""
 MOST_SAMPLES = 4000
 """Largest number of samples of all records together in which events are looked for. Of longer
 records only every k-th sample is used, except in the last step."""
@@ -171,7 +172,7 @@ class Events:
     Attributes
     ----------
     search : EventSearch
-        The search that found them.
+        The search in which they were found.
     forces : (Process, Process)
         The force of events, and the force that may be missing throughout.
     paths : sequence of (N,) ndarray of bool
@@ -242,21 +243,17 @@ def find_events(
         Events with changes if these are more probable than `least_score` and than a force that acts
         throughout the records that have one; otherwise such a force.
     """
-    # rounded up
-    stride = -(-sum(len(trial.time) for trial in linear_trials.trials) // MOST_SAMPLES)
+    sample_count = sum(len(trial.time) for trial in linear_trials.trials)
+    stride = ceil(sample_count / MOST_SAMPLES)
     search = EventSearch(linear_trials, port, process, stride=stride)
     never = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
     steady = _steady_force_where_needed(search, never)
-    event = Process(
-        INITIAL_EVENT_DEVIATION * process.standard_deviation,
-        process.correlation_time,
-        may_jump=True,
-    )
-    forces = (
-        event,
-        replace(process, standard_deviation=INITIAL_STEADY_DEVIATION * process.standard_deviation),
-    )
-    best = _search_round(search, forces, never, FIRST_EVALUATIONS)
+    # stretches with a large force that may jump, besides a small force throughout
+    event_deviation = INITIAL_EVENT_DEVIATION * process.standard_deviation
+    steady_deviation = INITIAL_STEADY_DEVIATION * process.standard_deviation
+    event_force = Process(event_deviation, process.correlation_time, may_jump=True)
+    steady_force = replace(process, standard_deviation=steady_deviation)
+    best = _search_round(search, (event_force, steady_force), never, FIRST_EVALUATIONS)
     for _ in range(MOST_ROUNDS):
         next_events = _search_round(search, best.forces, best.paths, LATER_EVALUATIONS)
         if next_events.score < best.score + LEAST_GAIN:
@@ -266,7 +263,9 @@ def find_events(
         best = _refine_to_all_samples(best, stride)
         steady = _refine_to_all_samples(steady, stride)
     has_changes = any(len(change_samples(on)) for on in best.paths)
-    return best if has_changes and best.score > max(least_score, steady.score) else steady
+    if has_changes and best.score > max(least_score, steady.score):
+        return best
+    return steady
 
 
 def events_throughout(linear_trials: LinearTrials, port: int, process: Process) -> Events:
@@ -276,14 +275,14 @@ def events_throughout(linear_trials: LinearTrials, port: int, process: Process) 
 
 
 def _refine_to_all_samples(coarse: Events, stride: int) -> Events:
-    """Return events of a part of the samples, with changes placed among all samples.
+    """Return events that were found in every `stride`-th sample, with changes among all samples.
 
     Parameters
     ----------
     coarse : Events
-        The events.
+        The events, with paths over the samples that were used.
     stride : int
-        The step between the samples in which they were found.
+        The step between these samples.
     """
     search = EventSearch(coarse.search.linear_trials, coarse.search.port, coarse.search.process)
     paths = [
@@ -291,14 +290,16 @@ def _refine_to_all_samples(coarse: Events, stride: int) -> Events:
         for on, trial in zip(coarse.paths, search.trials, strict=True)
     ]
     events_of_all = Events(search, coarse.forces, paths, -np.inf)
-    for number in range(len(paths)):
-        paths[number] = events_of_all.switched_record(number, 1).place_changes(paths[number])
+    # `events_of_all` refers to `paths`, so that each trial is placed given those before it
+    for trial_index in range(len(paths)):
+        record = events_of_all.switched_record(trial_index, 1)
+        paths[trial_index] = record.place_changes(paths[trial_index])
     log_evidence = float(search.log_evidence(search.products(coarse.forces, paths)))
     return replace(events_of_all, score=log_evidence - price_of_changes(paths))
 
 
 def _steady_force_where_needed(search: EventSearch, never: Sequence[BoolArray]) -> Events:
-    """Return a force that acts throughout those records whose evidence needs it.
+    """Return a force that acts throughout those records whose evidence is larger with it.
 
     Parameters
     ----------
@@ -315,8 +316,8 @@ def _steady_force_where_needed(search: EventSearch, never: Sequence[BoolArray]) 
         (search.process, negligible_force), paths, FIRST_EVALUATIONS
     )
     forces = (event, negligible_force)
-    for number, off in enumerate(never):
-        paths_without = [*paths[:number], off, *paths[number + 1 :]]
+    for trial_index, off in enumerate(never):
+        paths_without = [*paths[:trial_index], off, *paths[trial_index + 1 :]]
         evidence_without = search.log_evidence(search.products(forces, paths_without))
         evidence_with = search.log_evidence(search.products(forces, paths))
         if evidence_without > evidence_with - LEAST_EVIDENCE:

@@ -31,21 +31,21 @@ from .process_search import MOST_STEPS
 from .view import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
 
 FACTOR_DEVIATION = 3.0
-"""Prior standard deviation of the factor on an effect, relative to the factor that would explain
-all of the gap."""
+"""Prior standard deviation of the factor on an effect in the screening, over the factor with
+which the effect would be as large as the gap. It is wide, so that the screening prefers no size."""
 SCREENED_DEVIATIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
-"""Sizes of the missing forces with which effects are screened, over the most probable ones without
-effects."""
+"""Standard deviations of the missing forces with which effects are screened, over the most
+probable ones without effects: an effect leaves only a part of the force."""
 SCREENED_TIMES = (0.5, 1.5)
 """Correlation times of these forces, over the most probable ones without effects."""
 LARGEST_RATIO = 1e100
 """Ratio of an effect to the gap that stands for infinity, if the gap is zero."""
 FOLLOWED_COUNTS = (10, 4, 4)
-"""Number of effects that are followed after the screening: as single effects, as second ones and as
-third ones."""
+"""Numbers of effects that are fitted after the screening: as single effects, as second ones and as
+third ones of a set."""
 TIED_EVIDENCE = 1.0
-"""Difference of log evidence to the best values of an effect, up to which other values of it are
-followed too [nat]."""
+"""Difference to the log evidence of the best values of an effect up to which fits begin at its
+other values, too [nat]."""
 BEAM_WIDTH = 3
 """Number of most probable sets to which one more effect is added."""
 MOST_ITERATIONS = 8
@@ -55,7 +55,7 @@ LONGEST_STEP = 1.5
 CONVERGED_STEP = 0.05
 """Step of a parameter below which the iteration ends, in prior standard deviations."""
 LEAST_DAMPING = 0.2
-"""Least part of a step that is taken if successive steps have opposite directions."""
+"""Least fraction of a step that is taken if successive steps have opposite directions."""
 HALF_DIFFERENCE = 0.05
 """Half the difference of a standard normal parameter in derivatives of an effect."""
 
@@ -70,7 +70,7 @@ class ScreenedEffect(NamedTuple):
     term : EffectTerm
         The effect at its place.
     starts : list of (E,) array
-        The scaled parameters from which the effect is followed.
+        The scaled parameters from which fits of the effect begin.
     """
 
     log_evidence: float
@@ -78,11 +78,26 @@ class ScreenedEffect(NamedTuple):
     starts: list[FloatArray]
 
 
+class _TriedEffect(NamedTuple):
+    """An effect at its place, the scaled values (E,) at which it is tried, and its column there."""
+
+    term: EffectTerm
+    values: FloatArray
+    column: EffectColumn
+
+
 class _WeighedColumn(NamedTuple):
     """The log evidence of a column [nat], and its most probable factor."""
 
     log_evidence: float
     factor: float
+
+
+class _WeighedStart(NamedTuple):
+    """The log evidence of an effect [nat], and the scaled parameters (E,) at which a fit begins."""
+
+    log_evidence: float
+    start: FloatArray
 
 
 class ForceSearch(MissingForces):
@@ -195,10 +210,10 @@ class ForceSearch(MissingForces):
     ) -> list[ScreenedEffect]:
         """Return the effects that may be added to a hypothesis, the most promising first.
 
-        Each effect is tried at each of its places, with several values of its parameters. It is
-        followed from all values whose evidence is within `TIED_EVIDENCE` of the best. For example,
-        dead zones of different stiffness act alike if only their amplitude is fitted, but lead to
-        different ends.
+        Each effect is tried at each of its places, with several values of its parameters. All
+        values whose evidence is within `TIED_EVIDENCE` of the best are starts of later fits. For
+        example, dead zones of different stiffness act alike if only their amplitude is fitted, but
+        fits that begin with them lead to different ends.
 
         Parameters
         ----------
@@ -207,35 +222,47 @@ class ForceSearch(MissingForces):
         effects : iterable of Effect
             The effects.
         """
-        terms: list[EffectTerm] = []
-        values_of_columns: list[FloatArray] = []
-        columns: list[EffectColumn] = []
+        tried_effects = self._try_effects(base, effects)
+        weighed_columns = self._weigh_columns(base, tried_effects)
+        weighed_by_term: dict[EffectTerm, list[_WeighedStart]] = {}
+        for index, (log_evidence, factor) in weighed_columns.items():
+            tried = tried_effects[index]
+            start = tried.term.multiply_magnitudes(
+                tried.values, factor, -LARGEST_EFFECT, LARGEST_EFFECT
+            )
+            weighed_by_term.setdefault(tried.term, []).append(_WeighedStart(log_evidence, start))
+        screened_effects = []
+        for term, weighed_starts in weighed_by_term.items():
+            best_evidence = max(weighed.log_evidence for weighed in weighed_starts)
+            starts = [
+                weighed.start
+                for weighed in weighed_starts
+                if weighed.log_evidence > best_evidence - TIED_EVIDENCE
+            ]
+            screened_effects.append(ScreenedEffect(best_evidence, term, starts))
+        return sorted(screened_effects, key=lambda effect: -effect.log_evidence)
+
+    def _try_effects(self, base: ForceHypothesis, effects: Iterable[Effect]) -> list[_TriedEffect]:
+        """Return the columns of all effects that may be added, at several values of each.
+
+        Columns that change no reading are left out.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis to which an effect is added, with the motion along which effects act.
+        effects : iterable of Effect
+            The effects.
+        """
+        tried_effects = []
         for term in self._terms_to_add(base, effects):
             for values in values_to_try(term):
-                candidate = Candidate((term,))
                 column = self.column_builder.column_of_candidate(
-                    base.linear_trials, base.motions, candidate, values
+                    base.linear_trials, base.motions, Candidate((term,)), values
                 )
                 if column is not None and any(np.any(change.readings) for change in column):
-                    terms.append(term)
-                    values_of_columns.append(values)
-                    columns.append(column)
-        starts_of_terms: dict[EffectTerm, list[tuple[float, FloatArray]]] = {}
-        for number, (log_evidence, factor) in self._weigh_columns(base, columns, terms).items():
-            term = terms[number]
-            values = values_of_columns[number]
-            start = term.multiply_magnitudes(values, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
-            starts_of_terms.setdefault(term, []).append((log_evidence, start))
-        screened_effects = []
-        for term, starts in starts_of_terms.items():
-            best_log_evidence = max(log_evidence for log_evidence, _ in starts)
-            nearly_best_starts = [
-                start
-                for log_evidence, start in starts
-                if log_evidence > best_log_evidence - TIED_EVIDENCE
-            ]
-            screened_effects.append(ScreenedEffect(best_log_evidence, term, nearly_best_starts))
-        return sorted(screened_effects, key=lambda effect: -effect.log_evidence)
+                    tried_effects.append(_TriedEffect(term, values, column))
+        return tried_effects
 
     def _terms_to_add(
         self, base: ForceHypothesis, effects: Iterable[Effect]
@@ -259,33 +286,29 @@ class ForceSearch(MissingForces):
                     yield EffectTerm(effect, place, free_shape=True)
 
     def _weigh_columns(
-        self,
-        base: ForceHypothesis,
-        columns: Sequence[EffectColumn],
-        terms: Sequence[EffectTerm],
+        self, base: ForceHypothesis, tried_effects: Sequence[_TriedEffect]
     ) -> dict[int, _WeighedColumn]:
         """Return the best evidence and factor of each column, added alone to a hypothesis.
 
-        The best is taken over several sizes and times of the remaining missing forces.
+        The best is taken over several deviations and times of the remaining missing forces.
 
         Parameters
         ----------
         base : ForceHypothesis
             The hypothesis to which an effect is added.
-        columns : sequence of EffectColumn
-            The columns, each of an effect at one set of values of its parameters.
-        terms : sequence of EffectTerm
-            The effect of each column.
+        tried_effects : sequence of _TriedEffect
+            The effects with their columns.
 
         Returns
         -------
         dict of int to _WeighedColumn
-            The evidence and factor, by the index of the column. A column is left out if its factor
-            always has a sign that its effect cannot have.
+            The evidence and factor, by the index of the tried effect. One is left out if its factor
+            always has a sign that the effect cannot have.
         """
-        if not columns:
+        if not tried_effects:
             return {}
-        view_with_columns = replace(
+        columns = [tried.column for tried in tried_effects]
+        with_columns = replace(
             base.linear_trials,
             motions=base.motions,
             effect_columns=(*base.linear_trials.effect_columns, *columns),
@@ -294,23 +317,21 @@ class ForceSearch(MissingForces):
                 *self._prior_precisions(base, columns),
             ),
         )
-        known_count = len(base.linear_trials.prior_precision)
+        base_count = len(base.linear_trials.prior_precision)
         best: dict[int, _WeighedColumn] = {}
         for size_factor, time_factor in product(SCREENED_DEVIATIONS, SCREENED_TIMES):
-            normal_equations = view_with_columns.regression(
+            normal_equations = with_columns.regression(
                 scale_processes(base.processes, size_factor, time_factor)
             )
-            # the unknowns of the base are fitted again with each column
-            for number, term in enumerate(terms):
-                unknowns = [*range(known_count), known_count + number]
-                solution = normal_equations.solve(
-                    unknowns, view_with_columns.prior_precision[unknowns]
-                )
+            for index, tried in enumerate(tried_effects):
+                # the unknowns of the base are fitted again, with this column alone
+                unknowns = [*range(base_count), base_count + index]
+                solution = normal_equations.solve(unknowns, with_columns.prior_precision[unknowns])
                 factor = float(solution.mean[-1])
-                is_better = number not in best or best[number].log_evidence < solution.log_evidence
-                has_possible_sign = factor > 0.0 or term.may_be_negative
+                is_better = index not in best or best[index].log_evidence < solution.log_evidence
+                has_possible_sign = factor > 0.0 or tried.term.may_be_negative
                 if is_better and np.isfinite(solution.log_evidence) and has_possible_sign:
-                    best[number] = _WeighedColumn(solution.log_evidence, factor)
+                    best[index] = _WeighedColumn(solution.log_evidence, factor)
         return best
 
     def _prior_precisions(
@@ -350,7 +371,7 @@ class ForceSearch(MissingForces):
     ) -> ForceHypothesis | None:
         """Return a hypothesis at its most probable values, by steps of an iterated smoother.
 
-        Each step evaluates the laws along the motion that the last one has estimated.
+        Each step evaluates the laws along the motion that was estimated by the previous one.
 
         Parameters
         ----------
@@ -368,7 +389,7 @@ class ForceSearch(MissingForces):
         """
         processes = base.processes
         motions = base.motions
-        is_settled = False
+        has_converged = False
         damping = 1.0
         last_step = np.zeros(len(effect))
         best_hypothesis: ForceHypothesis | None = None
@@ -378,7 +399,7 @@ class ForceSearch(MissingForces):
                 break
             # missing forces: from the best point of a grid in the first step, unchanged in those
             # that follow, and by Newton's method in the last one
-            is_last = is_settled or step_number == MOST_ITERATIONS - 1
+            is_last = has_converged or step_number == MOST_ITERATIONS - 1
             hypothesis = fit_missing_forces(
                 linear_trials,
                 self.prior_processes(processes),
@@ -390,22 +411,25 @@ class ForceSearch(MissingForces):
             )
             step = hypothesis.solution.mean[len(linear_trials.shared_precision) :] - effect
             hypothesis = _with_evidence_before_step(hypothesis, step)
-            # the last iteration adds the step that remains
-            if is_settled:
+            # the last iteration takes the step that remains
+            if has_converged:
                 return replace(hypothesis, effect=effect + step)
-            # the motion of the first step is that of the base, which follows the readings: its
-            # evidence is too large, so that the second step replaces it in any case
+            # The motion of the first step is that of the base, which follows the readings without
+            # the effects. So its evidence is too large: the second step replaces it in any case.
             is_better = (
                 best_hypothesis is None or hypothesis.log_evidence > best_hypothesis.log_evidence
             )
             if is_better or step_number == 1:
                 best_hypothesis = hypothesis
             # shorter steps if the direction reverses, longer ones again if not
-            reverses = step @ last_step < -0.5 * (last_step @ last_step)
-            damping = max(0.5 * damping, LEAST_DAMPING) if reverses else min(1.0, 1.5 * damping)
-            move = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            effect = np.clip(candidate.add_step(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
-            is_settled = step_number > 0 and _has_converged(step, last_step)
+            if step @ last_step < -0.5 * (last_step @ last_step):
+                damping = max(0.5 * damping, LEAST_DAMPING)
+            else:
+                damping = min(1.0, 1.5 * damping)
+            damped_step = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+            effect = candidate.add_step(effect, damped_step)
+            effect = np.clip(effect, -LARGEST_EFFECT, LARGEST_EFFECT)
+            has_converged = step_number > 0 and _has_converged(step, last_step)
             processes = hypothesis.processes
             motions = hypothesis.motions
             last_step = step
@@ -434,7 +458,7 @@ class ForceSearch(MissingForces):
         Returns
         -------
         LinearTrials or None
-            The view; None if the effects cannot act along the motions.
+            The linear trials; None if the effects cannot act along the motions.
         """
         if not candidate.terms:
             return replace(
@@ -460,8 +484,8 @@ class ForceSearch(MissingForces):
             slopes.append(
                 sum_of_columns((above, below), (0.5 / HALF_DIFFERENCE, -0.5 / HALF_DIFFERENCE))
             )
-        # a column for each parameter, and a known one: the linear effects at zero parameters, which
-        # are the effects at `effect` minus the sum of effect * slope
+        # a column for each parameter, and a constant one: the linear effects at zero parameters,
+        # which are the effects at `effect` minus the sum of effect * slope
         at_zero = sum_of_columns((at_values, *slopes), (1.0, *-effect))
         linear_trials = self.column_builder.trials_along_motions(linear_trials, motions, at_zero)
         return replace(
@@ -476,11 +500,11 @@ def _rms(series: Iterable[FloatArray]) -> float:
 
 
 def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) -> ForceHypothesis:
-    """Return a hypothesis whose evidence is that at its own parameters, before a step.
+    """Return a hypothesis with the log evidence at its own parameters, before a step.
 
-    The solution of the linear model is the result of a step of the parameters, and so is its
-    evidence. Before the step the log density is lower by half the squared step over the posterior
-    covariance. Entries below `CONVERGED_STEP` are taken as zero.
+    The evidence of the linear model is that at the end of a step of the parameters. Before the step
+    the log density is lower by step^T covariance^-1 step / 2. Entries of the step below
+    `CONVERGED_STEP` are taken as zero.
 
     Parameters
     ----------
@@ -498,17 +522,18 @@ def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) ->
 
 
 def _has_converged(step: FloatArray, last_step: FloatArray) -> bool:
-    """Return whether the iteration may end after a step.
+    """Return whether a step of the effect parameters is so short that the iteration may end.
 
-    The limit is ten times lower for steps that hardly become smaller: slow convergence has far to
-    go.
+    The limit is ten times lower if the step is not half as long as the previous one, since after
+    slow convergence the sum of the steps that remain is large.
 
     Parameters
     ----------
     step, last_step : (E,) array
-        The present step of the effect parameters, and the one before.
+        The present step, and the previous one.
     """
     size = float(np.abs(step).max(initial=0.0))
     last_size = float(np.abs(last_step).max(initial=0.0))
-    becomes_smaller = size < 0.5 * last_size
-    return size < CONVERGED_STEP * (1.0 if becomes_smaller else 0.1)
+    if size < 0.5 * last_size:
+        return size < CONVERGED_STEP
+    return size < CONVERGED_STEP * 0.1

@@ -122,7 +122,7 @@ class Search(FittedCandidates):
         return sorted(best_by_effects.values(), key=lambda fit: -self.score(fit))
 
     def _has_large_residuals(self, base: CandidateFit) -> bool:
-        """Return whether the residuals of a fit are much larger than the noise."""
+        """Return whether χ² per sample of a fit is above `SEARCH.far`: much more than noise."""
         return base.chi_square > SEARCH.far * float(self.problem.sample_counts.sum())
 
     def _is_far_from_truth(self, base: CandidateFit) -> bool:
@@ -430,54 +430,56 @@ class Search(FittedCandidates):
     def fit_free_shapes(self) -> None:
         """Fit the best single effects with free shapes, and record those that explain the data.
 
-        One law with a free shape is a simpler cause than two laws, so it is tried before pairs. Of
-        each family at a place the fit of the best score is recorded.
+        One law with a free shape is a simpler cause than two laws, so it is tried before pairs.
+        Effects of one family at one place lead to the same free law; of their fits, the one with
+        the highest score is recorded.
         """
         single_fits = self._single_fits_to_free()
         best_by_family: dict[tuple[str, str], CandidateFit] = {}
         for single_fit in single_fits:
-            free_fit = fit_free_shape(self.problem, single_fit, 0)
-            if (
-                free_fit is None
-                or free_fit.log_evidence - single_fit.log_evidence <= LEAST_SHAPE_GAIN
-            ):
+            free_fit = fit_free_shape(self.problem, single_fit, term_index=0)
+            if free_fit is None:
+                continue
+            evidence_gain = free_fit.log_evidence - single_fit.log_evidence
+            if evidence_gain <= LEAST_SHAPE_GAIN:
                 continue
             (term,) = free_fit.candidate.terms
-            # all effects of a family lead to the same verdict: keep the fit of the best score
             key = (term.effect.family, term.place)
-            is_best = key not in best_by_family or self.score(best_by_family[key]) < self.score(
-                free_fit
-            )
-            if is_best and check_absolute_fit(self.problem, free_fit).passed is not False:
+            previous_best = best_by_family.get(key)
+            is_best = previous_best is None or self.score(previous_best) < self.score(free_fit)
+            if is_best and self._is_not_refuted(free_fit):
                 best_by_family[key] = free_fit
         for free_fit in best_by_family.values():
             self.record_fit(free_fit, exact=True)
 
+    def _is_not_refuted(self, fit: CandidateFit) -> bool:
+        """Return whether a fit passes the test of absolute fit, or cannot be tested.
+
+        It cannot be tested if there is no noise record (`passed` is then None).
+        """
+        return check_absolute_fit(self.problem, fit).passed is not False
+
     def _single_fits_to_free(self) -> list[CandidateFit]:
         """Return the single effects that are to be fitted with a free shape, the best first.
 
-        If the best effect does not explain the data, these are all of the best ones. If it does,
-        they are those that explain the data with a score near that of the best; none if it is the
-        only one, or if the model without effect explains the data too. The free shape of the best
-        effect itself is then examined by the test of shape.
+        If the best effect does not explain the data, these are the `SEARCH.exact_fits` best ones.
+        If it does, they are the effects that explain the data with a score near that of the best.
+        If it is the only such effect, or if the model without effect explains the data too, there
+        are none: the test of shape (`gates.check_shape`) examines the best effect later.
         """
         single_fits = []
         for fit in self.exact_fits.values():
             if len(fit.candidate.terms) == 1 and not fit.candidate.has_free_shape:
                 single_fits.append(fit)
         single_fits = sorted(single_fits, key=self.score, reverse=True)[: SEARCH.exact_fits]
-        explaining_fits = []
-        for fit in single_fits:
-            if check_absolute_fit(self.problem, fit).passed is not False:
-                explaining_fits.append(fit)
+        explaining_fits = [fit for fit in single_fits if self._is_not_refuted(fit)]
         if not explaining_fits or explaining_fits[0] is not single_fits[0]:
             return single_fits
-        least = self.score(single_fits[0]) - SEARCH.rivals
-        competing = [fit for fit in explaining_fits if self.score(fit) > least]
-        model_fits = check_absolute_fit(self.problem, self.no_effect).passed is not False
-        if len(competing) == 1 or model_fits:
+        least_score = self.score(single_fits[0]) - SEARCH.rivals
+        competing_fits = [fit for fit in explaining_fits if self.score(fit) > least_score]
+        if len(competing_fits) == 1 or self._is_not_refuted(self.no_effect):
             return []
-        return competing
+        return competing_fits
 
     def fit_pairs(self) -> None:
         """Fit the pairs of effects that reduce the misfit most by a screen without effect."""
