@@ -1,11 +1,11 @@
-"""Compiled loops of the estimator: steps with laws in them, a Kalman filter, and its smoother.
+"""Compiled loops of the estimator: substeps with laws, a Kalman filter, and its smoother.
 
 The system of a trial is linear along a trajectory and changes in time:
 
     z[j + 1] = transition[j] z[j] + drift[j] weights + process noise,
     columns weights = rows z + noise of variance one.
 
-The first of the W weights is one and stands for what is known; the others are the unknowns of the
+The first of the W weights is one, that of the constant part; the others are the unknowns of the
 hypothesis. The filter carries the response of the state to each weight along with the state (de
 Jong 1991, Annals of Statistics 19, 1073-1083). Unknowns that are constant in time then follow from
 one regression after one pass, and need not be states.
@@ -64,11 +64,11 @@ def substep_matrices_with_laws(
     force_by_weight: FloatArray,
     drift: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transitions and process noises of fine steps with laws, and fill `drift`.
+    """Return transitions and process noises of substeps with laws, and fill `drift`.
 
-    The force of the laws is linear in time over a step. As it depends on the state at the end, the
-    step is implicit: with the matrices b and e of forces at its start and end, tangents T and
-    pushes u,
+    The force of the laws is linear in time over a substep. As it depends on the state at the end,
+    the substep is implicit. With b and e for `by_force_at_begin` and `by_force_at_end`, T for
+    `force_by_state` and u for `force_by_weight`,
 
         (I - e T[j + 1]) z[j + 1] = (Phi + b T[j]) z[j] + d weights + noise,
         d = b u[j] + e u[j + 1] + drift[j].
@@ -78,25 +78,25 @@ def substep_matrices_with_laws(
     Parameters
     ----------
     substeps : int
-        The number of fine steps between two samples.
+        The number of substeps between two samples.
     interval_of_sample : (N,) ndarray of int
-        The kind of step that leads to each sample; steps of one kind have one length.
+        The index of the length of the interval that ends at each sample.
     free_transition, free_noise : (K, n, n) ndarray
-        The transition Phi and the process noise of a fine step without laws, by kind.
+        The transition Phi and the process noise of a substep without laws, for each length.
     by_force_at_begin, by_force_at_end : (K, n, P) ndarray
-        The change of the state over a fine step for a unit force at a port, at the start and at the
+        The change of the state over a substep for a unit force at a port, at the start and at the
         end of the step.
     force_by_state : (F, P, n) ndarray
         The derivative of the laws' force at a port by the state.
     force_by_weight : (F, P, W) ndarray
         The laws' force at a port at state zero, for a unit of each weight.
     drift : (F - 1, n, W) ndarray
-        The state that each weight adds in a fine step without laws; filled with that with laws.
+        The state that each weight adds in a substep without laws; filled with that with laws.
 
     Returns
     -------
     transition, noise : (F - 1, n, n) ndarray
-        The transition and the covariance of the process noise of each fine step.
+        The transition and the covariance of the process noise of each substep.
     """
     steps, ports, states = len(force_by_state) - 1, force_by_state.shape[1], force_by_state.shape[2]
     transition = np.empty((steps, states, states))
@@ -203,9 +203,9 @@ def filter_record(
     Parameters
     ----------
     substeps : int
-        The number of fine steps between two samples.
+        The number of substeps between two samples.
     transitions, noises, drifts : (F - 1, n, n), (F - 1, n, n), (F - 1, n, W) ndarray
-        The matrices of each fine step, see `substep_matrices_with_laws`.
+        The matrices of each substep, see `substep_matrices_with_laws`.
     output_rows, columns : (N, C, n), (N, C, W) ndarray
         The readings for a unit of each state, and the residuals for a unit of each weight, divided
         by the deviation of the noise.
@@ -248,7 +248,7 @@ def filter_record(
                     variances[k, c] = update_by_reading(
                         covariance, mean, output_rows[k, c], innovations[k, c], gains[k, c]
                     )
-        # predict over the fine step
+        # predict over the substep
         if j < stamps - 1:
             filtered_mean = mean.copy()
             multiply(transitions[j], filtered_mean, mean)
@@ -301,7 +301,7 @@ def smooth_record(
     work, carried = np.empty((2, size, size))
     information_gain = np.empty(size)
     for j in range(stamps - 1, -1, -1):
-        # carry both back over the fine step
+        # carry both back over the substep
         if j < stamps - 1:
             backward = np.ascontiguousarray(transitions[j].T)
             adjoint = backward @ adjoint

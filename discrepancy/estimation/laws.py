@@ -11,18 +11,20 @@ from fe.compilation import compiled, law_functions
 from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import steady_force
+from fe.runtime.laws.speed import POSITION_EXPONENT, steady_force
 
 WINDOW_NODES = 8
 """Number of speeds in the window over which a law of the speed is averaged."""
 RELATIVE_HALF_DIFFERENCE = 1e-4
-"""Half the difference of the position in the tangent of a law of the speed, over the rms
-position."""
+"""Half the difference of the position in the tangent of a law of the speed, as a fraction of the
+rms position."""
 
 
 @dataclass(frozen=True, eq=False)
 class LawForce:
-    """The force of laws at a port along its motion, counted positive against the motion.
+    """The force of laws at a port along its motion, with its derivatives by the motion (tangents).
+
+    A force is counted positive if it acts against the motion.
 
     Attributes
     ----------
@@ -61,17 +63,17 @@ def fill_force_and_tangents(
     """Fill the force of a law along a motion of its port, and its tangents.
 
     A law of the speed is averaged over a window of speeds, so that the jump of dry friction has a
-    finite tangent. The tangent of a law with memory is that in its present state; that an earlier
-    motion changes the memory is neglected.
+    finite tangent. The tangent of a law with memory is that for its present memory; the influence
+    of the earlier motion on the memory is neglected.
 
     Parameters
     ----------
     law_index : int
         The index of the law's class in `LAWS`.
     of_speed : bool
-        Whether the law is one of the speed, which has no memory.
+        Whether the law is a function of position and speed, without memory.
     law : (R,) array
-        The parameter row of the law.
+        The parameters of the law, as `PortForce.parameter_row`.
     positions, speeds : (F,) array
         The motion of the port [m or rad, and per s].
     half_width : float
@@ -101,7 +103,7 @@ def fill_force_and_tangents(
             law, x, v - half_width
         )
         by_speed[j] = difference_over_window / (2.0 * half_width)
-        if law[2] != 0.0:
+        if law[POSITION_EXPONENT] != 0.0:
             difference_by_position = steady_force(law, x + half_difference, v) - steady_force(
                 law, x - half_difference, v
             )

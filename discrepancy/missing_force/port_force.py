@@ -19,8 +19,8 @@ from .naming import ForceSearch
 from .shares import ForceShares
 
 ESTIMATION_ERRORS = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
-"""Errors that mean that a missing force cannot be estimated. The verdict is then given without
-it."""
+"""Errors that mean that a missing force cannot be estimated. The verdict is then given without the
+force."""
 MOST_BINS = 24
 """Largest number of bins of a variable in the test of whether it orders a force."""
 LEAST_IN_BIN = 4
@@ -31,7 +31,7 @@ TIED_SHARE = 0.05
 """Difference of these shares up to which two variables order a force equally well."""
 
 
-# ---------------------------------------------------------------- what orders a force
+# ---------------------------------------------------------------- variables that order a force
 
 
 def explained_variance(variable: FloatArray, force: FloatArray) -> float:
@@ -62,7 +62,7 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
 def ordering_variables(
     force: FloatArray, position: FloatArray, speed: FloatArray, time: FloatArray
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the variables that order a force: of which it is nearly a function.
+    """Return the variables that order a force: those of which the force is nearly a function.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def ordering_variables(
     """
     scaled_position = position / max(float(np.std(position)), 1e-300)
     scaled_speed = speed / max(float(np.std(speed)), 1e-300)
-    # of a vibration; its force is compared by magnitude, since it changes its sign in a cycle
+    # amplitude of a vibration; in a cycle the force changes its sign, but not its magnitude
     amplitude = np.hypot(scaled_position, scaled_speed)
     shares = {
         "displacement": explained_variance(position, force),
@@ -322,34 +322,21 @@ def missing_force_of_verdict(
     terms = fit.candidate.terms
     try:
         ports = problem.model.ports
-        has_law = any(term.place in ports for term in terms)
-        if not can_estimate_forces(problem) or (terms and not has_law):
+        laws = [term for term in terms if term.place in ports]
+        if not can_estimate_forces(problem) or (terms and not laws):
             return None
         search = search or ForceSearch(problem)
-        # the hypothesis with the effects of the fit, or one that is followed to them now
-        hypothesis = next(
-            (
-                fitted_hypothesis
-                for fitted_hypothesis in hypotheses
-                if fitted_hypothesis.candidate.key == fit.candidate.key
-            ),
-            None,
-        )
-        if hypothesis is None and terms:
-            hypothesis = search.fit_along_motion(
-                search.hypothesis_of_all_ports, fit.candidate, fit.point.effect
-            )
-        force = missing_force(
-            search, search.hypothesis_of_all_ports if hypothesis is None else hypothesis
-        )
+        hypothesis = _hypothesis_of_fit(search, hypotheses, fit)
+        force = missing_force(search, hypothesis or search.hypothesis_of_all_ports)
     except ESTIMATION_ERRORS:
         return None
     if force is None or not force.law or hypothesis is None:
         return force
     at_port = force.at_port
-    laws = [(term.name_in_words, term.place) for term in terms if term.place in ports]
-    if len({place for _, place in laws}) > 1:
-        at_port = replace(at_port, law=" and ".join(f"{name} at {place}" for name, place in laws))
+    if len({law.place for law in laws}) > 1:
+        names_at_ports = [f"{law.name_in_words} at {law.place}" for law in laws]
+        at_port = replace(at_port, law=" and ".join(names_at_ports))
+    # without the shares, the force is returned as it is
     with suppress(*ESTIMATION_ERRORS):
         shares = ForceShares(search)
         held_out = None
@@ -358,6 +345,33 @@ def missing_force_of_verdict(
         fitted = _remaining_force(shares.gap_share(hypothesis, held_out=False))
         at_port = replace(at_port, fitted=fitted, held_out=held_out)
     return replace(force, at_port=at_port)
+
+
+def _hypothesis_of_fit(
+    search: ForceSearch, hypotheses: Sequence[ForceHypothesis], fit: CandidateFit
+) -> ForceHypothesis | None:
+    """Return the hypothesis on the missing force with the effects of a fit.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    hypotheses : sequence of ForceHypothesis
+        The hypotheses that were fitted already; if none has the effects, one is fitted now.
+    fit : CandidateFit
+        The fit.
+
+    Returns
+    -------
+    ForceHypothesis or None
+        The hypothesis; None if the fit has no effects, or if they cannot act along the motion.
+    """
+    for hypothesis in hypotheses:
+        if hypothesis.candidate.key == fit.candidate.key:
+            return hypothesis
+    if not fit.candidate.terms:
+        return None
+    return search.fit_along_motion(search.hypothesis_of_all_ports, fit.candidate, fit.point.effect)
 
 
 def _remaining_force(share: GapShare) -> ForceLeft:

@@ -1,9 +1,10 @@
 """The windows in time in which there is a gap between the records and the model.
 
-They are found as events: of the missing force at the port with the most evidence or, if that is
-more probable, of an error of one channel, with all unknowns of the records integrated out. If the
-model does not describe how its ports move, events are looked for in the residuals of a fit:
-in the course of their strongest pattern over the channels (the first singular vector).
+The windows are found as events: stretches of time in which a force acts. The force is the missing
+one at the port with the most evidence or, if that is more probable, an error of one channel. All
+unknowns of the records are integrated out. If the model does not describe how its ports move,
+events are looked for in the residuals of a fit: in the amplitude of their strongest pattern over
+the channels (the first singular vector) over time.
 """
 
 from collections.abc import Sequence
@@ -25,14 +26,16 @@ from .explained import ForceHypothesis, fit_missing_forces
 from .filtered import Process
 from .naming import ForceSearch
 from .port_force import evidence_without_force
+from .process_search import Processes
 from .switched_record import change_samples
 from .trial import PortedTrial
 from .view import LinearTrials
 
 TIMED_KINDS = frozenset(TrialKind) - {TrialKind.STATIC}
-"""Kinds of trials whose readings are a course in time."""
+"""Kinds of trials whose readings follow each other in time; those of a static trial do not."""
 LEAST_RMS_SHARE = 0.2
-"""Share of the largest channel's rms from which on a channel is listed as showing the gap."""
+"""Least rms of a channel, over the largest rms of all channels, with which it is listed in a
+window."""
 CHANNEL_ERROR_DEVIATIONS = (3.0, 30.0, 300.0)
 """Standard deviations of an error of a channel, over that of its noise, that are compared with the
 missing force."""
@@ -65,7 +68,8 @@ def gap_windows(
         return windows_of_residuals(residuals, seed=seed)
     try:
         windows = _windows_of_missing_force(problem.with_trials(dynamic_trials), fit)
-    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # no verdict rests on it
+    # the windows are an addition to the verdict: if they cannot be computed, the residuals serve
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):
         return windows_of_residuals(residuals, seed=seed)
     flight = frozenset({TrialKind.FLIGHT})
     return windows + windows_of_residuals(residuals, seed=seed, kinds=flight)
@@ -256,7 +260,7 @@ def _port_or_channel_error(
     Returns
     -------
     port : int
-        The number of the port; 0 for a channel, which is the only port of its view.
+        The number of the port; 0 for a channel, which is the only port of the returned trials.
     hypothesis : ForceHypothesis
         The more probable of both.
     """
@@ -265,35 +269,47 @@ def _port_or_channel_error(
     longest_duration = max(float(np.ptp(trial.time)) for trial in trials)
     best_port = port
     best_hypothesis = at_port
-    for channel in dict.fromkeys(chain(*channels)):
-        motions = [
-            replace(motion, forces={}, unexplained_forces={}) for motion in linear_trials.motions
-        ]
-        trials_with_error = [
-            _with_channel_as_port(trial, names, channel)
-            for trial, names in zip(trials, channels, strict=True)
-        ]
-        trials_with_channel_error = replace(
-            linear_trials, trials=trials_with_error, motions=motions
+    channel_names = dict.fromkeys(chain(*channels))  # each once, in order
+    for channel in channel_names:
+        with_channel_error = replace(
+            linear_trials,
+            trials=[
+                _with_channel_as_port(trial, names, channel)
+                for trial, names in zip(trials, channels, strict=True)
+            ],
+            motions=[
+                replace(motion, forces={}, unexplained_forces={})
+                for motion in linear_trials.motions
+            ],
         )
-        processes_to_try = []
-        for size, relative_time in product(CHANNEL_ERROR_DEVIATIONS, CHANNEL_ERROR_TIMES):
-            processes_to_try.append(
-                {0: Process(size, relative_time * longest_duration, may_jump=True)}
-            )
-        evidences = [
-            trials_with_channel_error.solve(processes).log_evidence
-            for processes in processes_to_try
-        ]
-        best_option = max(range(len(processes_to_try)), key=lambda k: evidences[k])
-        if evidences[best_option] > best_hypothesis.log_evidence:
+        evidence, processes = _best_channel_error(with_channel_error, longest_duration)
+        if evidence > best_hypothesis.log_evidence:
             best_port = 0
-            best_hypothesis = fit_missing_forces(
-                trials_with_channel_error,
-                processes_to_try[best_option],
-                processes_to_try[best_option],
-            )
+            best_hypothesis = fit_missing_forces(with_channel_error, processes, processes)
     return best_port, best_hypothesis
+
+
+def _best_channel_error(
+    linear_trials: LinearTrials, longest_duration: float
+) -> tuple[float, Processes]:
+    """Return the log evidence and the process of an error of a channel, the best of a grid.
+
+    Parameters
+    ----------
+    linear_trials : LinearTrials
+        The trials, whose only port is the channel.
+    longest_duration : float
+        The duration of the longest of them [s].
+    """
+    best_evidence = -np.inf
+    best_processes: Processes = {}
+    for deviation, relative_time in product(CHANNEL_ERROR_DEVIATIONS, CHANNEL_ERROR_TIMES):
+        processes = {0: Process(deviation, relative_time * longest_duration, may_jump=True)}
+        evidence = linear_trials.solve(processes).log_evidence
+        if not best_processes or evidence > best_evidence:
+            best_evidence = evidence
+            best_processes = processes
+    return best_evidence, best_processes
 
 
 def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: str) -> PortedTrial:
@@ -306,7 +322,7 @@ def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: 
     channels : sequence of str
         The channels of the trial.
     channel : str
-        The channel with the error. A force of 1 changes its reading by one noise deviation.
+        The channel with the error. A force of one changes its reading by one noise deviation.
     """
     # readings are C s - e f (see `PortedSystem`): the minus sign makes a positive force raise them
     through = -trial.deviation[None] * (np.array(channels) == channel)
@@ -416,36 +432,68 @@ def _windows_of_events(
     with_effect : bool
         Whether the gap is that of the best hypothesis, not of the unchanged model.
     """
-    windows = []
-    for number, (trial, path) in enumerate(zip(events.search.trials, events.paths, strict=True)):
-        is_on = path
-        switches = change_samples(path)
-        if len(switches) > 2 * MOST_EVENTS:  # a force that comes and goes acts throughout
-            is_on = np.ones_like(path)
-            switches = switches[:0]
-        moments: list[Moment | None] = []
-        if len(switches):
-            moments = [Moment(*map(float, moment)) for moment in events.change_times(number)]
-        stretch_edges = [0, *switches.tolist(), len(is_on)]
-        # None: the stretch begins with the record, or ends with it
-        bounds = [None, *moments, None]
-        for k in np.flatnonzero(is_on[stretch_edges[:-1]]).tolist():
-            samples_of_stretch = slice(stretch_edges[k], stretch_edges[k + 1])
-            rms_of_channels = np.sqrt(
-                np.mean(readings_by_force[number][samples_of_stretch] ** 2, axis=0)
-            )
-            windows.append(
-                GapWindow(
-                    trial=trial.name,
-                    channels=_select_channels(
-                        channels[number], rms_of_channels > LEAST_RMS_SHARE * rms_of_channels.max()
-                    ),
-                    begin=bounds[k],
-                    end=bounds[k + 1],
-                    first=float(trial.time[0]),
-                    last=float(trial.time[-1]),
-                    size=float(rms_of_channels.max()),
-                    with_effect=with_effect,
-                )
-            )
+    windows: list[GapWindow] = []
+    for trial_index, channel_names in enumerate(channels):
+        windows += _windows_in_trial(
+            events,
+            trial_index,
+            channel_names,
+            readings_by_force[trial_index],
+            with_effect=with_effect,
+        )
     return tuple(windows)
+
+
+def _windows_in_trial(
+    events: Events,
+    trial_index: int,
+    channels: Sequence[str],
+    readings_by_force: FloatArray,
+    *,
+    with_effect: bool,
+) -> list[GapWindow]:
+    """Return the windows of events in one trial: the stretches in which the force is on.
+
+    Parameters
+    ----------
+    events : Events
+        The events.
+    trial_index : int
+        The index of the trial.
+    channels : sequence of str
+        The channels of the trial.
+    readings_by_force : (N, C) array
+        The part of its readings that the force makes, divided by the noise.
+    with_effect : bool
+        Whether the gap is that of the best hypothesis, not of the unchanged model.
+    """
+    trial = events.search.trials[trial_index]
+    is_on = events.paths[trial_index]
+    changes = change_samples(is_on)
+    change_times: list[Moment | None] = []
+    if len(changes) > 2 * MOST_EVENTS:
+        # a force that varies, not events: one stretch from the first sample to the last
+        is_on = np.ones_like(is_on)
+        changes = changes[:0]
+    elif len(changes):
+        change_times = [Moment(*times) for times in events.change_times(trial_index).tolist()]
+    stretch_edges = [0, *changes.tolist(), len(is_on)]
+    # None: the stretch begins with the record, or ends with it
+    edge_times = [None, *change_times, None]
+    windows = []
+    for stretch in np.flatnonzero(is_on[stretch_edges[:-1]]).tolist():
+        samples = slice(stretch_edges[stretch], stretch_edges[stretch + 1])
+        rms_of_channels = np.sqrt(np.mean(readings_by_force[samples] ** 2, axis=0))
+        largest_rms = float(rms_of_channels.max())
+        window = GapWindow(
+            trial=trial.name,
+            channels=_select_channels(channels, rms_of_channels > LEAST_RMS_SHARE * largest_rms),
+            begin=edge_times[stretch],
+            end=edge_times[stretch + 1],
+            first=float(trial.time[0]),
+            last=float(trial.time[-1]),
+            size=largest_rms,
+            with_effect=with_effect,
+        )
+        windows.append(window)
+    return windows

@@ -1,4 +1,4 @@
-"""Evidence of hypotheses under a noise that is as large as the residuals of the best of them.
+"""Evidence of hypotheses under a noise that is as large as the residuals of the best hypothesis.
 
 The search itself uses the recorded noise, which shows best how far a fit is from the truth. But the
 residuals of a model of a real structure are never white noise of the recorded level (Kennedy and
@@ -30,14 +30,15 @@ from .starts import report_each
 from .strategy import Search
 
 LEAST_P_VALUE = 1e-3
-"""p-value below which residuals are more than noise, or not white."""
+"""Least p-value with which residuals are taken as noise of the recorded level, or as white."""
 LARGEST_INTERVAL_DIFFERENCE = 0.25
-"""Relative difference of sampling intervals up to which a noise record is compared with
+"""Largest relative difference of sampling intervals with which a noise record is compared with
 residuals."""
 OSCILLATION_MINIMUM = -0.25
 """Autocorrelation at its first minimum below which a process oscillates."""
 LARGEST_CORRELATION_DIFFERENCE = 3.0
-"""Standard deviations within which the correlation of residuals agrees with the noise record."""
+"""Largest difference between the correlations of residuals and of the noise record with which they
+agree [standard deviations]."""
 LEAST_WHITE_SHARE = 1e-12
 """Least variance of an unrecorded noise, as a fraction of the residuals' mean square."""
 SECOND_DIFFERENCES = 6.0
@@ -47,7 +48,7 @@ SECOND_DIFFERENCES = 6.0
 # ---------------------------------------------------------------- what a fit leaves
 
 
-@dataclass
+@dataclass(frozen=True)
 class _ChannelProcess:
     """The residual process of one channel; `ResidualProcess` defines the attributes.
 
@@ -87,7 +88,7 @@ def estimate_residual_process(problem: Problem, fit: CandidateFit) -> ResidualPr
 def _channel_process(
     problem: Problem, fit: CandidateFit, channel: int, noise_level: float
 ) -> _ChannelProcess:
-    """Return the residual process of a channel.
+    """Return the random process in the residuals of one channel besides white noise.
 
     Parameters
     ----------
@@ -100,63 +101,94 @@ def _channel_process(
     noise_level : float
         The variance of the noise over s0^2, with s0 its recorded deviation or a stand-in.
     """
-    process = _ChannelProcess()
     records = residual_records(problem, fit, channel)
     if not records:
-        return process
+        return _ChannelProcess()
     residual_series = [record.values for record in records]
     sample_count = sum(float(record.is_used.sum()) for record in records)
-    # compare the variance of the residuals with the noise record
     residual_freedom = max(sample_count - fit.absorbed_freedom[channel], 1.0)
-    noise_freedom = problem.record_freedom[channel]
-    has_record = noise_freedom > 0.0
+    has_record = problem.record_freedom[channel] > 0.0
     mean_square = _sum_of_squares(residual_series) / residual_freedom
     interval = max(float(np.median(record.steps)) for record in records)
     colour = _recorded_colour(problem, problem.channel_names[channel], records, interval)
+    # compare the variance of the residuals with the noise record
     is_larger = False
     if has_record:
         p_value = noise_tests.variance_p_value(
             mean_square,
             residual_freedom / colour.samples_per_independent,
-            noise_freedom / colour.samples_per_independent,
+            problem.record_freedom[channel] / colour.samples_per_independent,
         )
         is_larger = p_value < LEAST_P_VALUE
     if not is_larger and whiteness_p_value(records) > LEAST_P_VALUE:
-        return process
-    # noise factor: variance of the residuals times samples per independent sample
+        return _ChannelProcess()
+    # compare their correlation with that of the noise record
     autocorrelation, white_variance = noise_tests.autocorrelation(residual_series)
     correlation_deviation = np.sqrt(1.0 / sample_count + colour.variance)
+    correlation_difference = abs(autocorrelation[0] - colour.correlation)
     has_record_colour = (
-        abs(autocorrelation[0] - colour.correlation)
-        < LARGEST_CORRELATION_DIFFERENCE * correlation_deviation
+        correlation_difference < LARGEST_CORRELATION_DIFFERENCE * correlation_deviation
     )
-    process.is_recorded_colour = bool(not is_larger and has_record_colour)
-    if process.is_recorded_colour:
+    is_recorded_colour = bool(not is_larger and has_record_colour)
+    # noise factor: variance of the residuals times samples per independent sample
+    if is_recorded_colour:
         wide_variance = 1.0
     elif has_record:
         wide_variance = max(mean_square, 1.0)
     else:
         wide_variance = mean_square
-    process.noise_factor = np.sqrt(
-        wide_variance * noise_tests.times_fewer(autocorrelation, white_variance)
-    )
-    # the process without the noise: white noise adds to the variance of the residuals, but not to
-    # their correlation, so the correlation of the process is larger by the ratio of the variances
+    noise_factor = np.sqrt(wide_variance * noise_tests.times_fewer(autocorrelation, white_variance))
+    process = _ChannelProcess(noise_factor=noise_factor, is_recorded_colour=is_recorded_colour)
+    # the process is what the residuals have besides the noise
     process_variance = mean_square / noise_level - 1.0
-    if process.is_recorded_colour or process_variance <= 0.0:
+    if is_recorded_colour or process_variance <= 0.0:
         return process
-    process_over_residuals = (1.0 + process_variance) / process_variance
-    process.amplitude = np.sqrt(process_variance)
-    process.correlation_time = interval * noise_tests.times_fewer(
-        autocorrelation, white_variance, process_over_residuals
+    return _with_process_in_time(
+        process, process_variance, autocorrelation, white_variance, interval
     )
-    process_autocorrelation = autocorrelation * process_over_residuals
+
+
+def _with_process_in_time(
+    process: _ChannelProcess,
+    process_variance: float,
+    autocorrelation: FloatArray,
+    white_variance: FloatArray,
+    interval: float,
+) -> _ChannelProcess:
+    """Return a residual process with its amplitude, correlation time and frequency.
+
+    Parameters
+    ----------
+    process : _ChannelProcess
+        The process without these.
+    process_variance : float
+        The variance of the process over that of the noise.
+    autocorrelation : (K,) array
+        The autocorrelation of the residuals at lags of 1, 2, ... samples.
+    white_variance : (K,) array
+        The variance of each of these that white noise alone would cause.
+    interval : float
+        The sampling interval [s].
+    """
+    # White noise adds to the variance of the residuals, but not to their correlation. So the
+    # correlation of the process is larger by the ratio of the variances.
+    residuals_over_process = (1.0 + process_variance) / process_variance
+    correlation_time = interval * noise_tests.times_fewer(
+        autocorrelation, white_variance, residuals_over_process
+    )
+    frequency = 0.0
+    process_autocorrelation = autocorrelation * residuals_over_process
     first_minimum = int(np.argmax(np.diff(process_autocorrelation) > 0.0))
     if process_autocorrelation[first_minimum] < OSCILLATION_MINIMUM:
         # the first minimum is at half a period; the lags begin at one interval
-        process.frequency = 0.5 / ((first_minimum + 1) * interval)
-        process.correlation_time *= 2.0  # the mean of a squared cosine is a half
-    return process
+        frequency = 0.5 / ((first_minimum + 1) * interval)
+        correlation_time *= 2.0  # the mean of a squared cosine is a half
+    return replace(
+        process,
+        amplitude=np.sqrt(process_variance),
+        correlation_time=correlation_time,
+        frequency=frequency,
+    )
 
 
 def _sum_of_squares(series: Sequence[FloatArray]) -> float:
