@@ -9,8 +9,8 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, with_step
 from discrepancy.missing_force.hypotheses import ColumnBuilder
+from discrepancy.missing_force.linear_trials import TrialMotion
 from discrepancy.missing_force.trial import PortedTrial
-from discrepancy.missing_force.view import TrialMotion
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch

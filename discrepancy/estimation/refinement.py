@@ -1,7 +1,7 @@
 """The most probable hypotheses on the missing force, estimated together with the motion.
 
-The search follows a hypothesis along a motion that is taken as known. Here its laws are inside of
-the smoother that estimates the motion.
+The search evaluates the laws of a hypothesis along a motion that is taken as known. Here the laws
+are part of the smoother that estimates the motion.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,9 +13,9 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import with_step
 from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.filtered import Solution
+from discrepancy.missing_force.linear_trials import PortDeviations, TrialMotion
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.missing_force.trial import PortedTrial
-from discrepancy.missing_force.view import PortDeviations, TrialMotion
 
 from .effects import HALF_DIFFERENCE, EffectLaws
 from .estimator import EstimatorStart, MotionEstimate, MotionEstimator

@@ -18,7 +18,7 @@ from fe.runtime.patch import ModelPatch
 from .explained import NO_EFFECTS, ForceHypothesis, fit_missing_forces
 from .filtered import Process
 from .hypotheses import ColumnBuilder, scale_processes
-from .view import LinearTrials
+from .linear_trials import LinearTrials
 
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""

@@ -16,6 +16,7 @@ from scipy.optimize import minimize
 from discrepancy.campaign.records import BoolArray, FloatArray
 
 from .filtered import Process
+from .linear_trials import LinearTrials
 from .process_search import PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME
 from .switched_record import (
     EventTrials,
@@ -25,7 +26,6 @@ from .switched_record import (
     change_samples,
     price_of_changes,
 )
-from .view import LinearTrials
 
 CHANGE_GRID_SIZE = 4000
 """Least number of points of a record at which a change is looked for, when its time is determined.
@@ -66,7 +66,7 @@ class EventSearch(EventTrials):
     Parameters
     ----------
     linear_trials : LinearTrials
-        The trials, and the columns of all unknowns and of the forces known to act.
+        The trials with the columns of all unknowns.
     port : int
         The number of the port.
     process : Process
@@ -229,7 +229,7 @@ def find_events(
     Parameters
     ----------
     linear_trials : LinearTrials
-        The trials, and the columns of all unknowns and of the forces known to act.
+        The trials with the columns of all unknowns.
     port : int
         The number of the port.
     process : Process

@@ -10,8 +10,8 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate
 
 from .filtered import Solution
+from .linear_trials import LinearTrials, TrialMotion
 from .process_search import MOST_STEPS, Processes
-from .view import LinearTrials, TrialMotion
 
 NO_EFFECTS = Candidate()
 """The candidate without effects."""
@@ -24,7 +24,7 @@ intervals of a weaker law contain only 4 of 9 hidden values."""
 
 @dataclass(frozen=True, eq=False)
 class ForceHypothesis:
-    """A hypothesis fitted to the missing force: effects that act along the estimated motion.
+    """A hypothesis that is fitted to the missing force, with effects along the estimated motion.
 
     Attributes
     ----------
@@ -63,10 +63,10 @@ class ForceHypothesis:
 
     @cached_property
     def shared(self) -> FloatArray:
-        """The shared unknowns (K,) given the values `effect` of the effect parameters.
+        """The conditional mean (K,) of the shared unknowns given the effect parameters `effect`.
 
-        The iteration may have ended before `effect` reached the mean of the solution. The shared
-        unknowns are then moved along: to their conditional mean given `effect`.
+        It differs from the mean of the solution if the iteration ended before `effect` reached that
+        mean.
         """
         first_effect = len(self.linear_trials.shared_precision)
         mean = self.solution.mean
@@ -83,9 +83,9 @@ class ForceHypothesis:
     def covariance(self) -> FloatArray:
         """The covariance (K + E, K + E) of all unknowns, widened for a hidden force.
 
-        The process of a missing force is independent of the motion. If another law is missing, its
-        force does depend on the motion, and a part of it may look like the laws of the hypothesis.
-        It is assumed that the rms of that part is `HIDDEN_SHARE` times that of the remaining force.
+        The process of a missing force is independent of the motion. But if another law is missing,
+        its force depends on the motion, and a part of it may look like the laws of the hypothesis.
+        The rms of this hidden part is taken as `HIDDEN_SHARE` times that of the unexplained force.
         """
         covariance = self.solution.covariance
         if not len(self.effect):
@@ -111,9 +111,9 @@ class ForceHypothesis:
                 @ forces_by_parameter[acting].T
                 / forces_by_parameter.shape[1]
             )
-            # one parameter: the change whose force has the hidden rms has the variance (hidden
-            # variance) / (mean square force per unit); the added variance keeps it below the prior
-            # variance of one
+            # With one parameter the added variance is (hidden variance) / (mean square force per
+            # unit), that of a change whose force has the hidden rms. The hidden variance in the
+            # denominator keeps it below the prior variance of one.
             regularised = mean_products + variance * np.eye(len(acting))
             hidden[np.ix_(acting, acting)] += variance * np.linalg.inv(regularised)
         return hidden
@@ -157,7 +157,7 @@ def fit_missing_forces(
     candidate : Candidate
         The effects.
     effect : (E,) array
-        The scaled effect parameters about which the view is linear.
+        The scaled effect parameters about which the trials are linear.
     skip_grid : bool
         Whether the search begins at `initial` itself, not at the best point of a grid around it.
     most_steps : int

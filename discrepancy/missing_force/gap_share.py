@@ -25,7 +25,7 @@ class GapShare:
     Attributes
     ----------
     squares_before, squares_after : (B,) array
-        The sum of squares of the gap in each of B blocks, without and with the hypothesis.
+        The sum of squares of the gap in each of B blocks of time, without and with the hypothesis.
     noise_squares : (B,) array
         The sum of squares that the noise of the readings alone gives in each block.
     held_out : bool
@@ -41,7 +41,7 @@ class GapShare:
         (changes of the readings by the forces in a block, from its start) and `OF_READINGS`
         (differences between readings and simulation).
     is_tested : bool
-        Whether the force of the law is large enough in these trials to be seen.
+        Whether the force of the law is so large in these trials that they test it.
     """
 
     squares_before: FloatArray

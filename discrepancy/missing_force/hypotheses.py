@@ -32,9 +32,9 @@ from fe.runtime.patch import SENSORS, LoggerClock, ModelPatch
 from fe.runtime.sensors import clock_of
 
 from .filtered import Process
+from .linear_trials import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
 from .process_search import Processes
 from .trial import PortedTrial, TrialColumn, ported_trial
-from .view import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
 
 SHAPE_VALUES = (-1.3, -0.4, 0.4, 1.3)
 """Standard normal values at which a parameter that is not a magnitude is tried."""
@@ -228,7 +228,7 @@ class ColumnBuilder:
     problem : Problem
         The campaign and model.
     trial_indices : sequence of int
-        The indices in the problem of the trials of the view.
+        The indices, in the problem, of the trials in motion.
     point : Point
         The unknowns about which the trials are linear.
     model_laws : ModelPatch

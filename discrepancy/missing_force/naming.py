@@ -27,8 +27,8 @@ from discrepancy.fits.fitting import LARGEST_EFFECT
 from .at_ports import MissingForces
 from .explained import ForceHypothesis, fit_missing_forces
 from .hypotheses import log_prior, scale_processes, values_to_try
+from .linear_trials import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
 from .process_search import MOST_STEPS
-from .view import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
 
 FACTOR_DEVIATION = 3.0
 """Prior standard deviation of the factor on an effect in the screening, over the factor with
@@ -156,7 +156,7 @@ class ForceSearch(MissingForces):
         effects : sequence of Effect
             The effects.
         followed_count : int
-            The number of effects that are followed.
+            The number of effects that are fitted.
         extended_hypotheses : dict of CandidateKey to ForceHypothesis
             The hypotheses with one more effect, to which results are added.
         on_progress : callable
@@ -397,8 +397,8 @@ class ForceSearch(MissingForces):
             linear_trials = self.linearise_effects(base.linear_trials, motions, candidate, effect)
             if linear_trials is None:
                 break
-            # missing forces: from the best point of a grid in the first step, unchanged in those
-            # that follow, and by Newton's method in the last one
+            # missing forces: the best point of a grid in the first step, unchanged in later ones,
+            # and by Newton's method in the last one
             is_last = has_converged or step_number == MOST_ITERATIONS - 1
             hypothesis = fit_missing_forces(
                 linear_trials,

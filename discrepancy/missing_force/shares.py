@@ -13,20 +13,20 @@ from discrepancy.fits.candidate import Point
 from .explained import ForceHypothesis
 from .gap_share import OF_FORCE, OF_PREDICTIONS, SEED, GapShare
 from .hypotheses import ColumnBuilder
+from .linear_trials import LinearTrials, TrialMotion
 from .naming import ForceSearch
 from .trial import PortedTrial
-from .view import LinearTrials, TrialMotion
 
 MOST_BLOCKS = 12
-"""Largest number of blocks into which a trial is divided."""
+"""Largest number of blocks into which a trial is divided for the bootstrap."""
 LEAST_BLOCK_SAMPLES = 8
 """Least number of samples of a block."""
 SHARED_BOUND = 2.0
 """Bound of the shared unknowns, in prior standard deviations, when the missing force is estimated
 without any effect."""
 LEAST_FORCE_RATIO = 0.1
-"""Ratio of the mean square force of a law to that of the missing force from which on the trials
-test the law."""
+"""Least mean square force of a law, over that of the missing force, with which trials can test the
+law."""
 SMOOTHING_ROUNDS = 3
 """Number of times that a held-out trial is smoothed again with the law along its motion."""
 
@@ -75,9 +75,9 @@ class ForceShares:
         """Return the share of the missing force that a hypothesis explains.
 
         Two shares are computed: that of the forces, and that of the changes of the readings by
-        these forces. The one with the larger lower end of its interval is returned, as each may
-        miss a part: fast forces hardly move a free mass, and slow forces are small compared with
-        fast ones.
+        these forces. The one with the larger lower end of its interval is returned. Each of them
+        may miss a part: fast forces hardly move a free mass, and slow forces are small compared
+        with fast ones.
 
         Parameters
         ----------
@@ -186,7 +186,7 @@ class ForceShares:
         return of_forces, of_predictions
 
     def _motions_without_effect(self, held_out: bool) -> tuple[LinearTrials, list[TrialMotion]]:
-        """Return the view of the trials, and motion and missing force of each without any effect.
+        """Return the trials, and the motion and missing force of each without any effect.
 
         Shared unknowns are kept within `SHARED_BOUND` prior deviations, as they would otherwise
         explain a part of the missing force.
@@ -203,10 +203,10 @@ class ForceShares:
     def smooth_trials(
         self, hypothesis: ForceHypothesis, *, held_out: bool
     ) -> tuple[LinearTrials, list[TrialMotion]]:
-        """Return the view of the trials, and motion and remaining force of each with a hypothesis.
+        """Return the trials, and the motion and unexplained force of each with a hypothesis.
 
-        The remaining force has the size of the force that is missing without any effect, so that it
-        can take up all that the hypothesis does not explain.
+        The unexplained force has the standard deviation of the force that is missing without any
+        effect, so that it can take up all that the hypothesis does not explain.
 
         Parameters
         ----------

@@ -16,7 +16,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 
 from .filtered import ForceFilter, ForceStateSpace, Process, integrate_out_last
 from .kalman import FilterState, RecordFilter, StateInformation, discretise, join_filters
-from .view import LinearTrials
+from .linear_trials import LinearTrials
 
 CHANGE_PRICE = 4.0
 """Log odds against a change of a path, besides the prior of the sample at which it lies [nat]. With
@@ -55,7 +55,7 @@ class EventTrials:
     Parameters
     ----------
     linear_trials : LinearTrials
-        The trials, and the columns of all unknowns and of the forces known to act.
+        The trials with the columns of all unknowns.
     port : int
         The number of the port.
     stride : int
@@ -179,7 +179,7 @@ class SwitchedRecord:
         starts : (A,) array of int
             The first samples of the stretches in which the path is inverted.
         ends : (B,) array of int
-            The samples that follow the last ones of the stretches.
+            The samples after the last ones of the stretches.
 
         Returns
         -------
@@ -239,7 +239,7 @@ class SwitchedRecord:
         on : (N,) array of bool
             The path before a stretch is inverted.
         ends : (B,) array of int
-            The samples that follow the last ones of the stretches. No step follows the end of the
+            The samples after the last ones of the stretches. No step follows the end of the
             record: its transition is the identity, without noise.
         """
         # the kind of step as in `step_kinds`: the path is inverted before the end, not at it
@@ -414,7 +414,8 @@ def initial_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray
         The index of the force of events in the state.
     """
     on = system.initial_covariance
-    # a settled trial begins at rest under the force; without it that deflection is absent
+    # A settled trial begins at rest, deflected by the force. Without the force that part of the
+    # covariance is absent.
     off = on.copy()
     off[:event, :event] -= np.outer(on[:event, event], on[:event, event])
     return zero_state(off, event), on

@@ -24,12 +24,12 @@ from discrepancy.verdict import GapWindow, Moment
 from .events import LEAST_EVIDENCE, MOST_EVENTS, Events, events_throughout, find_events
 from .explained import ForceHypothesis, fit_missing_forces
 from .filtered import Process
+from .linear_trials import LinearTrials
 from .naming import ForceSearch
 from .port_force import evidence_without_force
 from .process_search import Processes
 from .switched_record import change_samples
 from .trial import PortedTrial
-from .view import LinearTrials
 
 TIMED_KINDS = frozenset(TrialKind) - {TrialKind.STATIC}
 """Kinds of trials whose readings follow each other in time; those of a static trial do not."""
@@ -348,7 +348,7 @@ def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: 
 def strongest_pattern(
     name: str, time: FloatArray, series: FloatArray, used: BoolArray
 ) -> tuple[ForceHypothesis, FloatArray]:
-    """Return the strongest pattern of residuals over channels, and its course as a force.
+    """Return the strongest pattern of residuals over channels, and its amplitude as a force.
 
     Parameters
     ----------
@@ -364,7 +364,7 @@ def strongest_pattern(
     Returns
     -------
     hypothesis : ForceHypothesis
-        The course of the pattern, as a missing force at the one channel of a record.
+        The amplitude of the pattern over time, as a missing force in a record of one channel.
     pattern : (C,) array
         The pattern over the channels, of norm one.
     """

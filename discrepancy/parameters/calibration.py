@@ -55,11 +55,11 @@ def calibrate_parameters(
     choice : ModelChoice
         The model, with its file or source.
     asset : str, optional
-        Name of what was measured; that of the campaign by default.
+        The name of what was measured; that of the campaign by default.
     samples : int
-        Number of samples of the posterior, and of the prior.
+        The number of samples of the posterior, and of the prior.
     seed : int
-        Seed of the samples.
+        The seed of the samples.
     progress : Progress, optional
         Where progress is reported.
 
@@ -198,15 +198,15 @@ def findings(
     Parameters
     ----------
     priors : tuple of ParameterPrior
-        Priors of the parameters.
+        The priors of the parameters.
     posterior : ParameterPosterior
         Their posterior.
     gate : Gate
         The test of absolute fit at the optimum.
     faults : tuple of DataFault
-        Faults of the data.
+        The faults of the data.
     remarks : tuple of str
-        Remarks of the campaign.
+        The remarks of the campaign.
     """
     sentences: list[str] = []
     if gate.passed is False:

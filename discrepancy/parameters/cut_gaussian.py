@@ -20,13 +20,13 @@ class TruncatedGaussian:
     Attributes
     ----------
     mean : (P,) ndarray
-        Mean of the Gaussian before truncation; it may lie outside the range.
+        The mean of the Gaussian before truncation; it may lie outside the range.
     covariance : (P, P) ndarray
-        Covariance of the Gaussian before truncation.
+        The covariance of the Gaussian before truncation.
     low, high : (P,) ndarray
-        Lower and upper ends of the range of each parameter.
+        The lower and upper ends of the range of each parameter.
     log_integral : float
-        Logarithm of the integral of the density before truncation, up to a constant [nat].
+        The logarithm of the integral of the density before truncation, up to a constant [nat].
     """
 
     mean: FloatArray
@@ -70,16 +70,16 @@ class TruncatedGaussian:
         Parameters
         ----------
         means : (..., P) ndarray
-            Means of the Gaussian for each draw, used instead of `mean`.
+            The means of the Gaussian for each draw, used instead of `mean`.
         uniform : (..., P) ndarray
-            Uniform random numbers between 0 and 1, one for each parameter of each draw.
+            The uniform random numbers between 0 and 1, one for each parameter of each draw.
 
         Returns
         -------
         draws : (..., P) ndarray
             Draws of the scaled parameters.
         log_weights : (...) ndarray
-            Logarithm of the weight of each draw.
+            The logarithm of the weight of each draw.
         """
         normal = np.zeros_like(uniform)
         log_weight = np.zeros(uniform.shape[:-1])
@@ -132,9 +132,9 @@ class TruncatedGaussian:
         Parameters
         ----------
         count : int
-            Number of draws.
+            The number of draws.
         generator : Generator
-            Source of random numbers.
+            The source of random numbers.
         """
         uniform = generator.random((CANDIDATES_PER_DRAW * count, len(self.mean)))
         candidates, log_weight = self.weighted_draws(self.mean, uniform)
@@ -152,9 +152,9 @@ class TruncatedGaussian:
         Parameters
         ----------
         means : (N, P) ndarray
-            Means that are used instead of `mean`.
+            The means that are used instead of `mean`.
         generator : Generator
-            Source of random numbers.
+            The source of random numbers.
         """
         shape = (CANDIDATES_PER_DRAW, *means.shape)
         candidates, log_weight = self.weighted_draws(

@@ -31,14 +31,14 @@ LARGEST_EVIDENCE_GAP = 10.0
 
 
 class Refusal(NamedTuple):
-    """Parameters within the stated range for which the model could not be evaluated.
+    """A point within the stated range of the parameters at which the model could not be evaluated.
 
     Attributes
     ----------
     parameters : (P,) ndarray
-        Scaled parameters; nan for those that were being fitted.
+        The scaled parameters; nan for those that were being fitted.
     reason : str
-        Message of the model.
+        The message of the model.
     """
 
     parameters: FloatArray
@@ -54,15 +54,15 @@ class MarginalPosterior:
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
 
     Attributes
     ----------
     parameter_indices : (P,) ndarray of int
-        Indices of the calibrated parameters whose prior deviation is not zero; u has one entry for
-        each of them.
+        The indices of the calibrated parameters whose prior deviation is not zero; u has one entry
+        for each of them.
     low, high : (P,) ndarray
-        Ends of the model's range as scaled parameters; the prior is truncated there.
+        The ends of the model's range as scaled parameters; the prior is truncated there.
     refusals : list of Refusal
         Parameters within the range for which the model could not be evaluated.
     """
@@ -92,7 +92,7 @@ class MarginalPosterior:
         is_fixed: NDArray[np.bool_] | None = None,
         start_point: Point | None = None,
     ) -> CandidateFit:
-        """Return the fit of the nuisances while parameters are fixed at given values.
+        """Return the fit of the nuisances with parameters fixed at given values.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class MarginalPosterior:
             True for parameters that are fixed at `u`, all by default; the others are fitted
             together with the nuisances.
         start_point : Point, optional
-            Point at which the fit begins; the best optimum by default, if it is known.
+            The point at which the fit begins; the best optimum by default, if it is known.
 
         Raises
         ------
@@ -116,7 +116,7 @@ class MarginalPosterior:
         if is_fixed is None:
             is_fixed = np.ones(len(self.parameter_indices), dtype=bool)
         fixed_indices = self.parameter_indices[is_fixed]
-        # a fixed parameter has a prior without deviation, and a range of one value
+        # a parameter is fixed by a prior without deviation, and a range of one value
         prior_arrays = {
             name: getattr(shared, name).copy() for name in ("centre", "low", "high", "scale")
         }
@@ -155,7 +155,7 @@ class MarginalPosterior:
         Parameters
         ----------
         seed : int
-            Seed of the draws from which fits begin.
+            The seed of the draws from which fits begin.
 
         Raises
         ------
@@ -172,7 +172,7 @@ class MarginalPosterior:
             )
             with suppress(FitError, ModelError):
                 fits.append(fit(problem, NO_EFFECTS, start, iterations=40))
-        # of fits that agree within rounding the first one is kept, as the sort is stable
+        # the sort is stable: of fits that agree within rounding, the first one stays first
         fits.sort(key=lambda fitted: round(fitted.objective, 3))
         all_fitted = np.ones(len(self.parameter_indices), dtype=bool)
         optima: list[CandidateFit] = []

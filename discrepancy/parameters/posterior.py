@@ -24,9 +24,9 @@ from discrepancy.parameters.marginal import MarginalPosterior
 QUADRATURE_RANGE = 6.0
 """Half of the range of a quadrature about the prior mean, in prior deviations."""
 NODES_PER_OPTIMUM = 9
-"""Number of first nodes within three standard deviations of an optimum."""
+"""Number of first nodes of a quadrature within three standard deviations of each optimum."""
 NODES_OF_PRIOR = 17
-"""Number of first nodes over the whole prior."""
+"""Number of first nodes of a quadrature over the whole prior."""
 INTERPOLATION_INTERVALS = 40
 """Number of intervals between two nodes at which the density is interpolated."""
 LARGEST_MASS = 0.04
@@ -50,11 +50,11 @@ class ParameterPosterior:
     Attributes
     ----------
     procedure : Procedure
-        How the draws were made.
+        The procedure by which the draws were made.
     draws : (N, P) ndarray
         Scaled parameters of equal weight.
     optima : tuple of CandidateFit
-        Maxima of the posterior, the most probable first.
+        The maxima of the posterior, the most probable first.
     marginal : MarginalPosterior
         The posterior density.
     """
@@ -78,11 +78,11 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     count : int
-        Number of draws.
+        The number of draws.
     seed : int
-        Seed of the draws.
+        The seed of the draws.
 
     Raises
     ------
@@ -123,8 +123,8 @@ def _draws_of_gaussians(
 def is_gaussian(marginal: MarginalPosterior, gaussian: TruncatedGaussian) -> bool:
     """Return whether a posterior agrees with a Gaussian that is truncated at the range.
 
-    Their energies are compared at points on the principal axes, at the distances `GAUSSIAN_CHECKS`
-    from the mean, or at the end of the range if that is nearer.
+    Their energies are compared at points on the principal axes, at the distances from the mean that
+    `GAUSSIAN_CHECKS` lists, or at the end of the range if that is nearer.
 
     Parameters
     ----------
@@ -164,15 +164,15 @@ def _draws_by_quadrature(
     Parameters
     ----------
     index : int
-        Index of the parameter of the quadrature.
+        The index of the parameter of the quadrature.
     marginal : MarginalPosterior
         The posterior density.
     optima : tuple of CandidateFit
         Its maxima, the most probable first.
     count : int
-        Number of draws.
+        The number of draws.
     generator : Generator
-        Source of the draws.
+        The source of the draws.
 
     Returns
     -------
@@ -218,7 +218,7 @@ class _QuadratureNodes:
     Parameters
     ----------
     index : int
-        Index of the parameter of the quadrature.
+        The index of the parameter of the quadrature.
     marginal : MarginalPosterior
         The posterior density.
     best : CandidateFit
@@ -227,11 +227,11 @@ class _QuadratureNodes:
     Attributes
     ----------
     centre : float
-        Value of the parameter at the optimum.
+        The value of the parameter at the optimum.
     is_of_quadrature : (P,) ndarray of bool
         True for the parameter of the quadrature.
     energy : dict of float to float
-        Energy by node; infinite if the model cannot be evaluated there.
+        The energy by node; infinite if the model cannot be evaluated there.
     gaussians : dict of float to TruncatedGaussian
         The other parameters by node.
     """
@@ -273,7 +273,7 @@ def _first_nodes(
     optima : tuple of CandidateFit
         Its maxima.
     index : int
-        Index of the parameter of the quadrature.
+        The index of the parameter of the quadrature.
     """
     low, high = marginal.low[index], marginal.high[index]
     shared_index = marginal.parameter_indices[index]
@@ -299,7 +299,7 @@ def _distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray
     Parameters
     ----------
     energy : mapping of float to float
-        Energy [nat] by node.
+        The energy [nat] by node.
 
     Returns
     -------

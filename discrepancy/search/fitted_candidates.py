@@ -125,8 +125,8 @@ class FittedCandidates:
         key = rough.candidate.key
         if key in self.wide_fits:
             return self.wide_fits[key]
-        known = self.exact_fits.get(key)
-        if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
+        previous = self.exact_fits.get(key)
+        if previous is None or previous.log_evidence < rough.log_evidence - SEARCH.gained_again:
             exact = try_fit(self.problem, rough.candidate, rough.point)
             # the rough fit may be at a point from which the model cannot be fitted further
             self.record_fit(rough if exact is None else exact, exact=True)

@@ -91,9 +91,9 @@ def are_related(first: Effect, second: Effect) -> bool:
 def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChange]:
     """Return the changes of the prediction by an effect from which its fits should begin.
 
-    They are those of least `_cost`, over all places and a grid of parameters. An effect with
-    several parameters besides its magnitude, such as the place and width of a box, gets more starts
-    than others.
+    They are those with the least expected objective over all places and a grid of parameters. An
+    effect with several parameters besides its magnitude, such as the place and width of a box, gets
+    more starts than others.
 
     Parameters
     ----------
@@ -123,12 +123,14 @@ def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChang
                     small_change, _ = screen.shrink_change(change)
                     changes.append(small_change)
             nonzero_changes = [change for change in changes if change.squared_size > 0.0]
-            best_of_place = sorted([*best_of_place, *nonzero_changes], key=_cost)[:count]
+            best_of_place = sorted(
+                [*best_of_place, *nonzero_changes], key=_expected_objective_change
+            )[:count]
         best_changes.extend(best_of_place)
-    return sorted(best_changes, key=_cost)[:count]
+    return sorted(best_changes, key=_expected_objective_change)[:count]
 
 
-def _cost(change: ScreenedChange) -> float:
+def _expected_objective_change(change: ScreenedChange) -> float:
     """Return the expected change of the objective by a change at its best scale [nat].
 
     It is the negative log prior of the parameters minus the decrease of the misfit.

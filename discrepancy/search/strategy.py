@@ -182,15 +182,18 @@ class Search(FittedCandidates):
 
         The nuisances of a wrong model take up part of its error, which makes them a bad start. They
         are taken from a fit that includes a free missing force. If a trial is at rest, or no force
-        can be seen, they are set to their prior means.
+        can be estimated, they are set to their prior means.
         """
         point = self.problem.prior_mean_point(base.candidate)
         force_search = self.force_search if self.is_all_in_motion else None
         if force_search is not None:
             hypothesis = force_search.hypothesis_of_all_ports
             if base.candidate.terms:
-                followed = force_search.fit_along_motion(hypothesis, base.candidate, base.effect)
-                hypothesis = followed or hypothesis
+                with_effects = force_search.fit_along_motion(
+                    hypothesis, base.candidate, base.effect
+                )
+                # without the effects if they cannot act along the motion
+                hypothesis = with_effects or hypothesis
             point = force_search.point_with_effects(hypothesis)
         return replace(base, point=replace(point, effect=base.effect), trial_derivatives=())
 
