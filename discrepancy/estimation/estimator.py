@@ -37,10 +37,10 @@ from .linearised import (
 )
 
 DEVIATION_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
-"""Standard deviations of the missing force, over the first one, through which it is lowered."""
+"""Standard deviations of the missing force in turn, over the one at the start."""
 SPEED_WINDOWS = (0.1, 0.02, 0.005)
 """Half windows of speeds over which laws of the speed are averaged, over the rms speed. They become
-narrower from one estimate to the next."""
+narrower from one estimate to the next, so that the jump of dry friction is introduced gradually."""
 MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
 CONVERGED_STEP = 0.02
@@ -55,8 +55,8 @@ PATTERN_FACTORS = (3.0, 1.7, 1.3)
 """Factors on size and time of a missing force in the search for its most probable values, in
 turn."""
 LARGEST_DECLINE = 12.0
-"""Difference of log evidence to the best size of the missing force, from which on smaller sizes are
-not tried [nat]."""
+"""Difference to the largest log evidence above which still smaller missing forces are not tried
+[nat]."""
 
 
 class HypothesisLaws(Protocol):
@@ -185,22 +185,21 @@ class Linearisation:
         local : list of (L,) array
             The unknowns of each trial alone.
         """
+        # normal equations of the shared and effect unknowns, summed over the trials
         sum_of_products = np.zeros((1 + len(self.prior_precision),) * 2)
         half_log_determinant = 0.0
         for linear_trial in self.trials:
             products, half_of_trial = linear_trial.whitened_products
-            local_precision = linear_trial.trial.local_precision
-            without_local, half_without_local = integrate_out_last(
-                products, np.asarray(half_of_trial), local_precision
+            products_without_local, half_without_local = integrate_out_last(
+                products, np.asarray(half_of_trial), linear_trial.trial.local_precision
             )
-            sum_of_products += without_local
+            sum_of_products += products_without_local
             half_log_determinant += float(half_without_local)
-        solution = Regression(sum_of_products, half_log_determinant).solve(
-            range(len(self.prior_precision)), self.prior_precision
-        )
-        return solution, [
-            self._local_unknowns(linear_trial, solution.mean) for linear_trial in self.trials
-        ]
+        regression = Regression(sum_of_products, half_log_determinant)
+        all_unknowns = range(len(self.prior_precision))
+        solution = regression.solve(all_unknowns, self.prior_precision)
+        local = [self._local_unknowns(linear_trial, solution.mean) for linear_trial in self.trials]
+        return solution, local
 
     def with_processes(self, processes: Mapping[int, Process]) -> "Linearisation":
         """Return the same linear trials with other missing forces."""
@@ -219,7 +218,7 @@ class Linearisation:
         shared_and_effect : (K + E,) array
             The values of the shared unknowns, and of those of effects.
         """
-        # the last rows of the normal equations, with the known values on the right side
+        # the rows of the local unknowns in the normal equations, with the others on the right side
         products, _ = linear_trial.whitened_products
         first_local = 1 + len(shared_and_effect)
         precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
@@ -297,7 +296,7 @@ class MotionEstimator:
         current = start
         # with wide windows of speeds first, so that a jump of a law does not stop the iteration
         for speed_window in SPEED_WINDOWS[:-1]:
-            smoothed = self._iterate(laws, current, speed_window)
+            smoothed = self._iterate_gauss_newton(laws, current, speed_window)
             if smoothed is None:
                 return None
             current = start_from_estimate(smoothed)
@@ -331,7 +330,9 @@ class MotionEstimator:
                 port: replace(process, standard_deviation=fraction * process.standard_deviation)
                 for port, process in start.processes.items()
             }
-            estimate = self._iterate(laws, replace(current, processes=processes), SPEED_WINDOWS[-1])
+            estimate = self._iterate_gauss_newton(
+                laws, replace(current, processes=processes), SPEED_WINDOWS[-1]
+            )
             if estimate is None:
                 break
             if best is None or estimate.log_evidence > best.log_evidence:
@@ -374,12 +375,14 @@ class MotionEstimator:
                     if evidence > largest_evidence:
                         processes, largest_evidence = changed_processes, evidence
                         break
-        tuned = self._iterate(laws, replace(start, processes=processes), SPEED_WINDOWS[-1])
+        tuned = self._iterate_gauss_newton(
+            laws, replace(start, processes=processes), SPEED_WINDOWS[-1]
+        )
         if tuned is None or tuned.log_evidence <= estimate.log_evidence:
             return estimate
         return tuned
 
-    def _iterate(
+    def _iterate_gauss_newton(
         self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> MotionEstimate | None:
         """Return the estimate under given missing forces, by damped Gauss-Newton steps.

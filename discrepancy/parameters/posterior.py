@@ -180,10 +180,10 @@ def _draws_by_quadrature(
         Draws of the scaled parameters, of equal weight.
     """
     nodes = _QuadratureNodes(index, marginal, optima[0])
-    first_nodes = _first_nodes(marginal, optima, index)
-    for node in sorted(first_nodes, key=lambda node: abs(node - nodes.centre)):
+    initial_nodes = _initial_nodes(marginal, optima, index)
+    for node in sorted(initial_nodes, key=lambda node: abs(node - nodes.centre)):
         nodes.add_node(node)
-    points, distribution = _distribution(nodes.energy)
+    points, distribution = _cumulative_distribution(nodes.energy)
     while len(nodes.energy) < MOST_NODES:
         probabilities = np.diff(
             distribution[::INTERPOLATION_INTERVALS]
@@ -193,7 +193,7 @@ def _draws_by_quadrature(
             break
         left, right = sorted(nodes.energy)[largest : largest + 2]
         nodes.add_node(0.5 * (left + right))
-        points, distribution = _distribution(nodes.energy)
+        points, distribution = _cumulative_distribution(nodes.energy)
     quadrature_values = np.interp(stratified(generator, count), distribution, points)
 
     # the other parameters: their mean interpolates those at the nodes, and their covariance is
@@ -261,7 +261,7 @@ class _QuadratureNodes:
             self.energy[node] = 0.5 * node**2 - gaussian.log_evidence
 
 
-def _first_nodes(
+def _initial_nodes(
     marginal: MarginalPosterior, optima: tuple[CandidateFit, ...], index: int
 ) -> list[float]:
     """Return the first nodes: values over the whole prior, and closer ones about each optimum.
@@ -291,7 +291,7 @@ def _first_nodes(
     return [float(node) for node in nodes[is_apart]]
 
 
-def _distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
+def _cumulative_distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
     """Return the cumulative distribution of a density whose energy is known at nodes.
 
     The energy is interpolated between the nodes by Akima's method.

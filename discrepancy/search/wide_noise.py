@@ -143,12 +143,12 @@ def _channel_process(
     process_variance = mean_square / noise_level - 1.0
     if is_recorded_colour or process_variance <= 0.0:
         return process
-    return _with_process_in_time(
+    return _add_correlation_in_time(
         process, process_variance, autocorrelation, white_variance, interval
     )
 
 
-def _with_process_in_time(
+def _add_correlation_in_time(
     process: _ChannelProcess,
     process_variance: float,
     autocorrelation: FloatArray,
