@@ -143,7 +143,7 @@ def update_by_reading(
     innovation: FloatArray,
     gain: FloatArray,
 ) -> float:
-    """Take one reading into covariance (n, n) and means (n, W) in place, and return its variance.
+    """Update covariance and means of the state in place by one reading, and return its variance.
 
     Parameters
     ----------

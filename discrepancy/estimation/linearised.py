@@ -574,7 +574,7 @@ class SmoothedTrial:
 
 
 def input_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the changes of the state over a step for a unit input to its rate.
+    """Return the changes of a state over steps by a unit input to its rate.
 
     The input is linear over the step. The matrices follow from one exponential of the system with
     the input and its rate as further states (Van Loan 1978, IEEE Transactions on Automatic Control

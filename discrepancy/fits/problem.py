@@ -46,10 +46,9 @@ LEAST_VARIANCE = 1e-12
 def channel_misfits(
     record_freedom: FloatArray, sample_counts: FloatArray, squares: FloatArray
 ) -> FloatArray:
-    """Return the misfit of each channel: -ln L with the noise variance marginalised [nat].
+    """Return -ln L of each channel with the noise variance marginalised, up to a constant [nat].
 
-    It is up to a constant. Without a noise record, the logarithm of the noise deviation has a flat
-    prior.
+    Without a noise record, the logarithm of the noise deviation has a flat prior.
 
     Parameters
     ----------
@@ -160,7 +159,7 @@ class Problem:
             self.refusals[candidate.terms[0].effect.identifier] = str(cause)
 
     def _gain_estimates(self) -> dict[str, float]:
-        """Return the ratio of readings to model response for each channel of unknown gain.
+        """Return first estimates of unknown gains: the ratio of readings to the model's response.
 
         It is the ratio of their largest amplitudes in the first trial in which the channel moves in
         the model. It is negative if readings and response have opposite signs, except after a
@@ -231,7 +230,7 @@ class Problem:
         patch: ModelPatch,
         refinement: int = 1,
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the response of a patched model in a trial, without gains and zeros.
+        """Return the response of a patched model in a trial, without gains and zeros of channels.
 
         The last `MOST_CACHED_RESPONSES` responses are kept in memory.
 

@@ -1,7 +1,7 @@
 """Trials with all that is needed to compare them with a model: noise, used samples, and unknowns.
 
 Each unknown is a scaled variable u with the prior N(0, 1), or a flat prior if nothing is known of
-it. Its value is centre + scale u. *Global* unknowns have the same value in all hypotheses and
+it. Its value is centre + scale u. *Shared* unknowns have the same value in all hypotheses and
 trials: calibrated parameters and gains of channels. *Local* unknowns belong to one trial: zeros of
 its channels, an unknown initial state, the time of release of a ring-down, constants to be added to
 recorded inputs, and uncertain health (stiffness losses).
@@ -88,7 +88,7 @@ class SharedUnknowns:
 
     @property
     def unknown_count(self) -> int:
-        """The number Q of global unknowns."""
+        """The number Q of shared unknowns."""
         return len(self.scale)
 
     @property

@@ -55,9 +55,10 @@ class FittedCandidates:
         return fit.log_evidence + self.log_prior(fit.candidate)
 
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
-        """Return the fit of every candidate by which it is compared.
+        """Return the fits by which candidates are compared, one for each candidate.
 
-        It is the fit under the wider noise if there is any, else the exact fit, else the rough one.
+        They are the fits under the wider noise if there are any; otherwise the exact fit of each
+        candidate, or its rough fit if it has no exact one.
         """
         return self.wide_fits or {**self.rough_fits, **self.exact_fits}
 
@@ -66,7 +67,7 @@ class FittedCandidates:
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
     def best_fit_of_set(self, identifiers: tuple[str, ...]) -> CandidateFit:
-        """Return the fit of the highest score of a set of effects, at any places."""
+        """Return the fit with the highest score of a set of effects, whatever their places."""
         fits = self.compared_fits().values()
         return max(
             (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
@@ -86,7 +87,7 @@ class FittedCandidates:
         return self.wide_fits.get((), self.no_effect)
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
-        """Return the probability of each set of effects at any places, the most probable first."""
+        """Return the probability of each set of effects over all places, in descending order."""
         scores: dict[tuple[str, ...], list[float]] = {}
         for fit in self.compared_fits().values():
             scores.setdefault(fit.candidate.identifiers, []).append(self.score(fit))

@@ -19,9 +19,9 @@ from discrepancy.search_settings import SEARCH
 def canonical_relatives(
     leading: EffectTerm, hypotheses: Iterable[ForceHypothesis]
 ) -> list[ForceHypothesis]:
-    """Return the hypotheses of one effect that has the family and place of a given one.
+    """Return the hypotheses of one effect with the family and place of a leading effect.
 
-    The effects have their canonical shape, and a magnitude.
+    Only effects with a magnitude and with their canonical shape are returned.
 
     Parameters
     ----------

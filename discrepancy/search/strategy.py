@@ -81,7 +81,7 @@ class Search(FittedCandidates):
     def fit_one_more_effect(
         self, base: CandidateFit, effects: Iterable[Effect]
     ) -> list[CandidateFit]:
-        """Add each effect to a fit and fit the set by few steps.
+        """Add each effect to a base, one at a time, and fit the sets by few steps.
 
         The fits begin where the screen expects the least objective. Far from the truth the phases
         of predictions drift away from those of the readings, and the screen, which is linear, does
@@ -178,7 +178,7 @@ class Search(FittedCandidates):
         return self._fit_from_starts(starts_by_effect, base, least_gain if has_effects else 0.0)
 
     def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
-        """Return a base with nuisances that are not distorted by the errors of the model.
+        """Return a base whose nuisances are not distorted by the errors of the model.
 
         The nuisances of a wrong model take up part of its error, which makes them a bad start. They
         are taken from a fit that includes a free missing force. If a trial is at rest, or no force
@@ -250,7 +250,7 @@ class Search(FittedCandidates):
         if not rough:
             return []
         best_score = self.score(rough[0])
-        # after few steps far from the truth the scores are only roughly in order
+        # far from the truth, the scores after few steps are only roughly in order
         margin = max(SEARCH.close, SEARCH.close_share * (best_score - floor))
         least_score = max(best_score - margin, floor)
         chosen = [fit for fit in rough[: SEARCH.exact_fits] if self.score(fit) > least_score]

@@ -220,7 +220,7 @@ def unrecorded_noise_levels(problem: Problem, fit: CandidateFit) -> FloatArray:
 
 
 class _RecordedColour(NamedTuple):
-    """The correlation in time that a channel's noise has in residuals, by its noise record.
+    """The correlation in time that the residuals of a channel have if they are recorded noise.
 
     Attributes
     ----------
@@ -240,7 +240,7 @@ class _RecordedColour(NamedTuple):
 def _recorded_colour(
     problem: Problem, name: str, records: Sequence[ResidualRecord], interval: float
 ) -> _RecordedColour:
-    """Return the correlation in time that residuals have if they are noise as in the record.
+    """Return the correlation in time of residuals that are noise as in the noise record.
 
     If residuals are whitened, the record is passed through the same whitening filter first.
 
@@ -442,9 +442,9 @@ def _add_wide_fit(
 
 
 def _expected_score(search: Search, wide_problem: Problem, fit: CandidateFit) -> float:
-    """Return the score of a fit under a wider noise if its point and prior stay the same [nat].
+    """Return the score that a fit would have under a wider noise at its present point [nat].
 
-    The score is ln (evidence times prior). Only the misfit changes with the noise.
+    The score is ln (evidence times prior). Of its parts, only the misfit is computed again.
     """
     problem = search.problem
     scaled_residuals = []
