@@ -53,9 +53,9 @@ from twin_master.mission.sensor_design import separations as separations
 from twin_master.mission.sensor_design import with_candidates as with_candidates
 from twin_master.network.belief_planning import BeliefPlan as BeliefPlan
 from twin_master.network.belief_planning import DecisionProblem as DecisionProblem
-from twin_master.report.structure import design_figure as design_figure
+from twin_master.report.planning import design_figure as design_figure
+from twin_master.report.planning import plan_figure as plan_figure
 from twin_master.report.structure import gauge_places as gauge_places
-from twin_master.report.structure import plan_figure as plan_figure
 from twin_master.report.structure import planform_of as planform_of
 from twin_master.scenario.reading import load_scenario as load_scenario
 from twin_master.scenario.schema import Scenario as Scenario
