@@ -20,9 +20,9 @@ from benchmarks.browser import open_browser
 from benchmarks.pictures.notebooks import folder_until_exit, notebook
 from benchmarks.pictures.picture import Drawing
 from reporting.figures import to_png
-from twin_master.fleet.flight import KIND, fleet_config
+from twin_master.fleet.configuration import KIND, fleet_config
+from twin_master.fleet.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import last_steps
-from twin_master.fleet.report import course_figure, map_figure
 from twin_master.fleet.store import FAILED, has_flown, open_group
 from twin_master.scenario.schema import Scenario
 

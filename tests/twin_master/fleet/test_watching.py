@@ -16,11 +16,13 @@ from tests.command_line import command, said, seen
 from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until, write_csv
 from twin_master.errors import FleetError, RunFolderError
+from twin_master.fleet.engine import Engine
 from twin_master.fleet.plan import load_fleet
-from twin_master.fleet.reading import group_figures, leaving
-from twin_master.fleet.report import WORST, fleet_page, serve_fleet, write_fleet_report
-from twin_master.fleet.shard import Engine
-from twin_master.fleet.watching import FleetWatch, WatchedAsset
+from twin_master.fleet.reading import group_figures, leaving_probabilities
+from twin_master.fleet.report import fleet_page, write_fleet_report
+from twin_master.fleet.view import ATTENTION_ROWS, serve_fleet
+from twin_master.fleet.watched_asset import WatchedAsset
+from twin_master.fleet.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.folder import Watch
 from uav_twin import fly_fleet, learn_from_fleet, open_fleet
@@ -338,7 +340,9 @@ def leaving_soon(fleet_file: Path, folder: Path) -> Any:
     """Fly the recordings of a fleet; return the folder, and how probably each asset leaves its control."""
     outcome = fly_fleet(load_fleet(fleet_file), folder, Engine(0))
     config = json.loads((outcome.folder / "config.json").read_text())
-    return outcome.folder, leaving(outcome.folder, config["fleet"]["groups"][0], open_fleet(folder)["north"])
+    return outcome.folder, leaving_probabilities(
+        outcome.folder, config["fleet"]["groups"][0], open_fleet(folder)["north"]
+    )
 
 
 def watched_records(fleet_file: Path, folder: Path) -> list[dict[str, Any]]:
@@ -428,4 +432,4 @@ def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, al
     del asset["last"]["health"]
     file.write_text(json.dumps(state))
     with pytest.raises(FleetError, match="out is damaged or of another version"):
-        fleet_page(tmp_path / "out", WORST)
+        fleet_page(tmp_path / "out", ATTENTION_ROWS)
