@@ -72,7 +72,7 @@ def check_fleet(fleet: Fleet) -> None:
 def _objections_to_scenarios(group: Group) -> list[str]:
     """Return why scenarios of a group cannot be flown, a sentence for each."""
     objections = []
-    mean_parameters = {name: spread.mean for name, spread in group.spreads.items()}
+    mean_parameters = {name: spread.mean for name, spread in group.parameter_spreads.items()}
     is_real = bool(group.observations)
     for number, scenario in enumerate(group.scenarios):
         try:
@@ -122,7 +122,7 @@ def _check_scenario(group: Group, scenario: Scenario) -> None:
             "same life: name its seeds in `asset.seeds`, or fly the scenario with --seed."
         )
     if flies_model(scenario):
-        unknown_parameters = sorted({*group.spreads} - {_WING_PARAMETER})
+        unknown_parameters = sorted({*group.parameter_spreads} - {_WING_PARAMETER})
         if unknown_parameters:
             raise FleetError(
                 f"`parameters` names {', '.join(unknown_parameters)}, and the model of a wing "

@@ -18,7 +18,7 @@ from reporting.progress import Progress
 from reporting.provenance import collect_provenance
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Member
-from twin_master.fleet.shard import ShardResult, fly_shard, unflown
+from twin_master.fleet.shard import ShardResult, fly_shard, result_of_unflown
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -137,7 +137,7 @@ def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[Flown
                 running.update(submit(single_twins))
                 continue
             reason = "its flight ended the worker process: fly an FMU that crashes isolated."
-            result = unflown(piece.members[0], reason)
+            result = result_of_unflown(piece.members[0], reason)
         except CancelledError:
             raise FleetError(
                 "the scheduler was lost: what was flown is kept, "
@@ -177,6 +177,10 @@ def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> Shard
 def _connected_client(engine: Engine) -> "Iterator[Client]":
     """Return a context with a client of the cluster, or of workers that live as long as it."""
     import dask
+
+    # Importing `distributed` adds its defaults to the configuration. That must happen before the
+    # settings below, which are undone at the end together with all that was added meanwhile.
+    import distributed  # noqa: F401
 
     quiet_settings = {
         "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,

@@ -24,7 +24,7 @@ from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_fol
 from twin_master.fleet.engine import Engine, Piece, fly_pieces
 from twin_master.fleet.evidence import reason_transitions_are_fixed
 from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
-from twin_master.fleet.shard import ShardResult, unflown
+from twin_master.fleet.shard import ShardResult, result_of_unflown
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
 from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
@@ -185,7 +185,7 @@ def endings_of(folder: Path) -> Endings:
     return Endings(dict(sorted(failures.items())), dict(sorted(ended.items())))
 
 
-def prepared(scenario: Scenario, folder: Path, *, is_real: bool = False) -> bytes:
+def prepare_kit(scenario: Scenario, folder: Path, *, is_real: bool = False) -> bytes:
     """Prepare a scenario in a folder, and return the packed kit with which it is flown.
 
     Parameters
@@ -307,14 +307,14 @@ class _FleetFlight:
             except IN_FLIGHT as error:
                 if len(group.scenarios) == 1:
                     raise
-                self._store(number, members, unflown(members[0], str(error)))
+                self._store(number, members, result_of_unflown(members[0], str(error)))
             else:
                 yield Piece(number, kit, recorded)
 
     def _pack_kit(self, group_number: int, scenario_number: int) -> bytes:
         """Return the packed kit of a scenario of a group."""
         group = self._fleet.groups[group_number]
-        return prepared(
+        return prepare_kit(
             group.scenarios[scenario_number],
             group_folder(self._folder, group, scenario_number),
             is_real=bool(group.observations),

@@ -40,6 +40,7 @@ from twin_master.fleet.store import open_group
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
+from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -271,11 +272,7 @@ def _learn_group(
         The twins that have flown, by scenario.
     """
     scenario = flown[0].knowledge.scenario
-    reason = reason_transitions_are_fixed(scenario)
-    if reason:
-        family = TransitionFamily.fixed(scenario, reason)
-    else:
-        family = TransitionFamily.learnable(scenario)
+    family = _transition_family(scenario)
     observations = _observations(group, flown)
     # With several scenarios, each twin has a calibration of its own, and there is no population.
     nodes = None
@@ -303,6 +300,14 @@ def _learn_group(
         lessons["population"] = _population(observations[0], family, grid, nodes, noise.mean)
     flown_controls = _followed_controls(group, rows, scenario.control_names)
     return _GroupLessons(family, grid, flown_controls, lessons)
+
+
+def _transition_family(scenario: Scenario) -> TransitionFamily:
+    """Return the transitions of a scenario, as a function of the probabilities that are learnt."""
+    reason = reason_transitions_are_fixed(scenario)
+    if reason:
+        return TransitionFamily.fixed(scenario, reason)
+    return TransitionFamily.learnable(scenario)
 
 
 def _observations(group: "xr.Dataset", flown: Sequence[TwinsOfScenario]) -> list[_Observations]:

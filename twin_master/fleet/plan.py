@@ -159,30 +159,32 @@ class Group:
         The name of the group.
     scenarios : tuple of Scenario
         The resolved scenarios: one for all assets, or one for each.
-    spreads : dict of str to Spread
+    parameter_spreads : dict of str to Spread
         The parameters that differ from asset to asset.
     members : tuple of Member
         The assets; empty if a broker will tell which there are.
     observations : str
         Where the observations of real assets come from, a pattern of files or an address; empty if
         assets are flown.
-    file : dict of str to str
+    scenario_file : dict of str to str
         The name and the hash of the file of the scenario.
     """
 
     name: str
     scenarios: tuple[Scenario, ...]
-    spreads: Mapping[str, Spread]
+    parameter_spreads: Mapping[str, Spread]
     members: tuple[Member, ...]
     observations: str = ""
-    file: Mapping[str, str] = field(default_factory=dict)
+    scenario_file: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Return the group for `config.json`."""
         record: dict[str, Any] = {
             "name": self.name,
             "scenarios": [scenario.portable().to_dict() for scenario in self.scenarios],
-            "parameters": {name: spread.model_dump() for name, spread in self.spreads.items()},
+            "parameters": {
+                name: spread.model_dump() for name, spread in self.parameter_spreads.items()
+            },
             "members": [
                 [member.name, member.seed, member.scenario_number] for member in self.members
             ],
@@ -350,10 +352,10 @@ def _group(section: GroupSection, folder: Path, seed: int) -> Group:
     return Group(
         name=section.name,
         scenarios=_scenarios(section, folder, seed, loaded, files),
-        spreads={} if observations else section.parameters,
+        parameter_spreads={} if observations else section.parameters,
         members=_members(section, seed, observations, files),
         observations=observations,
-        file=loaded.file,
+        scenario_file=loaded.file,
     )
 
 
@@ -446,7 +448,7 @@ def _members(
             return ()
         return tuple(
             Member(row, asset_name(path), seed, {}, file=path)
-            for row, path in enumerate(recordings(observations))
+            for row, path in enumerate(recording_files(observations))
         )
     if files:
         return tuple(_member(section, seed, row, file) for row, file in enumerate(files))
@@ -473,7 +475,7 @@ def _member(section: GroupSection, seed: int, row: int, file: Path | None = None
     return Member(row, file.stem, own_seed, parameters, scenario_number=row, file=file)
 
 
-def recordings(pattern: str) -> list[Path]:
+def recording_files(pattern: str) -> list[Path]:
     """Return the files of real assets that fit a pattern, sorted; hidden files are left out."""
     paths = sorted(Path(pattern).parent.glob(Path(pattern).name))
     return [path for path in paths if not path.name.startswith(".")]

@@ -16,7 +16,7 @@ from twin_master.fleet.store import (
     FLOWN,
     NOTICE_KINDS,
     WITHIN,
-    has_flown,
+    flown_rows,
     open_group,
 )
 from twin_master.mission.preparation import Knowledge, kept_knowledge
@@ -43,10 +43,10 @@ class Outcomes:
 
     Attributes
     ----------
-    within : Estimated
+    prompt_fallbacks : Estimated
         The fraction of the fallbacks that were called for and came within `WITHIN` steps; NaN if
         none was called for. A fallback counts if so many steps were flown after the call.
-    early : Estimated
+    early_fallbacks : Estimated
         The fraction of missions with a fallback before the damage that calls for it; NaN if no
         damage calls for one.
     rms : tuple of Estimated
@@ -54,19 +54,19 @@ class Outcomes:
         missions, in SI units.
     bias : tuple of Estimated
         For each factor, the mean error of its filtered mean, in SI units.
-    evidence : Estimated
+    log_evidence : Estimated
         The mean log evidence of a step.
-    credible : Estimated
+    credible_coverage : Estimated
         The fraction of the steps in which the true state lies in the smallest set of states that
         has a probability of `CREDIBILITY` under the filtered belief.
     """
 
-    within: Estimated
-    early: Estimated
+    prompt_fallbacks: Estimated
+    early_fallbacks: Estimated
     rms: tuple[Estimated, ...]
     bias: tuple[Estimated, ...]
-    evidence: Estimated
-    credible: Estimated
+    log_evidence: Estimated
+    credible_coverage: Estimated
 
     @classmethod
     def from_store(cls, stored: Mapping[Any, Any]) -> "Outcomes":
@@ -74,7 +74,7 @@ class Outcomes:
 
         Twins whose assets ended their simulations early count with what they have flown.
         """
-        flown = has_flown(np.asarray(stored["status"]))
+        flown = flown_rows(np.asarray(stored["status"]))
 
         def values(name: str) -> Float:
             return np.asarray(stored[name])[flown].astype(np.float64)
@@ -87,12 +87,12 @@ class Outcomes:
         mean_square = (error**2).mean(axis=1).filled(np.nan).T
         mean_error = error.mean(axis=1).filled(np.nan).T
         return cls(
-            within=_fraction(called_for <= WITHIN),
-            early=_fraction(early[early >= 0.0] > 0.0),
+            prompt_fallbacks=_fraction(called_for <= WITHIN),
+            early_fallbacks=_fraction(early[early >= 0.0] > 0.0),
             rms=tuple(_root(_mean(factor)) for factor in mean_square),
             bias=tuple(_mean(factor) for factor in mean_error),
-            evidence=_mean(np.nanmean(values("log_evidence"), axis=1)),
-            credible=_mean(values("credible")),
+            log_evidence=_mean(np.nanmean(values("log_evidence"), axis=1)),
+            credible_coverage=_mean(values("credible")),
         )
 
 
@@ -181,8 +181,10 @@ def severity(scenario: Scenario, mean: ArrayLike) -> Float:
     """
     lowest = np.array([factor.levels[0] for factor in scenario.state])
     highest = np.array([factor.levels[-1] for factor in scenario.state])
-    length = np.where(highest > lowest, highest - lowest, 1.0)  # a factor may have one level
-    return np.asarray(((np.asarray(mean) - lowest) / length).sum(axis=-1))
+    has_one_level = highest == lowest
+    length = np.where(has_one_level, 1.0, highest - lowest)
+    position = (np.asarray(mean) - lowest) / length
+    return np.asarray(position.sum(axis=-1))
 
 
 def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) -> Float:
@@ -264,7 +266,7 @@ def flown_twins(
     RunFolderError
         If what the twins know is missing or damaged.
     """
-    flown = has_flown(group["status"].values)
+    flown = flown_rows(group["status"].values)
     scenario_numbers = np.array([number for _name, _seed, number in record["members"]])[flown]
     for number in np.unique(scenario_numbers).tolist():
         home = folder / GROUPS / record["name"] / str(number)
@@ -316,24 +318,26 @@ def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
     """
     status = group["status"].values
     figures = _counts_of_twins(group)
-    if not len(has_flown(status)):
+    if not len(flown_rows(status)):
         return figures
     outcomes = Outcomes.from_store(group)
     is_truth_known = not np.isnan(outcomes.bias[0].value)  # of real assets nobody knows it
     if is_truth_known:
-        if not np.isnan(outcomes.within.value):
+        if not np.isnan(outcomes.prompt_fallbacks.value):
             steps = f"{group.attrs['step_name']}s"
-            figures[f"fallback within {WITHIN} {steps}, of those called for"] = outcomes.within
-        if not np.isnan(outcomes.early.value):
-            figures["early fallback"] = outcomes.early
+            figures[f"fallback within {WITHIN} {steps}, of those called for"] = (
+                outcomes.prompt_fallbacks
+            )
+        if not np.isnan(outcomes.early_fallbacks.value):
+            figures["early fallback"] = outcomes.early_fallbacks
         for name, rms, bias in zip(
             group.attrs["factors"], outcomes.rms, outcomes.bias, strict=True
         ):
             figures[f"filtered rms error of {name}"] = rms
             figures[f"bias of {name}"] = bias
-    figures["log evidence of a step"] = outcomes.evidence
+    figures["log evidence of a step"] = outcomes.log_evidence
     if is_truth_known:
-        figures["true state in the 90 % set"] = outcomes.credible
+        figures["true state in the 90 % set"] = outcomes.credible_coverage
     return figures
 
 

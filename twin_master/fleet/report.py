@@ -30,7 +30,7 @@ from twin_master.fleet.reading import (
     leaving_probabilities,
 )
 from twin_master.fleet.standing import Standing, standing_of_flown, standing_of_watched
-from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, has_flown, open_group
+from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, flown_rows, open_group
 from twin_master.fleet.watched_asset import counts_of, read_standing
 from twin_master.report.reading import PrintedFactor, printed_factors
 
@@ -161,7 +161,7 @@ def _leaving_or_explanation(
     except TwinMasterError as error:
         page.add_paragraph(in_one_line(f"Who leaves its control soon is not known: {error}"))
         return None
-    return probabilities[has_flown(group["status"].values)]
+    return probabilities[flown_rows(group["status"].values)]
 
 
 def _opening(standings: Sequence[Standing], groups: "Sequence[xr.Dataset]") -> str:
@@ -286,7 +286,7 @@ def _add_map(page: Page, standing: Standing, failed: int) -> None:
 
 def _add_courses(page: Page, standing: Standing, group: "xr.Dataset") -> None:
     """Add the health of the assets of a group over time, if a state is believed in any step."""
-    flown = has_flown(group["status"].values)
+    flown = flown_rows(group["status"].values)
     mean = believed_means(group)[flown]
     if standing.names and not np.isnan(mean).all():
         figure = course_figure(standing.scenario, mean, group["state"].values[flown])

@@ -116,7 +116,7 @@ class ShardResult(NamedTuple):
     ended: dict[str, str]
 
 
-def unflown(member: Member, reason: str) -> ShardResult:
+def result_of_unflown(member: Member, reason: str) -> ShardResult:
     """Return the result of a twin that could not fly, with the reason."""
     variables = {"status": np.array([FAILED]), "seed": np.array([member.seed])}
     return ShardResult(variables, {member.name: reason}, {})

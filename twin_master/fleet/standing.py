@@ -8,7 +8,7 @@ import numpy as np
 
 from reporting.arrays import Float, Index
 from twin_master.fleet.reading import believed_means, last_steps, notice_counts, severity
-from twin_master.fleet.store import has_flown
+from twin_master.fleet.store import flown_rows
 from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standin
         The group in the store.
     """
     scenario = Scenario.model_validate(record["scenarios"][0])
-    flown = has_flown(group["status"].values)
+    flown = flown_rows(group["status"].values)
     last_step = last_steps(group)[flown]
     at_last_step = (flown, last_step)
     control = group["control_index"].values[at_last_step]

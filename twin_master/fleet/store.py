@@ -80,7 +80,7 @@ def _schema() -> dict[str, _Variable]:
     return variables
 
 
-def has_flown(status: NDArray[Any]) -> Index:
+def flown_rows(status: NDArray[Any]) -> Index:
     """Return the rows of the twins that flew to the end of the mission or of their assets."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
@@ -359,7 +359,7 @@ def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
     twin_count = len(group.members)
     sizes = dimension_sizes(scenario)
     variables = _schema()
-    for name in group.spreads:
+    for name in group.parameter_spreads:
         variables[name] = _Variable((), "SI", "true parameter", "f8")
     for name, variable in variables.items():
         row_shape = tuple(sizes[axis] for axis in variable.axes)

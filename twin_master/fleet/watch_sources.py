@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from twin_master.errors import FleetError
-from twin_master.fleet.plan import Group, asset_name, recordings
+from twin_master.fleet.plan import Group, asset_name, recording_files
 from twin_master.fleet.watched_asset import WatchedAsset
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.watch.feeds import broker_of, file_feed
@@ -25,6 +25,13 @@ _LONGEST_HEADER = 100_000
 """Largest number of bytes of the header of a file."""
 
 
+class BrokerMessage(Protocol):
+    """A message of a broker."""
+
+    topic: str
+    payload: bytes
+
+
 class Watcher(Protocol):
     """What sources need of the watch of a fleet; `FleetWatch` has it.
 
@@ -34,16 +41,16 @@ class Watcher(Protocol):
         The folder of the fleet.
     assets : dict of str to WatchedAsset
         The assets under watch.
-    asked : bool
+    is_end_requested : bool
         Whether the watch is to end.
-    goodbyes : ExitStack
-        What is to be done at the end, before the folders are released.
+    final_actions : ExitStack
+        The actions at the end of the watch, before the folders are released.
     """
 
     folder: Path
     assets: dict[str, WatchedAsset]
-    asked: bool
-    goodbyes: ExitStack
+    is_end_requested: bool
+    final_actions: ExitStack
 
     def note(self, sentence: str) -> None:
         """Tell the operator a sentence."""
@@ -68,7 +75,7 @@ class Source(Protocol):
     """The observations of a group of real assets."""
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether nothing more is to be read."""
 
     def look(self, *, for_new_assets: bool) -> int:
@@ -94,7 +101,7 @@ class FileSource:
     """
 
     def __init__(self, watcher: Watcher, group: Group, *, follow: bool) -> None:
-        if not follow and not recordings(group.observations):
+        if not follow and not recording_files(group.observations):
             raise FleetError(
                 f"no recording fits {group.observations}; "
                 "what is still to come is waited for with --follow."
@@ -105,7 +112,7 @@ class FileSource:
         self._files: dict[str, Path] = {}
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether all files are read to their end, or as far as was wanted."""
         if self._follow:
             return False
@@ -128,7 +135,7 @@ class FileSource:
             Whether new files are searched for, too.
         """
         if for_new_assets:
-            for path in recordings(self._group.observations):
+            for path in recording_files(self._group.observations):
                 self._add_file(path)
         scenario = self._group.scenarios[0]
         steps = 0
@@ -169,7 +176,7 @@ class TopicSource:
         The certificate of the broker's authority.
     """
 
-    ended = False
+    has_ended = False  # a broker may send more at any time
 
     def __init__(self, watcher: Watcher, group: Group, authority: Path | None) -> None:
         broker = broker_of(group.observations, authority, many=True)
@@ -177,8 +184,8 @@ class TopicSource:
         self._group = group
         self._topic_prefix = broker.topic.removesuffix("+")
         self._session = Session(broker, group.name, watcher.folder, watcher.note, self._heartbeat)
-        watcher.goodbyes.callback(self._session.close)
-        self._messages: Iterator[Any] = self._session.messages(0.0)
+        watcher.final_actions.callback(self._session.close)
+        self._messages: Iterator[BrokerMessage | None] = self._session.messages(0.0)
         self._topics: dict[str, Topic] = {}
 
     def look(self, *, for_new_assets: bool) -> int:
@@ -197,7 +204,7 @@ class TopicSource:
         if for_new_assets:
             for name in list(self._topics):
                 steps += self._advance(name)
-        while not self._watcher.asked:
+        while not self._watcher.is_end_requested:
             message = next(self._messages)
             if message is None:
                 break
@@ -215,7 +222,7 @@ class TopicSource:
         for path in sorted(group_folder.glob(f"*/{CONFIG_NAME}")):
             self._find_topic(path.parent.name)
 
-    def _take_in(self, message: Any) -> int:
+    def _take_in(self, message: BrokerMessage) -> int:
         """Take in a message of the broker; return the number of steps."""
         name = message.topic.rpartition("/")[2]
         asset = self._watcher.assets.get(f"{self._group.name}/{name}")

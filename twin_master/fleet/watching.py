@@ -100,7 +100,7 @@ class FleetWatch:
         The assets under watch, without those that are lost.
     standing : dict
         How all assets stood at the last writing of the state; see `read_standing`.
-    asked : bool
+    is_end_requested : bool
         Whether the watch is to end between two steps.
     """
 
@@ -117,9 +117,9 @@ class FleetWatch:
     ) -> None:
         self.folder = folder
         self.assets: dict[str, WatchedAsset] = {}
-        self.asked = False
-        self.closing = ExitStack()
-        self.goodbyes = ExitStack()
+        self.is_end_requested = False
+        self.folder_locks = ExitStack()
+        self.final_actions = ExitStack()
         self._tell = tell
         self._note = note
         self._wanted_steps = steps
@@ -133,7 +133,7 @@ class FleetWatch:
                 self._sources.append(TopicSource(self, group, authority))
             else:
                 self._sources.append(FileSource(self, group, follow=follow))
-        self.closing.enter_context(locked_fleet_folder(folder, WATCHED_KIND, _record(fleet)))
+        self.folder_locks.enter_context(locked_fleet_folder(folder, WATCHED_KIND, _record(fleet)))
         self.standing = read_standing(folder)
         self._records_of_lost = dict(self.standing["assets"])
         _allow_many_files()
@@ -174,10 +174,10 @@ class FleetWatch:
         """
         last_state = -SEARCH_SECONDS
         last_search = -SEARCH_SECONDS
-        # The goodbyes come first, since they may still write into the folders.
-        with self.closing, self.goodbyes:
+        # The final actions run before the folders are released, into which they may still write.
+        with self.folder_locks, self.final_actions:
             try:
-                while not self.asked:
+                while not self.is_end_requested:
                     begin = time.monotonic()
                     is_search_due = begin - last_search >= SEARCH_SECONDS
                     if is_search_due:
@@ -190,7 +190,7 @@ class FleetWatch:
                         last_state = begin
                     after_look()
                     if steps == 0:
-                        if all(source.ended for source in self._sources):
+                        if all(source.has_ended for source in self._sources):
                             return
                         _pause_after(time.monotonic() - begin)
             finally:
@@ -226,7 +226,7 @@ class FleetWatch:
         """
         key = f"{group.name}/{name}"
         is_waiting = key in self._lost and time.monotonic() < self._lost[key].again
-        if self.asked or (key not in self.assets and is_waiting):
+        if self.is_end_requested or (key not in self.assets and is_waiting):
             return 0
         steps = 0
         try:
@@ -241,7 +241,7 @@ class FleetWatch:
                     self.note(f"{key} is watched again.")
                 self._hand_on(asset, decision)
                 steps += 1
-                if steps == most_steps or self.has_all_steps(asset) or self.asked:
+                if steps == most_steps or self.has_all_steps(asset) or self.is_end_requested:
                     break
             if steps == 0 and not asset.watch.intake.ended:
                 asset.watch.quiet(partial(self._hand_on, asset))
@@ -263,7 +263,7 @@ class FleetWatch:
             raise FleetError(f"a process watches {LARGEST_FLEET} assets at most.")
         key = f"{group.name}/{name}"
         asset = self._open_asset(group, name, feed)
-        self.closing.callback(asset.close)
+        self.folder_locks.callback(asset.close)
         self._sibling.setdefault(group.name, asset.watch)
         self.assets[key] = asset
         last_decision = asset.decision
@@ -282,7 +282,7 @@ class FleetWatch:
             with explained_write_errors(folder):
                 folder.parent.mkdir(exist_ok=True)
             watch_context = begun_watch(
-                group.scenarios[0], group.file, folder, SilentProgress(), like=sibling
+                group.scenarios[0], group.scenario_file, folder, SilentProgress(), like=sibling
             )
         with ExitStack() as closing:
             watch = closing.enter_context(watch_context)
@@ -305,7 +305,7 @@ class FleetWatch:
 
     def ask(self) -> None:
         """Ask for an end between two steps."""
-        self.asked = True
+        self.is_end_requested = True
 
     def has_all_steps(self, asset: WatchedAsset) -> bool:
         """Return whether an asset has the steps that were wanted."""

@@ -28,7 +28,7 @@ def state_units(run: Run) -> str:
     return ", ".join(dict.fromkeys(units))
 
 
-def mission_words(run: Run, figure: Figure, now: int, name: str) -> ReportFigure:
+def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigure:
     """Return the figure of the mission as seen at a step, with its title and caption.
 
     Parameters
@@ -87,7 +87,7 @@ def _decision_sentence(run: Run, now: int) -> str:
     )
 
 
-def belief_words(run: Run, figure: Figure) -> ReportFigure:
+def caption_belief(run: Run, figure: Figure) -> ReportFigure:
     """Return the figure of the belief about the state, with its title and caption."""
     units = state_units(run)
     is_truth_known = run.true_state is not None
@@ -113,7 +113,7 @@ def belief_words(run: Run, figure: Figure) -> ReportFigure:
     return report_figure._replace(name="belief")
 
 
-def learnt_words(run: Run, figure: Figure) -> ReportFigure:
+def caption_learnt(run: Run, figure: Figure) -> ReportFigure:
     """Return the figure of the learnt quantities, with its title and caption."""
     sensor_sentence = (
         f"Of the {run.sensors.word}s on the left: the one named, which departs most from its "
@@ -132,7 +132,7 @@ def learnt_words(run: Run, figure: Figure) -> ReportFigure:
     )
 
 
-def policy_words(run: Run, figure: Figure) -> ReportFigure:
+def caption_policy(run: Run, figure: Figure) -> ReportFigure:
     """Return the figure of the policy, with its title and caption."""
     controls = run.controls
     if len(controls) == 1:
@@ -148,7 +148,7 @@ def policy_words(run: Run, figure: Figure) -> ReportFigure:
     return WORDS.figure("policy", figure, truth=truth, margin=margin)
 
 
-def check_words(run: Run, check: PredictiveCheck, figure: Figure) -> ReportFigure:
+def caption_check(run: Run, check: PredictiveCheck, figure: Figure) -> ReportFigure:
     """Return the figure of the posterior predictive check, with its title and caption."""
     lowest_coverage = ""
     if len(check.transform):
@@ -205,7 +205,7 @@ def assumed_model_error(run: Run) -> str:
     return f"{low:.3g} %" if low == high else f"{low:.3g} to {high:.3g} %"
 
 
-def calibration_words(run: Run, figure: Figure) -> ReportFigure:
+def caption_calibration(run: Run, figure: Figure) -> ReportFigure:
     """Return the figure of the calibration, with its title and caption."""
     draws = run["calibration/draw_value"]
     unit = parameter_unit(run)
@@ -239,7 +239,7 @@ def _load_test_sentence(run: Run) -> str:
     )
 
 
-def mesh_words(run: Run, picture: StructurePicture) -> ReportFigure:
+def caption_mesh(run: Run, picture: StructurePicture) -> ReportFigure:
     """Return the picture of a structure's mesh, with its title and caption."""
     report_figure = WORDS.figure(
         "mesh",
@@ -252,13 +252,13 @@ def mesh_words(run: Run, picture: StructurePicture) -> ReportFigure:
     return report_figure._replace(name="structure")
 
 
-def planform_words(run: Run, figure: Figure) -> ReportFigure:
+def caption_planform(run: Run, figure: Figure) -> ReportFigure:
     """Return the picture of a wing from above, with its title and caption."""
     report_figure = WORDS.figure("planform", figure, step=run.step_word, sensor=run.sensors.word)
     return report_figure._replace(name="structure")
 
 
-def network_words(run: Run) -> ReportFigure:
+def caption_network(run: Run) -> ReportFigure:
     """Return the title and the caption of the decision network, whose drawing is a file."""
     if run.decides_on_prediction:
         deciding_belief = "the belief predicted from its observation"

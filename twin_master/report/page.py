@@ -69,7 +69,7 @@ def write_report(run_folder: Path | str, *, now: int | None = None) -> Path:
             drawing = to_png(report_figure.figure)
             atomic_write_bytes(folder / FIGURE_FOLDER / f"{name}.png", drawing)
         figures[name] = report_figure._replace(figure=None)  # type: ignore[arg-type]
-    figures[NETWORK] = captions.network_words(run)
+    figures[NETWORK] = captions.caption_network(run)
     drawings[NETWORK] = resources.files(__package__).joinpath("network.svg").read_bytes()
     for name, drawing in drawings.items():
         atomic_write_bytes(folder / FIGURE_FOLDER / f"{name}.svg", drawing)
@@ -105,18 +105,18 @@ def _figures(run: Run, now: int | None, folder: Path) -> Iterator[ReportFigure]:
     present = _present_row(run, now)
     last = run.step_count - 1
     figure = mission_figure(run, present)
-    yield captions.mission_words(run, figure, present, MISSION_NOW)
+    yield captions.caption_mission(run, figure, present, MISSION_NOW)
     if present != last:
         figure = mission_figure(run, last)
-        yield captions.mission_words(run, figure, last, MISSION_WHOLE)
-    yield captions.belief_words(run, belief_figure(run))
+        yield captions.caption_mission(run, figure, last, MISSION_WHOLE)
+    yield captions.caption_belief(run, belief_figure(run))
     if run.learnt_quantities:
-        yield captions.learnt_words(run, learnt_figure(run))
+        yield captions.caption_learnt(run, learnt_figure(run))
     if len(run.factors) == 2:
-        yield captions.policy_words(run, policy_figure(run))
+        yield captions.caption_policy(run, policy_figure(run))
     check = predictive_check(run)
-    yield captions.check_words(run, check, check_figure(run, check))
-    yield captions.calibration_words(run, calibration_figure(run))
+    yield captions.caption_check(run, check, check_figure(run, check))
+    yield captions.caption_calibration(run, calibration_figure(run))
     yield from _structure_figure(run, folder, check)
 
 
@@ -144,10 +144,10 @@ def _structure_figure(run: Run, folder: Path, check: PredictiveCheck) -> Iterato
     last_residual = check.residual[-1]
     planform = planform_of(design_of(folder), run.scenario)
     if (folder / FIELD_NAME).is_file():
-        yield captions.mesh_words(run, mesh_figure(folder, last_residual))
+        yield captions.caption_mesh(run, mesh_figure(folder, last_residual))
     elif planform is not None:
         figure = planform_figure(run, planform, last_residual)
-        yield captions.planform_words(run, figure)
+        yield captions.caption_planform(run, figure)
 
 
 def render_page(

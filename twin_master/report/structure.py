@@ -103,8 +103,13 @@ def _wing_panel(design: WingDesign, span: tuple[float, float], chord: tuple[floa
     """
     start, end = span
     front, rear = chord
-    corners = ((start, front), (end, front), (end, rear), (start, rear))
-    return np.array([_wing_point(design, *corner) for corner in corners])
+    corners = [
+        _wing_point(design, start, front),
+        _wing_point(design, end, front),
+        _wing_point(design, end, rear),
+        _wing_point(design, start, rear),
+    ]
+    return np.array(corners)
 
 
 def design_of(folder: Path) -> WingDesign | None:

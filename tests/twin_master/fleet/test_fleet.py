@@ -35,7 +35,7 @@ from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import Fleet, Member, ensemble, load_fleet
 from twin_master.fleet.reading import Outcomes, group_figures
 from twin_master.fleet.report import write_fleet_report
-from twin_master.fleet.shard import unflown
+from twin_master.fleet.shard import result_of_unflown
 from twin_master.fleet.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
 from twin_master.fleet_command import engine_of
 from twin_master.mission.journal import JournalFile
@@ -79,7 +79,7 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_p
         assert np.array_equal(group[ours].values[row], single.astype(group[ours].dtype)), ours
     figures, study = group_figures(group), Outcomes.from_store(group)
     names = "log evidence of a step", "filtered rms error of z2", "bias of z2"
-    assert [figures[name] for name in names] == [study.evidence, study.rms[1], study.bias[1]]
+    assert [figures[name] for name in names] == [study.log_evidence, study.rms[1], study.bias[1]]
 
 
 def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
@@ -223,10 +223,11 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
             raise PosteriorError("no posterior.")
         return b"kit"
 
-    monkeypatch.setattr(flight, "prepared", preparing)
+    monkeypatch.setattr(flight, "prepare_kit", preparing)
     monkeypatch.setattr(flight, "check_fleet", lambda _fleet: None)
     monkeypatch.setattr(
-        "twin_master.fleet.engine.fly_shard", lambda _kit, members: unflown(members[0], "it was flown")
+        "twin_master.fleet.engine.fly_shard",
+        lambda _kit, members: result_of_unflown(members[0], "it was flown"),
     )
     south = FLEET[FLEET.index('[[group]]\nname = "south"') :]
     fleet = changed(fleet_file, (south, ""), ("count = 3", 'fmus = "*.fmu"'))

@@ -368,10 +368,10 @@ def test_figures_of_a_fleet_have_standard_errors():
 
     bias, squared = (np.nanmean(error[:51] ** power, axis=1) for power in (1, 2))
     assert study.bias[1] == of_missions(bias[:, 1])
-    assert study.evidence == of_missions(bias[:, 0])
-    assert study.credible == of_missions(credible[:51])
-    assert study.within == Estimated(pytest.approx(40 / 45), pytest.approx(beta(41, 6).std()))
-    assert study.early == Estimated(0.2, pytest.approx(beta(11, 41).std()))
+    assert study.log_evidence == of_missions(bias[:, 0])
+    assert study.credible_coverage == of_missions(credible[:51])
+    assert study.prompt_fallbacks == Estimated(pytest.approx(40 / 45), pytest.approx(beta(41, 6).std()))
+    assert study.early_fallbacks == Estimated(0.2, pytest.approx(beta(11, 41).std()))
     again = [np.sqrt(np.mean(random.choice(squared[:, 0], 51))) for _ in range(4000)]  # the bootstrap
     assert study.rms[0].value == pytest.approx(np.sqrt(squared[:, 0].mean()))
     assert study.rms[0].error == pytest.approx(np.std(again), rel=0.1)
