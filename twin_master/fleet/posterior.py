@@ -79,25 +79,26 @@ class Distribution:
 
     @cached_property
     def _interpolated(self) -> tuple[Float, Float]:
-        """Many values of x and their probabilities, from a cubic spline of the log density.
+        """Values of x and their probabilities, as two arrays, from a spline of the log density.
 
         The sums over the grid itself would be wrong if its spacing is as wide as the distribution,
         or if a bound cuts the distribution off.
         """
         from scipy.interpolate import CubicSpline
 
-        # Leave out the tails: their logarithms would make the spline swing. Four points are needed.
+        # Leave out the tails, whose logarithms would make the spline swing, but keep the four
+        # points that a cubic spline needs.
         relevant = np.flatnonzero(self.weight > NEGLIGIBLE_WEIGHT * self.weight.max())
         first = max(0, min(relevant[0], len(self.x) - 4))
         end = max(4, relevant[-1] + 1)
         x = self.x[first:end]
         fine_x = np.linspace(x[0], x[-1], FINE_POINTS)
-        # The ends of the whole grid stand for half an interval, which density does not.
+        # The weights at both ends are those of half an interval: double them for the density.
         density = self.weight.copy()
         density[[0, -1]] *= 2.0
         log_density = np.log(np.maximum(density[first:end], NEGLIGIBLE_WEIGHT * density.max()))
         fine_density = np.exp(CubicSpline(x, log_density)(fine_x) - log_density.max())
-        fine_density[[0, -1]] *= 0.5
+        fine_density[[0, -1]] *= 0.5  # the ends of the fine grid have half an interval, too
         return fine_x, fine_density / fine_density.sum()
 
     @property
@@ -126,6 +127,7 @@ class Distribution:
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
         """Return the ends of the central interval with a probability."""
         x, probability_of_x = self._interpolated
+        # Half of the probability of a value lies below it.
         cumulative = np.cumsum(probability_of_x) - 0.5 * probability_of_x
         levels = [0.5 - probability / 2.0, 0.5 + probability / 2.0]
         low, high = self.transform(np.interp(levels, cumulative, x)).tolist()
