@@ -30,8 +30,13 @@ _LONGEST_HEADER = 100_000
 class BrokerMessage(Protocol):
     """A message of a broker."""
 
-    topic: str
-    payload: bytes
+    @property
+    def topic(self) -> str:
+        """The topic of the message."""
+
+    @property
+    def payload(self) -> bytes | bytearray:
+        """The content of the message."""
 
 
 class Watcher(Protocol):
