@@ -7,6 +7,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from reporting.choices import did_you_mean
 from reporting.former_names import with_present_names
 from reporting.toml_file import read_toml, validate
 from reporting.words import brief
@@ -95,7 +96,8 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    raise ScenarioError(said("scenario.unknown", name=name, shipped=", ".join(shipped)))
+    sentence = said("scenario.unknown", name=name, shipped=", ".join(shipped))
+    raise ScenarioError(f"{sentence}{did_you_mean(name, shipped)}")
 
 
 def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
