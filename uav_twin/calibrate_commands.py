@@ -13,7 +13,7 @@ from reporting import terminal
 from reporting.command_options import LARGEST_SEED, JsonOption, NoReportOption
 from reporting.files import atomic_write_text, refuse_filled
 from uav_twin.completion import complete_model
-from uav_twin.discrepancy_commands import one_thread
+from uav_twin.discrepancy_commands import use_one_thread
 from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def calibrate_campaign(
     from discrepancy.model_choice import choose_model
     from discrepancy.parameters.calibration import calibrate_parameters
 
-    one_thread()
+    use_one_thread()
     data = read_campaign(campaign)
     name = check_name(data.name if asset is None else asset)
     if out is not None:
@@ -73,10 +73,12 @@ def calibrate_campaign(
     written = None
     if out is not None:
         written = write_calibration_folder(result, out, report=not no_report)
-    conclude(result, written, json=json, report=not no_report)
+    print_calibration(result, written, json=json, report=not no_report)
 
 
-def conclude(result: "Calibration", written: Path | None, *, json: bool, report: bool) -> None:
+def print_calibration(
+    result: "Calibration", written: Path | None, *, json: bool, report: bool
+) -> None:
     """Print the result of a calibration, and where it was written.
 
     Parameters
@@ -92,7 +94,7 @@ def conclude(result: "Calibration", written: Path | None, *, json: bool, report:
     """
     if json:
         file = None if written is None else str(written)
-        terminal.print_json({"calibration": file} | _record(result))
+        terminal.print_json({"calibration": file} | _calibration_record(result))
         return
     from calibration.result import text
     from calibration.result.folder import REPORT_NAME
@@ -112,7 +114,7 @@ def conclude(result: "Calibration", written: Path | None, *, json: bool, report:
         terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
 
 
-def _record(result: "Calibration") -> dict[str, Any]:
+def _calibration_record(result: "Calibration") -> dict[str, Any]:
     """Return the calibration as plain data."""
 
     def posterior(name: str) -> dict[str, Any]:
@@ -230,7 +232,7 @@ def calibrate_wing(
     written = None
     if out is not None:
         written = write_wing_folder(calibration, out, report=not no_report)
-    conclude(calibration.result, written, json=json, report=not no_report)
+    print_calibration(calibration.result, written, json=json, report=not no_report)
 
 
 def calibrate_ringdown(

@@ -11,19 +11,19 @@ from scenarios import structure_files
 
 def complete_structure(incomplete: str) -> list[str]:
     """Return the shipped structures whose names begin with what was typed."""
-    return _beginning_with(incomplete, structure_files())
+    return _names_beginning_with(incomplete, structure_files())
 
 
 def complete_model(incomplete: str) -> list[str]:
     """Return the shipped lumped models and structures whose names begin with what was typed."""
-    return _beginning_with(incomplete, [*_lumped_model_names(), *structure_files()])
+    return _names_beginning_with(incomplete, [*_lumped_model_names(), *structure_files()])
 
 
 def complete_effect(incomplete: str) -> list[str]:
     """Return the effects of the catalogue whose identifiers begin with what was typed."""
     from discrepancy.catalogue.library import load_catalogue
 
-    return _beginning_with(incomplete, [effect.identifier for effect in load_catalogue()])
+    return _names_beginning_with(incomplete, [effect.identifier for effect in load_catalogue()])
 
 
 def _lumped_model_names() -> list[str]:
@@ -33,6 +33,6 @@ def _lumped_model_names() -> list[str]:
     return sorted(name.removesuffix(".toml") for name in files if name.endswith(".toml"))
 
 
-def _beginning_with(incomplete: str, names: Iterable[str]) -> list[str]:
+def _names_beginning_with(incomplete: str, names: Iterable[str]) -> list[str]:
     """Return the names that begin with what was typed."""
     return [name for name in names if name.startswith(incomplete)]

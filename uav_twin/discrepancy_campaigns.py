@@ -180,21 +180,30 @@ def import_files(
 
     Example: `uav-twin discrepancy import pull.csv --kind static --column F=force --out measured`
     """  # noqa: E501
-    from discrepancy.campaign.importing import OF_COLUMNS, OF_FILES, LaboratoryImport
+    from discrepancy.campaign.importing import LaboratoryImport
     from discrepancy.campaign.sheet import read_sheet
     from discrepancy.campaign.writing import write_campaign
     from discrepancy.model_choice import choose_model
 
     folder = out or Path(files[0].stem)
     refuse_filled(folder)
-    column_options = (column, unit, quantity, scale, zero, gain, hold)
-    held_out_option = [f"{name}=yes" for name in held_out or ()]
-    file_options = (kind, release, load_place, decimal, interval, begins, held_out_option)
-    names = (*OF_COLUMNS, *OF_FILES)
-    answers = {
-        name: _answers_by_subject(texts or ())
-        for name, texts in zip(names, (*column_options, *file_options), strict=True)
+    options = {
+        "column": column,
+        "unit": unit,
+        "quantity": quantity,
+        "scale": scale,
+        "zero": zero,
+        "gain": gain,
+        "hold": hold,
+        "kind": kind,
+        "release": release,
+        "load-place": load_place,
+        "decimal": decimal,
+        "interval": interval,
+        "begins": begins,
+        "held-out": [f"{name}=yes" for name in held_out or ()],
     }
+    answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
     sheets = [read_sheet(file) for file in files]
@@ -202,27 +211,27 @@ def import_files(
     if model is not None:
         quantity_of_output = choose_model(model).model.output_quantity
         understanding = LaboratoryImport(understanding.sheets, answers, quantity_of_output)
-    _show_understanding(understanding)
+    _print_understanding(understanding)
     is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
     if is_interactive and (understanding.questions or understanding.assumptions):
         while understanding.questions or understanding.assumptions:
-            understanding = _with_answer_of_user(understanding)
-        _show_understanding(understanding)
+            understanding = _ask_one_question(understanding)
+        _print_understanding(understanding)
     campaign = understanding.campaign(folder.resolve().name)
     if is_interactive and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
         raise typer.Exit(1)
     write_campaign(campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True)
-    terminal.say(f"Wrote {folder}: {_size_text(campaign)}.")
+    terminal.say(f"Wrote {folder}: {_campaign_size(campaign)}.")
     if understanding.assumed:
         terminal.say(
             f"{understanding.assumed} Where you know better, give --zero and --gain, or correct "
             f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
         )
-    terminal.say(f"Next: uav-twin discrepancy check {_arguments_of(folder, model)}")
+    terminal.say(f"Next: uav-twin discrepancy check {_shell_arguments(folder, model)}")
 
 
-def _size_text(campaign: "Campaign") -> str:
+def _campaign_size(campaign: "Campaign") -> str:
     """Return how many trials and channels a campaign has, as a text."""
     trials = counted(len(campaign.trials), "trial")
     return f"{trials}, {counted(len(campaign.channels), 'channel')}"
@@ -237,7 +246,7 @@ def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
     return answers
 
 
-def _with_answer_of_user(understanding: "LaboratoryImport") -> "LaboratoryImport":
+def _ask_one_question(understanding: "LaboratoryImport") -> "LaboratoryImport":
     """Ask the user one question, and return the understanding with the answer.
 
     Questions that must be answered come first, then those with a default, which an empty line
@@ -264,7 +273,7 @@ _DECIMAL_MARKS = {".": "points", ",": "commas"}
 """What the marks before decimals are called."""
 
 
-def _show_understanding(understanding: "LaboratoryImport") -> None:
+def _print_understanding(understanding: "LaboratoryImport") -> None:
     """Print how the columns of files are understood, each with a value that is not zero."""
     for sheet in understanding.sheets:
         kind = understanding.kinds[sheet.name] or "?"
@@ -317,7 +326,7 @@ def effects(
 
     catalogue = load_catalogue(add or ())
     if show is not None:
-        _show_effect(effect_by_identifier(show, catalogue))
+        _print_effect(effect_by_identifier(show, catalogue))
         return
     rows = []
     for effect in catalogue:
@@ -327,7 +336,7 @@ def effects(
     terminal.say(f"{counted(len(rows), 'effect')}; --show ID tells everything about one.")
 
 
-def _show_effect(effect: "Effect") -> None:
+def _print_effect(effect: "Effect") -> None:
     """Print everything about an effect: facts, then parameters and exponents of its law."""
     from discrepancy.report.text import formula
 
@@ -416,22 +425,22 @@ def example(
     if effect:
         plain = example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # it checks
         for text in effect:
-            patch = patch + _hidden_effect(text, chosen, plain)
+            patch = patch + _patch_of_hidden_effect(text, chosen, plain)
     campaign = write_example(chosen, out, kind, seed, plan, patch)  # type: ignore[arg-type]
     hidden = ", ".join(effect) if effect else "nothing"
-    arguments = _arguments_of(out, model)
-    terminal.say(f"Wrote {out}: {_size_text(campaign)}; hidden: {hidden}.")
+    arguments = _shell_arguments(out, model)
+    terminal.say(f"Wrote {out}: {_campaign_size(campaign)}; hidden: {hidden}.")
     terminal.say(f"Next: uav-twin discrepancy check {arguments}")
     terminal.say(f"Then: uav-twin discrepancy run {arguments}")
 
 
-def _arguments_of(campaign: Path, model: str | None) -> str:
+def _shell_arguments(campaign: Path, model: str | None) -> str:
     """Return a campaign and its model as the arguments of a further command."""
     model_option = [] if model is None else ["--model", model]
     return shlex.join([str(campaign), *model_option])
 
 
-def _hidden_effect(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
+def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
     """Return the patch of an effect that is hidden in an example.
 
     Parameters

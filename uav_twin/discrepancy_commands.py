@@ -102,14 +102,14 @@ def run(
     from discrepancy.verdict_so_far import SearchInProgress
     from discrepancy.workflow import investigate
 
-    one_thread()
-    _check_source(campaign, from_run, from_step, to_step)
+    use_one_thread()
+    _refuse_unfit_sources(campaign, from_run, from_step, to_step)
     source = campaign or from_run
     assert source is not None
     folder = out if out is not None else Path("verdicts") / source.resolve().name
     check_verdict_folder(folder, replace_it=replace)
     catalogue = load_catalogue(effects or ())
-    data, choice = _compared(campaign, from_run, from_step, to_step, model)
+    data, choice = _read_campaign_and_model(campaign, from_run, from_step, to_step, model)
     options_of_command = {
         "from-step": from_step,
         "to-step": to_step,
@@ -117,14 +117,14 @@ def run(
         "seed": seed,
         "calibrate": calibrate,
     }
-    command = _command(source, effects or [], from_run is not None, options_of_command)
-    origin = _origin(data, choice, effects or [], command, seed)
+    command = _repeatable_command(source, effects or [], from_run is not None, options_of_command)
+    origin = _origin_of_verdict(data, choice, effects or [], command, seed)
     in_progress = SearchInProgress()
-    with terminal.interruptible(lambda: _keep_so_far(folder, in_progress, origin)):
+    with terminal.interruptible(lambda: _write_search_so_far(folder, in_progress, origin)):
         investigation = investigate(
             data, choice.model, catalogue, seed=seed, on_search=in_progress.begin
         )
-    separability, self_calibration = _decidability(
+    separability, self_calibration = _assess_campaign(
         investigation, choice, catalogue, calibrate, seed
     )
     pack = None if choice.design is None else partial(packed_beside, choice)
@@ -135,13 +135,27 @@ def run(
         report_file = write_verdict_folder(
             folder, content, replace_it=replace, report=not no_report
         )
-    _conclude(content, folder, None if no_report else report_file, json=json)
+    _print_conclusion(content, folder, None if no_report else report_file, json=json)
 
 
-def _origin(
+def _origin_of_verdict(
     campaign: "Campaign", choice: "ModelChoice", effects: list[Path], command: str, seed: int
 ) -> "Origin":
-    """Return what a verdict rests on: campaign, model and further effects with their hashes."""
+    """Return what a verdict rests on: campaign, model and further effects, with their hashes.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    choice : ModelChoice
+        The model that it is compared with.
+    effects : list of Path
+        Files of further effects.
+    command : str
+        The command that repeats the investigation in any folder.
+    seed : int
+        Seed of all draws.
+    """
     from discrepancy.document import Origin
     from reporting.files import hash_file
     from reporting.provenance import collect_provenance
@@ -149,17 +163,17 @@ def _origin(
     inputs = {"campaign": campaign.data_hash, "model": choice.source_hash}
     inputs |= {f"effects {path.name}": hash_file(path) for path in effects}
     return Origin(
-        campaign.name,
-        choice.model.name,
-        campaign.data_hash,
-        choice.source_hash,
-        command,
-        collect_provenance(seed, input_hashes=inputs),
-        choice.file,
+        campaign=campaign.name,
+        model=choice.model.name,
+        data_hash=campaign.data_hash,
+        model_hash=choice.source_hash,
+        command=command,
+        provenance=collect_provenance(seed, input_hashes=inputs),
+        model_file=choice.file,
     )
 
 
-def _check_source(
+def _refuse_unfit_sources(
     campaign: Path | None, from_run: Path | None, from_step: int | None, to_step: int | None
 ) -> None:
     """Refuse both sources of records or none of them, and steps that are not those of a mission.
@@ -181,17 +195,33 @@ def _check_source(
         )
 
 
-def _decidability(
+def _assess_campaign(
     investigation: "Investigation",
     choice: "ModelChoice",
     catalogue: "Sequence[Effect]",
     calibrate: int | None,
     seed: int,
 ) -> tuple["Separability | None", "SelfCalibration | None"]:
-    """Return what the campaign can decide, and how often the workflow is right on simulated ones.
+    """Return what a campaign can decide, and how often the workflow is right on simulated ones.
 
-    Both are None where the records could not be compared with the model; the second also where no
-    number of simulated campaigns is given.
+    Parameters
+    ----------
+    investigation : Investigation
+        The investigation of the campaign.
+    choice : ModelChoice
+        The model that the campaign is compared with.
+    catalogue : sequence of Effect
+        All effects that can be named.
+    calibrate : int or None
+        The number of simulated campaigns.
+    seed : int
+        Seed of their draws.
+
+    Returns
+    -------
+    Separability or None, SelfCalibration or None
+        Both are None if the records could not be compared with the model; the second is also None
+        if no number of simulated campaigns is given.
     """
     from discrepancy.judgement.separability import separability as separability_of_campaign
     from discrepancy.model_choice import ModelKind
@@ -220,7 +250,7 @@ def _decidability(
     return separability, self_calibration
 
 
-def _keep_so_far(folder: Path, in_progress: "SearchInProgress", origin: "Origin") -> str:
+def _write_search_so_far(folder: Path, in_progress: "SearchInProgress", origin: "Origin") -> str:
     """Write the fits of an interrupted search, and return the sentence that says where.
 
     The sentence is empty if there are none yet.
@@ -231,7 +261,9 @@ def _keep_so_far(folder: Path, in_progress: "SearchInProgress", origin: "Origin"
     return "" if path is None else f"the hypotheses fitted until then are in {path}"
 
 
-def _conclude(content: "ReportInput", folder: Path, report: Path | None, *, json: bool) -> None:
+def _print_conclusion(
+    content: "ReportInput", folder: Path, report: Path | None, *, json: bool
+) -> None:
     """Print the conclusion of an investigation; faulty data end the command with exit code 1.
 
     Parameters
@@ -261,7 +293,7 @@ def _conclude(content: "ReportInput", folder: Path, report: Path | None, *, json
         for sentence in (verdict.sentence, *further_faults):
             typer.secho(sentence, fg="red", err=True)
     elif not json:
-        _show_verdict(content, folder)
+        _print_verdict(content, folder)
     if not json:
         terminal.say(f"Verdict: {folder}" if report is None else f"Report: {report}")
     if has_faulty_data:
@@ -270,11 +302,11 @@ def _conclude(content: "ReportInput", folder: Path, report: Path | None, *, json
         terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 
-def _compared(
+def _read_campaign_and_model(
     campaign: Path | None,
     from_run: Path | None,
-    first: int | None,
-    last: int | None,
+    first_step: int | None,
+    last_step: int | None,
     model: str | None,
 ) -> "tuple[Campaign, ModelChoice]":
     """Return the campaign, and the model that it is compared with.
@@ -282,9 +314,9 @@ def _compared(
     Parameters
     ----------
     campaign, from_run : Path or None
-        The folder of a campaign, or that of a mission's run.
-    first, last : int or None
-        The turns of the run.
+        The folder of a campaign, or that of a mission's run; the other one is None.
+    first_step, last_step : int or None
+        The first and the last step of the run that are compared; all steps by default.
     model : str or None
         The model; by default that of the twin of the run.
     """
@@ -296,9 +328,9 @@ def _compared(
     if from_run is None:
         assert campaign is not None
         return read_campaign(campaign), choose_model(model)
-    with flown(from_run, first, last, reporter()) as folder:
+    with flown(from_run, first_step, last_step, reporter()) as folder:
         try:
-            data = run_campaign(folder, first, last)
+            data = run_campaign(folder, first_step, last_step)
             if model is not None:
                 return data, choose_model(model)
             return data, dataclasses.replace(choice_of_run(folder), file=str(from_run.resolve()))
@@ -306,7 +338,7 @@ def _compared(
             raise type(error)(str(error).replace(str(folder), str(from_run))) from error
 
 
-def one_thread() -> None:
+def use_one_thread() -> None:
     """Hold the linear algebra of this process to one thread, for good.
 
     Its matrices are small: several threads would wait for each other, and the last bits of a sum
@@ -318,7 +350,7 @@ def one_thread() -> None:
     threadpool_limits(1)
 
 
-def _command(
+def _repeatable_command(
     source: Path, effects: list[Path], from_run: bool, values: Mapping[str, str | int | None]
 ) -> str:
     """Return the command that does the same in any folder, with absolute paths.
@@ -346,7 +378,7 @@ def _command(
     return shlex.join(words)
 
 
-def _show_verdict(content: "ReportInput", folder: Path) -> None:
+def _print_verdict(content: "ReportInput", folder: Path) -> None:
     """Print a verdict, with the intervals of its patch if there is one in the folder."""
     from discrepancy.files.verdict import PATCH_NAME, read_patch
     from discrepancy.report.page import said_on_page
@@ -387,16 +419,16 @@ def check(
             setting = Setting(data, chosen, chosen.scales(data))
             separability = separability_of_campaign(data, chosen, setting, catalogue)
     if json:
-        terminal.print_json(_record(data, chosen.name, faults, separability))
+        terminal.print_json(_check_record(data, chosen.name, faults, separability))
     else:
-        _show_check(data, chosen, catalogue, faults, separability)
+        _print_check(data, chosen, catalogue, faults, separability)
     if separability is None:
         raise terminal.error_exit(
             "Mend the faults first: conclusions from these data would be wrong."
         )
 
 
-def _show_check(
+def _print_check(
     data: "Campaign",
     model: "Model",
     catalogue: "Sequence[Effect]",
@@ -422,7 +454,7 @@ def _show_check(
     )
 
 
-def _record(
+def _check_record(
     data: "Campaign",
     model: str,
     faults: "Sequence[DataFault]",

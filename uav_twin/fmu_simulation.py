@@ -94,7 +94,7 @@ def simulate(
     from fmu_asset.client.history_files import read_histories
     from fmu_asset.client.session import FmiAsset
 
-    _refuse_files(out, plot, replace=replace)
+    _refuse_unwritable_files(out, plot, replace=replace)
     if (binding is None) != (inputs is None):
         raise FmuInputError(
             "--binding and --inputs go together: one names the columns of the other."
@@ -119,16 +119,16 @@ def simulate(
         with closing(
             FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
         ) as asset:
-            _finish(asset, run_experiment(asset, experiment), file, out, plot)
+            _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
         return
     assert inputs is not None  # they go with a binding
-    fmu_binding = _interpolated(load_binding(binding), interpolation)
+    fmu_binding = _with_interpolation(load_binding(binding), interpolation)
     steps, histories = read_histories(inputs, fmu_binding)
     fmu_binding = ending_with_histories(fmu_binding, steps)
     with closing(
         FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
     ) as asset:
-        _finish(asset, run_histories(asset, steps, histories), file, out, plot)
+        _write_and_print_history(asset, run_histories(asset, steps, histories), file, out, plot)
 
 
 def simulate_system(
@@ -189,7 +189,7 @@ def simulate_system(
     from fmu_asset.ssp.check import join_ssp, left_out_sentence
     from fmu_asset.ssp.reader import read_ssp
 
-    _refuse_files(out, plot, replace=replace)
+    _refuse_unwritable_files(out, plot, replace=replace)
     start_values = _values_by_name(values or ())
     for name, value in start_values.items():
         count = len(value.split(","))
@@ -210,16 +210,16 @@ def simulate_system(
         )
         with CoupledAsset(
             wiring,
-            _interpolated(experiment.binding, interpolation),
+            _with_interpolation(experiment.binding, interpolation),
             algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
             iterations=iterations,
             isolated=not in_process,
             parameters=experiment.parameters,
         ) as asset:
-            _finish(asset, run_experiment(asset, experiment), file, out, plot)
+            _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
 
 
-def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
+def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
     """Refuse files that cannot be written, before anything is simulated."""
     targets = (("--out", out, (".csv", ".nc")), ("--plot", plot, (".png", ".svg")))
     for option, path, suffixes in targets:
@@ -244,7 +244,7 @@ def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
     return values
 
 
-def _interpolated(binding: "Binding", kind: str | None) -> "Binding":
+def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
     """Return a binding whose inputs are interpolated as `--interpolation` says, if it is given."""
     if kind is None:
         return binding
@@ -253,7 +253,7 @@ def _interpolated(binding: "Binding", kind: str | None) -> "Binding":
     return binding.with_header(interpolation=kind)
 
 
-def _finish(
+def _write_and_print_history(
     asset: "FmiAsset",
     history: "ObservationHistory",
     file: Path,
@@ -280,7 +280,7 @@ def _finish(
         write_history(out, asset, (file.name, hash_file(file)), history)
     columns = _history_columns(asset, history)
     if plot is not None:
-        _draw(plot, history, columns)
+        _draw_history(plot, history, columns)
     end = history.time[-1] if len(history.time) else asset.time
     # the start may be a row of its own
     steps = int((history.time > asset.binding.binding.start_time).sum())
@@ -323,7 +323,9 @@ def _history_columns(asset: "FmiAsset", history: "ObservationHistory") -> list[H
     return columns
 
 
-def _draw(path: Path, history: "ObservationHistory", columns: Sequence[HistoryColumn]) -> None:
+def _draw_history(
+    path: Path, history: "ObservationHistory", columns: Sequence[HistoryColumn]
+) -> None:
     """Draw the outputs over time, those of one unit in one panel, and write the picture."""
     from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
 
