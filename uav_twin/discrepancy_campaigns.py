@@ -180,10 +180,7 @@ def import_files(
 
     Example: `uav-twin discrepancy import pull.csv --kind static --column F=force --out measured`
     """  # noqa: E501
-    from discrepancy.campaign.importing import LaboratoryImport
-    from discrepancy.campaign.sheet import read_sheet
     from discrepancy.campaign.writing import write_campaign
-    from discrepancy.model_choice import choose_model
 
     folder = out or Path(files[0].stem)
     refuse_filled(folder)
@@ -206,17 +203,11 @@ def import_files(
     answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
-    sheets = [read_sheet(file) for file in files]
-    understanding = LaboratoryImport(sheets, answers)
-    if model is not None:
-        quantity_of_output = choose_model(model).model.output_quantity
-        understanding = LaboratoryImport(understanding.sheets, answers, quantity_of_output)
+    understanding = _understand_files(files, answers, model)
     _print_understanding(understanding)
     is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
-    if is_interactive and (understanding.questions or understanding.assumptions):
-        while understanding.questions or understanding.assumptions:
-            understanding = _ask_one_question(understanding)
-        _print_understanding(understanding)
+    if is_interactive:
+        understanding = _ask_all_questions(understanding)
     campaign = understanding.campaign(folder.resolve().name)
     if is_interactive and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
@@ -244,6 +235,42 @@ def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
         subject, _, value = text.rpartition("=")
         answers[subject] = value
     return answers
+
+
+def _understand_files(
+    files: list[Path], answers: dict[str, dict[str, str]], model: str | None
+) -> "LaboratoryImport":
+    """Return how a laboratory's files are understood.
+
+    Parameters
+    ----------
+    files : list of Path
+        The files.
+    answers : dict of str to (dict of str to str)
+        The answers of the user by option and by subject, a column or a file.
+    model : str or None
+        A model whose outputs name columns; its description is read after the files.
+    """
+    from discrepancy.campaign.importing import LaboratoryImport
+    from discrepancy.campaign.sheet import read_sheet
+    from discrepancy.model_choice import choose_model
+
+    sheets = [read_sheet(file) for file in files]
+    understanding = LaboratoryImport(sheets, answers)
+    if model is None:
+        return understanding
+    quantity_of_output = choose_model(model).model.output_quantity
+    return LaboratoryImport(understanding.sheets, answers, quantity_of_output)
+
+
+def _ask_all_questions(understanding: "LaboratoryImport") -> "LaboratoryImport":
+    """Ask the user what the files do not say, and return the understanding with all answers."""
+    if not understanding.questions and not understanding.assumptions:
+        return understanding
+    while understanding.questions or understanding.assumptions:
+        understanding = _ask_one_question(understanding)
+    _print_understanding(understanding)
+    return understanding
 
 
 def _ask_one_question(understanding: "LaboratoryImport") -> "LaboratoryImport":
