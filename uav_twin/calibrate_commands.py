@@ -96,8 +96,20 @@ def print_calibration(
         file = None if written is None else str(written)
         terminal.print_json({"calibration": file} | _calibration_record(result))
         return
-    from calibration.result import text
+    _print_posterior(result)
+    if written is None:
+        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
+        return
     from calibration.result.folder import REPORT_NAME
+
+    terminal.say(f"Calibration: {written}")
+    if report:
+        terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
+
+
+def _print_posterior(result: "Calibration") -> None:
+    """Print the parameters of a calibration: what was known before, and what is known now."""
+    from calibration.result import text
 
     terminal.show(
         "calibration",
@@ -106,16 +118,12 @@ def print_calibration(
         headline=text.headline(result),
         correlations=text.correlation_lines(result),
     )
-    if written is None:
-        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
-        return
-    terminal.say(f"Calibration: {written}")
-    if report:
-        terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
 
 
 def _calibration_record(result: "Calibration") -> dict[str, Any]:
-    """Return the calibration as plain data."""
+    """Return the calibration as plain data, for JSON."""
+    # a wing, which has a design, is calibrated from a laboratory's folder, all else from a campaign
+    name_of_source = "campaign" if result.design is None else "laboratory"
 
     def posterior(name: str) -> dict[str, Any]:
         return {
@@ -127,7 +135,7 @@ def _calibration_record(result: "Calibration") -> dict[str, Any]:
     return {
         "asset": result.asset,
         "model": result.model,
-        "campaign" if result.design is None else "laboratory": result.source,
+        name_of_source: result.source,
         "procedure": result.procedure,
         "explained": result.explained,
         "seed": result.seed,

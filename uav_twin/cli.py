@@ -46,10 +46,15 @@ def _common_options(
 
 
 def _command_of_group(function: Callable[..., None]) -> Callable[..., None]:
-    """Return the command that has the name of a group, such as `calibrate`.
+    """Return a function as the command that the name of a group calls, such as `calibrate`.
 
-    It runs where no command of the group is called. Its own options may not stand before such a
-    command.
+    Typer calls it before each command of the group, too. There it does nothing but refuse options
+    of its own, as in `calibrate --seed 3 simulate`: nothing would take them.
+
+    Parameters
+    ----------
+    function : callable
+        The command, with Typer's annotations.
     """
 
     def command_of_group(context: typer.Context, **options: object) -> None:

@@ -279,12 +279,13 @@ def _ask_one_question(understanding: "LaboratoryImport") -> "LaboratoryImport":
     Questions that must be answered come first, then those with a default, which an empty line
     takes. An answer that does not fit is refused, and changes nothing.
     """
-    default = None
     if understanding.questions:
-        (option, expected), (subject, *_) = next(iter(understanding.questions.items()))
+        option, expected = next(iter(understanding.questions))
+        subject = understanding.questions[option, expected][0]
+        default = None
     else:
-        (option, expected), defaults = next(iter(understanding.assumptions.items()))
-        subject, default = next(iter(defaults.items()))
+        option, expected = next(iter(understanding.assumptions))
+        subject, default = next(iter(understanding.assumptions[option, expected].items()))
     question = f"{option} ({expected})"
     if subject:
         question = f"{subject}, {question}"
@@ -488,28 +489,39 @@ def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> 
     from discrepancy.catalogue.entry import Setting
     from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
 
+    # ID@PLACE stands before the colon; without a colon, before the first equals sign
     has_names = ":" in text
-    head, _, numbers = text.partition(":" if has_names else "=")
-    identifier, at, place = head.partition("@")
+    effect_and_place, _, numbers = text.partition(":" if has_names else "=")
+    identifier, at_sign, place = effect_and_place.partition("@")
     effect = effect_by_identifier(identifier, load_catalogue())
     setting = Setting(campaign, model, model.scales(campaign))
     reason = effect.unavailable(setting)
     if reason is not None:
         raise CatalogueError(f"{identifier} cannot be hidden in this example: {reason}")
     places = effect.places(setting)
-    if at and place not in places:
+    if at_sign and place not in places:
         known = ", ".join(repr(name) for name in places)
         raise CatalogueError(f"{identifier} cannot act at {place!r} here; its places are {known}.")
-    values = {}
-    for parameter in effect.parameters:
-        value = parameter.prior.value(0.0)
-        if parameter.magnitude and value == 0.0:
-            # the median of a magnitude of either sign would hide nothing
-            value = parameter.prior.value(1.0)
-        values[parameter.name] = value
+    values = _usual_values(effect)
     if numbers or has_names:
         values |= _parameter_values(text, identifier, numbers.split(","), list(values))
-    return effect.patch(setting, values, place if at else places[0])
+    return effect.patch(setting, values, place if at_sign else places[0])
+
+
+def _usual_values(effect: "Effect") -> dict[str, float]:
+    """Return values of an effect's parameters by name: the medians of their priors.
+
+    A magnitude of either sign has the median zero, which would hide nothing in an example. It has
+    the value one standard deviation above.
+    """
+    values = {}
+    for parameter in effect.parameters:
+        median = parameter.prior.value(0.0)
+        if parameter.magnitude and median == 0.0:
+            values[parameter.name] = parameter.prior.value(1.0)
+        else:
+            values[parameter.name] = median
+    return values
 
 
 def _parameter_values(
