@@ -1,7 +1,6 @@
 """`uav-twin fleet`, and `uav-twin run --seeds`; the process behind `--view` of all commands."""
 
 import json
-import multiprocessing
 import os
 import signal
 import sys
@@ -314,6 +313,8 @@ def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path
     if not wanted:
         yield lambda _folder: None
         return
+    import multiprocessing
+
     process: multiprocessing.process.BaseProcess | None = None
 
     def begin(folder: Path) -> None:

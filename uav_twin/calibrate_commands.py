@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from fe.runtime.state import DigitalState
 from reporting import terminal
 from reporting.command_options import LARGEST_SEED, JsonOption, NoReportOption
 from reporting.files import atomic_write_text, refuse_filled
@@ -19,6 +18,7 @@ from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
     from calibration.virtual_wing import TestBench
+    from fe.runtime.state import DigitalState
     from fe.wing.design import WingDesign
 
 
@@ -412,6 +412,7 @@ def calibrate_simulate(
         weigh,
     )
     from calibration.wing.lab_data import write_lab_folder
+    from fe.runtime.state import DigitalState
     from fe.wing.design import load_design
 
     if fmu is not None and frequency_error != (0.0, 0.0):
@@ -453,7 +454,7 @@ def calibrate_simulate(
 
 
 def _bench_of_reduced_model(
-    design: "WingDesign", truth: DigitalState, frequency_error: tuple[float, float]
+    design: "WingDesign", truth: "DigitalState", frequency_error: tuple[float, float]
 ) -> "AbstractContextManager[TestBench]":
     """Return a test bench with the reduced model of a wing, whose true frequencies may differ."""
     from calibration.virtual_wing import VirtualWing
@@ -462,7 +463,7 @@ def _bench_of_reduced_model(
     return nullcontext(VirtualWing(reduced_model(design), truth, frequency_error))
 
 
-def _bench_of_fmu(fmu: Path, truth: DigitalState) -> "AbstractContextManager[TestBench]":
+def _bench_of_fmu(fmu: Path, truth: "DigitalState") -> "AbstractContextManager[TestBench]":
     """Return a test bench with the FMU of a wing."""
     from twin_master.assets.virtual_experiments import FmuTestBench
 
@@ -471,7 +472,7 @@ def _bench_of_fmu(fmu: Path, truth: DigitalState) -> "AbstractContextManager[Tes
 
 def _write_truth(
     path: Path,
-    truth: DigitalState,
+    truth: "DigitalState",
     frequency_error: tuple[float, float],
     seed: int,
     bench_name: str,

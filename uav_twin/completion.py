@@ -4,8 +4,9 @@ The shell itself completes the paths of files where no name fits.
 """
 
 from collections.abc import Iterable
-from importlib import resources
+from pathlib import Path
 
+import discrepancy
 from scenarios import structure_files
 
 
@@ -28,9 +29,8 @@ def complete_effect(incomplete: str) -> list[str]:
 
 def _lumped_model_names() -> list[str]:
     """Return the names of the shipped lumped models, without an import of their package's code."""
-    folder = resources.files("discrepancy").joinpath("lumped_models")
-    files = [file.name for file in folder.iterdir()]
-    return sorted(name.removesuffix(".toml") for name in files if name.endswith(".toml"))
+    folder = Path(discrepancy.__file__).parent / "lumped_models"
+    return sorted(file.stem for file in folder.glob("*.toml"))
 
 
 def _names_beginning_with(incomplete: str, names: Iterable[str]) -> list[str]:

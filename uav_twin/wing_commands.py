@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fe.runtime.state import DigitalState
 from reporting import terminal
 from reporting.command_options import JsonOption
 from reporting.files import atomic_write_text, refuse_filled
 from uav_twin.options import DesignOption
 
 if TYPE_CHECKING:
+    from fe.runtime.state import DigitalState
     from fe.wing.design import WingDesign
 
 PUBLISHED_FREQUENCIES = {
@@ -41,6 +41,7 @@ def wing(
     Example: `uav-twin wing --vtu wing.vtu`
     """
     from fe.reduction.model_cache import reduced_model
+    from fe.runtime.state import DigitalState
     from fe.wing.design import load_design
     from fe.wing.operators import structural_mass
 
@@ -75,7 +76,7 @@ def wing(
 
 
 def _write_wing_fields(
-    path: Path, wing_design: "WingDesign", state: DigitalState
+    path: Path, wing_design: "WingDesign", state: "DigitalState"
 ) -> tuple[Path, Path]:
     """Write the fields of a wing in a 3 g turn, and its modes beside them; return both files."""
     from fe.reduction.model_cache import wing_fields, write_modes_vtu, write_wing_vtu
