@@ -233,7 +233,7 @@ def _patched(path: Path, progress: Progress | None) -> ModelChoice:
     }
     return replace(
         base,
-        model=base.model.patched(stored.patch, calibrated),
+        model=base.model.with_patch(stored.patch, calibrated),
         label=path.name,
         source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
         built_in=stored.upon(base.built_in),

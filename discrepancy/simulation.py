@@ -14,7 +14,11 @@ from discrepancy.fits.candidate import Candidate, EffectTerm, Point
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
-from discrepancy.judgement.separability import DETECTED, as_predicted, has_free_initial_state
+from discrepancy.judgement.separability import (
+    DETECTION_DISTANCE,
+    campaign_as_predicted,
+    has_free_initial_state,
+)
 from discrepancy.system.interface import Model
 
 TRIES = 60
@@ -75,7 +79,7 @@ class Simulator:
 
         It is linearised about a fit to the predictions of the model as data.
         """
-        predicted = as_predicted(self.campaign, self.model, self.setting)
+        predicted = campaign_as_predicted(self.campaign, self.model, self.setting)
         problem = Problem(predicted, self.model, self.setting)
         return Screen(problem, fit(problem, Candidate(), problem.start(Candidate()), iterations=1))
 
@@ -101,7 +105,7 @@ class Simulator:
                 distance = screen.change(term, normal).squared_size
             except DiscrepancyError:  # the structure cannot carry an effect of this size
                 continue
-            if distance >= DETECTED:
+            if distance >= DETECTION_DISTANCE:
                 return Hidden(term, normal, distance)
         return None
 

@@ -85,7 +85,7 @@ def not_fitted(
         elif identifier not in fitted:
             gain = search.screened_gains.get(identifier, nan)
             refusal = search.problem.refusals.get(identifier)
-            if refusal is not None and not 0.0 < gain < SEARCH.worth_fitting:
+            if refusal is not None and not 0.0 < gain < SEARCH.least_gain_to_fit:
                 reason = f"could not be fitted: {refusal}"
             elif isnan(gain):
                 where = "along the missing force" if along_force else "at first sight"

@@ -31,7 +31,12 @@ from discrepancy.judgement.exact_sensors import exact_sensor_remarks
 from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
 from discrepancy.judgement.proof import prove
-from discrepancy.judgement.remarks import NO_GAP, look_alike_remark, with_date, with_untested
+from discrepancy.judgement.remarks import (
+    KINDS_WITHOUT_GAP,
+    look_alike_remark,
+    sentence_with_times,
+    verdict_with_untested_effects,
+)
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce, seen_force
@@ -165,14 +170,14 @@ def investigate(
         verdict, search, fit = reach_verdict(
             problem, catalogue, on_progress=tell, on_search=on_search
         )
-        verdict = with_untested(verdict, setting, catalogue)
+        verdict = verdict_with_untested_effects(verdict, setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
         share = time_step_error(problem, fit)
-        if share > SEARCH.solver_share:
+        if share > SEARCH.largest_step_error:
             remarks.append(
                 f"The time steps cost up to {share:.2g} of the noise (rms), more than the "
-                f"{SEARCH.solver_share:g} that is wanted: probabilities may be too sharp."
+                f"{SEARCH.largest_step_error:g} that is wanted: probabilities may be too sharp."
             )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.no_effect, sensitivities=thorough)
@@ -192,7 +197,7 @@ def investigate(
             windows = sized_windows(windows, before, after)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
-    if thorough and verdict.kind not in NO_GAP and not verdict.unfitted:
+    if thorough and verdict.kind not in KINDS_WITHOUT_GAP and not verdict.unfitted:
         with stage("Seeing the missing force", "force"):
             missing = seen_force(problem, search.force_search, search.force_hypotheses, fit)
     if fit.candidate.terms:
@@ -204,7 +209,7 @@ def investigate(
             experiments = next_experiments(problem, open_hypotheses(search))
     verdict = replace(
         verdict,
-        sentence=with_date(verdict, windows),
+        sentence=sentence_with_times(verdict, windows),
         remarks=tuple(remarks),
         next_experiments=experiments,
         not_fitted=not_fitted(problem.setting, catalogue, search),
@@ -250,7 +255,7 @@ def _remarks(
     remarks = [*problem.campaign.remarks]
     remarks += strained(problem, fit)
     remarks += without_port(problem.setting, catalogue)
-    if verdict.kind not in NO_GAP:
+    if verdict.kind not in KINDS_WITHOUT_GAP:
         remarks += exact_sensor_remarks(problem, search.no_effect)
     look_alikes = look_alike_remark(verdict, search.effects)
     if look_alikes is not None:

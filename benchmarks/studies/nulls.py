@@ -360,7 +360,7 @@ def findings(campaign: Campaign, model: Model, seed: int) -> list[str]:
         problem, replace(best, residual_process=residual_process_of(problem, best))
     )
     is_found = {
-        "not explained": gate.passed is False,
+        "not explained": gate.has_failed,
         "disagrees": location.disagrees,
         "discovery in the map": any(cell.significant for cell in location.cells),
     }

@@ -144,7 +144,7 @@ def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
 
     The parameters have their prior means, the release its nominal displacement, the clock no error.
     """
-    parameters = np.array([mean for mean, _ in model.stated(campaign)])
+    parameters = np.array([mean for mean, _ in model.prior_moments(campaign)])
     initial_modes = np.zeros((0, 2))
     if trial.release is not None:
         initial_modes = np.zeros((trial.release.mode_count, 2))

@@ -222,7 +222,7 @@ class EffectLaws:
         """
         trial = self.trials[number]
         forces: dict[int, ForceAlong] = {}
-        for law in self.columns.problem.model.at_ports(patch):
+        for law in self.columns.problem.model.forces_at_ports(patch):
             if not isinstance(law, PortForce):
                 continue
             port = trial.system.ports.index(law.port)

@@ -80,7 +80,7 @@ def held_out_fit(problem: Problem, fitted: CandidateFit) -> tuple[Problem, Candi
     local_fit = fit(held_out, candidate, start, local_only=True)
     local_fit = refit_from_first_readings(held_out, local_fit, local_only=True)
     # a poor fit may be at a wrong optimum: try again from another release amplitude
-    if local_fit.chi_square > SEARCH.far * float(held_out.counts.sum()):
+    if local_fit.chi_square > SEARCH.far_chi_square * float(held_out.counts.sum()):
         start = _with_best_release_amplitudes(held_out, candidate, start)
         second_fit = fit(held_out, candidate, start, local_only=True)
         if second_fit.objective < local_fit.objective:

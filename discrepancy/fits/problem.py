@@ -108,7 +108,7 @@ class Problem:
             )
         self.campaign = campaign
         self.setting = setting
-        self.model = model.remembering()
+        self.model = model.with_response_cache()
         self.channel_names = tuple(campaign.channels)
         self.refinement = 1
         self.noise: dict[str, NoiseModel] = {}
@@ -395,7 +395,7 @@ class Problem:
         """
         other = copy(self)
         if model is not None:
-            other.model = model.remembering()
+            other.model = model.with_response_cache()
         other._prepare_trials(trials)
         return other
 

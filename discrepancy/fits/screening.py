@@ -234,7 +234,7 @@ class Screen:
         """
         is_reading = self.sign > 0.0
         squared_size = float((change.vector[is_reading] ** 2).sum())
-        factor = sqrt(SEARCH.first_order / squared_size) if squared_size > 0.0 else 1.0
+        factor = sqrt(SEARCH.first_order_change / squared_size) if squared_size > 0.0 else 1.0
         if factor >= 1.0:
             return change, 1.0
         return self.change(change.term, change.term.rescaled(change.start, factor)), factor
@@ -282,14 +282,14 @@ class Screen:
             if trial.kind not in term.effect.acts_on or term.place not in trial.channels:
                 continue
             series = residual[:, trial.channels.index(term.place)]
-            padded_length = SEARCH.padded * len(series)
+            padded_length = SEARCH.zero_padding_factor * len(series)
             power = np.abs(np.fft.rfft(series - series.mean(), padded_length)) ** 2
             key = (len(series), trial.interval)
             spectra[key] = spectra.get(key, 0.0) + power
         first_frequency = self.problem.setting.scales.angular_frequency / (2.0 * np.pi)
         peaks: list[float] = []
         for (count, interval), power in spectra.items():
-            resolution = 1.0 / (SEARCH.padded * count * interval)
+            resolution = 1.0 / (SEARCH.zero_padding_factor * count * interval)
             for index in _largest_peaks(power):
                 peaks.append(index * resolution / first_frequency)
         return tuple(peaks)
@@ -303,11 +303,11 @@ def _largest_peaks(power: FloatArray) -> list[int]:
     """
     is_peak = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])
     peaks = np.flatnonzero(is_peak) + 1
-    largest = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.peaks]]
+    largest = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.spectrum_peaks]]
     chosen: list[int] = []
     for index in largest:
-        is_apart = all(abs(index - other) > 2 * SEARCH.padded for other in chosen)
-        if is_apart and len(chosen) < SEARCH.peaks:
+        is_apart = all(abs(index - other) > 2 * SEARCH.zero_padding_factor for other in chosen)
+        if is_apart and len(chosen) < SEARCH.spectrum_peaks:
             chosen.append(int(index))
     return chosen
 
@@ -333,9 +333,9 @@ def parameter_grid(
         Whether a magnitude that may be negative is tried at a small value too.
     """
     other_parameter_count = sum(not parameter.magnitude for parameter in term.parameters)
-    levels = SEARCH.levels_of_many
-    if other_parameter_count < len(SEARCH.levels):
-        levels = SEARCH.levels[other_parameter_count]
+    levels = SEARCH.grid_levels_if_many
+    if other_parameter_count < len(SEARCH.grid_levels):
+        levels = SEARCH.grid_levels[other_parameter_count]
     axes: list[tuple[float, ...]] = []
     has_magnitude = False
     for parameter in term.parameters:
@@ -372,7 +372,7 @@ def _magnitude_levels(
         return (0.0,)
     if not is_first:
         return (-1.0, 0.0, 1.0)
-    return (1.0, SEARCH.linear) if fine else (1.0,)
+    return (1.0, SEARCH.small_magnitude) if fine else (1.0,)
 
 
 def _prior_quantiles(parameter: EffectParameter | ShapeParameter) -> tuple[float, ...]:

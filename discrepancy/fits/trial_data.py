@@ -230,7 +230,7 @@ def global_unknowns(
     data_over_model : dict of str to float
         The ratio of readings to model for channels of unknown scale: a first estimate of 1 + gain.
     """
-    priors = [ScaledPrior(*prior, 1.0) for prior in model.stated(campaign)]
+    priors = [ScaledPrior(*prior, 1.0) for prior in model.prior_moments(campaign)]
     used_channels = {name for trial in trials for name in trial.channels}
     gain_channels: list[str] = []
     fixed_gain: dict[str, float] = {}
@@ -299,7 +299,7 @@ def local_unknowns(
         if release.time_zero_deviation > 0.0:
             time_zero_scale = np.full(1, release.time_zero_deviation)
     elif trial.begins is Start.UNKNOWN:
-        sizes = model.initial_sizes(campaign, trial)
+        sizes = model.initial_state_magnitudes(campaign, trial)
         initial_shape = (-(-len(sizes) // 2), 2)  # rounded up
         initial_scale = FREE_MOTION * np.pad(sizes, (0, len(sizes) % 2))
     # constants of inputs

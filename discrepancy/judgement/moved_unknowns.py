@@ -30,25 +30,25 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
         The fit, usually that of the model without effect.
     """
     unknowns = [
-        *_parameters(problem, fit),
-        *_gains(problem, fit),
-        *_zeros_and_constants(problem, fit),
+        *_parameter_values(problem, fit),
+        *_gain_values(problem, fit),
+        *_zero_and_constant_values(problem, fit),
     ]
     moved = [unknown for unknown in unknowns if abs(unknown.deviations) > MOVED_DEVIATIONS]
     return tuple(sorted(moved, key=lambda unknown: -abs(unknown.deviations)))
 
 
-def _parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+def _parameter_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the stated and fitted values of the calibrated parameters with a prior deviation."""
     shared = problem.shared
     values = shared.parameters(fit.point.shared)
     unknowns = []
-    for number, parameter in enumerate(problem.model.parameters):
-        centre = float(shared.centre[number])
-        scale = float(shared.scale[number])
+    for parameter_index, parameter in enumerate(problem.model.parameters):
+        centre = float(shared.centre[parameter_index])
+        scale = float(shared.scale[parameter_index])
         if scale <= 0.0:
             continue
-        value = float(values[number])
+        value = float(values[parameter_index])
         unknowns.append(
             MovedUnknown(
                 name=parameter.name,
@@ -62,7 +62,7 @@ def _parameters(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     return unknowns
 
 
-def _gains(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+def _gain_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the fitted values of the gain errors with a stated deviation; they are stated as 0."""
     shared = problem.shared
     unknowns = []
@@ -71,11 +71,11 @@ def _gains(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
         if shared.precision[shared_number] > 0.0:
             u = float(fit.point.shared[shared_number])
             scale = float(shared.scale[shared_number])
-            unknowns.append(_moved_from_zero(f"gain of {channel}", u, scale, "1"))
+            unknowns.append(_unknown_stated_as_zero(f"gain of {channel}", u, scale, "1"))
     return unknowns
 
 
-def _zeros_and_constants(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
+def _zero_and_constant_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     """Return the fitted zeros of channels and constants of inputs that have a stated deviation."""
     unknowns = []
     for data, local in zip(problem.trials, fit.point.local, strict=True):
@@ -86,7 +86,7 @@ def _zeros_and_constants(problem: Problem, fit: CandidateFit) -> list[MovedUnkno
         for (name, unit), number in zip(names_and_units, numbers, strict=True):
             if layout.precision[number] > 0.0:
                 u = float(local[number])
-                unknowns.append(_moved_from_zero(name, u, float(layout.scale[number]), unit))
+                unknowns.append(_unknown_stated_as_zero(name, u, float(layout.scale[number]), unit))
     return unknowns
 
 
@@ -105,14 +105,16 @@ def _names_of_zeros_and_constants(problem: Problem, data: TrialData) -> list[tup
     return names_and_units
 
 
-def _moved_from_zero(name: str, u: float, scale: float, unit: str) -> MovedUnknown:
+def _unknown_stated_as_zero(
+    name: str, scaled_value: float, scale: float, unit: str
+) -> MovedUnknown:
     """Return the record of an unknown whose stated value is zero.
 
     Parameters
     ----------
     name : str
         The name of the unknown.
-    u : float
+    scaled_value : float
         Its scaled value in the fit.
     scale : float
         Its stated standard deviation [unit].
@@ -120,7 +122,12 @@ def _moved_from_zero(name: str, u: float, scale: float, unit: str) -> MovedUnkno
         Its unit.
     """
     return MovedUnknown(
-        name=name, stated=0.0, deviation=scale, value=scale * u, deviations=u, unit=unit
+        name=name,
+        stated=0.0,
+        deviation=scale,
+        value=scale * scaled_value,
+        deviations=scaled_value,
+        unit=unit,
     )
 
 

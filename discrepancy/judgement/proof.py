@@ -17,11 +17,11 @@ from scipy import stats
 from discrepancy.campaign.noise_tests import lag_products, ljung_box, variance_p_value
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from discrepancy.errors import FitError
-from discrepancy.location.residuals import FittedTrial, ResidualSet, mean_square, of_channel
+from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits, mean_square_ratio
 from discrepancy.proof_record import ClosedShare, Proof, Scores
 from discrepancy.verdict import Gate
 
-from .closed_share import closed_share, rms_by_channel, with_noise_of
+from .closed_share import closed_share, residuals_with_noise_of, rms_by_channel
 
 PIT_BINS = 10
 """Bins of the histogram of probability integral transforms."""
@@ -72,7 +72,7 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
     chi_square = chi_square_of(residuals)
     white = residuals.white(np.random.default_rng(seed))
-    p_values = [ljung_box(series)[1] for _, _, series in residuals.series(white)]
+    p_values = [ljung_box(series)[1] for _, _, series in residuals.dynamic_series(white)]
     counts, _ = np.histogram(stats.norm.cdf(used_transforms), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
         rms=rms_by_channel(residuals),
@@ -139,16 +139,16 @@ def chi_square_of(residuals: ResidualSet) -> ChiSquare:
     absorbs, or plus what its uncertainty adds to held-out trials.
     """
     unknown = ChiSquare(nan, nan, nan)
-    channels = residuals.recorded
+    channels = residuals.recorded_channels
     if not channels:
         return unknown
-    _, freedom = mean_square(residuals, channels)
+    _, freedom = mean_square_ratio(residuals, channels)
     if freedom <= 0.0:
         return unknown
     squares = []
     variances = []
     for name in channels:
-        for fitted, column, used in of_channel(residuals.trials, name):
+        for fitted, column, used in channel_fits(residuals.trials, name):
             squares.append(fitted.standardised[used, column] ** 2)
             variances.append(fitted.expected_variance[used, column])
     expected = float(np.concatenate(variances).mean())
@@ -376,7 +376,7 @@ def prove(
     FitError
         If no sample of the fitted or of the held-out trials is used.
     """
-    after = with_noise_of(after, before)
+    after = residuals_with_noise_of(after, before)
     held_out_before = _held_out_scores(before, seed)
     held_out_after = _held_out_scores(after, seed)
     fitted_before = scores(before.fitted or before, seed=seed)
@@ -421,8 +421,8 @@ def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:
         return "Without a noise record it is not known what remains."
     trials = "held-out trials" if residuals.trials[0].trial.held_out else "fitted trials"
     chi_square_phrase = f"χ² per sample {after.chi_square_per_sample:.3g} on {trials}"
-    channels = residuals.recorded
-    mean_square_residual, freedom = mean_square(residuals, channels)
+    channels = residuals.recorded_channels
+    mean_square_residual, freedom = mean_square_ratio(residuals, channels)
     noise_freedom = min(residuals.degrees_of_freedom(name) for name in channels)
     if variance_p_value(mean_square_residual, freedom, noise_freedom) < REMAINING_LEVEL:
         by_channel = {name: _channel_chi_square(residuals, name) for name in channels}
@@ -439,6 +439,6 @@ def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:
 def _channel_chi_square(residuals: ResidualSet, name: str) -> float:
     """Return the mean square residual of a channel over its noise variance."""
     squares = []
-    for fitted, column, used in of_channel(residuals.trials, name):
+    for fitted, column, used in channel_fits(residuals.trials, name):
         squares.append(fitted.standardised[used, column] ** 2)
     return float(np.concatenate(squares).mean())

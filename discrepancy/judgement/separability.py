@@ -26,12 +26,12 @@ from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.fits.trial_data import stand_in_deviation
 from discrepancy.system.interface import Model
 
-CONFUSED = 9.0
+CONFUSION_DISTANCE = 9.0
 """Squared distance below which two effects form a confusion group [sigma^2]."""
-DETECTED = 25.0
+DETECTION_DISTANCE = 25.0
 """Squared distance from the model at which an effect is found [sigma^2]: 3 nats of Bayes factor,
 the cost of its parameters and of its place in the catalogue."""
-LEAST_VISIBLE = 1e-6
+VISIBILITY_DISTANCE = 1e-6
 """Squared distance from the model below which an effect is not compared with others [sigma^2]."""
 
 
@@ -97,7 +97,7 @@ class Separability:
 # ---------------------------------------------------------------- a campaign as predicted
 
 
-def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
+def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign:
     """Return a campaign in which the readings are replaced by those that the model predicts.
 
     Such readings leave no residuals from which an unrecorded noise could be estimated. So a channel
@@ -116,9 +116,9 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     problem = Problem(campaign, model, setting)
     point = prior_point_with_initial_states(problem)
     predictions = {}
-    for number, data in enumerate(problem.trials):
-        response = problem.response_with(number, point, Candidate())
-        predictions[data.trial.name] = problem.prediction(number, point, response)
+    for trial_index, data in enumerate(problem.trials):
+        response = problem.response_with(trial_index, point, Candidate())
+        predictions[data.trial.name] = problem.prediction(trial_index, point, response)
     trials: list[Trial] = []
     for trial in campaign.trials:
         if trial.name in predictions:
@@ -174,7 +174,7 @@ def separability(
     ----------
     campaign : Campaign
         The campaign with its inputs, channels and noise records. The readings are used only to
-        determine unknown initial states, see `as_predicted`.
+        determine unknown initial states, see `campaign_as_predicted`.
     model : Model
         The model as it is.
     setting : Setting
@@ -182,7 +182,7 @@ def separability(
     effects : sequence of Effect
         The catalogue.
     """
-    problem = Problem(as_predicted(campaign, model, setting), model, setting)
+    problem = Problem(campaign_as_predicted(campaign, model, setting), model, setting)
     start = prior_point_with_initial_states(problem)
     screen = Screen(problem, fit(problem, Candidate(), start, iterations=1))
     detectability: list[Detectability] = []
@@ -201,7 +201,7 @@ def separability(
         small = _SmallChange(*screen.shrunk(best))
         distance = min(best.squared_size, small.change.squared_size / small.factor**2)
         detectability.append(_detectability(effect, best, distance))
-        if best.squared_size > LEAST_VISIBLE:
+        if best.squared_size > VISIBILITY_DISTANCE:
             visible.append(_VisibleEffect(effect.identifier, best, [best, *options]))
     identifiers = tuple(effect.identifier for effect in visible)
     distance_matrix = _distances(screen, visible)
@@ -263,7 +263,7 @@ def _reference_change(
     if not references:
         return None
     best = max(references, key=lambda change: change.squared_size)
-    if best.squared_size < DETECTED:  # its median place may be where nothing is measured
+    if best.squared_size < DETECTION_DISTANCE:  # its median place may be where nothing is measured
         at_reference = [change for change in options if _has_reference_magnitude(change)]
         best = max([best, *at_reference], key=lambda change: change.squared_size)
     return best
@@ -313,7 +313,7 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     for number, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:
             typical = abs(parameter.prior.value(float(change.start[number])))
-            detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
+            detectable = typical * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
             return Detectability(
                 effect=effect,
                 reason="",
@@ -356,7 +356,7 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
             # back to the size of the reference: squared distances grow with the square of it
             first_order /= small_reference.factor**2
             least_distance = min(_squared_distance(screen, reference, other.options), first_order)
-            distance[i, j] = least_distance * max(1.0, DETECTED / reference.squared_size)
+            distance[i, j] = least_distance * max(1.0, DETECTION_DISTANCE / reference.squared_size)
     return distance
 
 
@@ -412,8 +412,11 @@ def _squared_distance(
 def _confusion_groups(
     identifiers: Sequence[str], distance: FloatArray
 ) -> tuple[tuple[str, ...], ...]:
-    """Return the connected sets of effects that are closer than `CONFUSED` in either direction."""
-    is_confused = np.minimum(distance, distance.T) < CONFUSED
+    """Return the connected sets of effects that these data cannot tell apart.
+
+    Two effects are connected if they are closer than `CONFUSION_DISTANCE` in either direction.
+    """
+    is_confused = np.minimum(distance, distance.T) < CONFUSION_DISTANCE
     _, labels = connected_components(is_confused)
     groups = []
     for label in range(labels.max(initial=-1) + 1):

@@ -104,7 +104,7 @@ def backbones(
             window_time = time[samples] - time[first]
             modes = np.flatnonzero(is_ringing).tolist()
             points_of_window = dict(
-                zip(modes, _points(window_time, solution, noise_deviation), strict=True)
+                zip(modes, _points_of_window(window_time, solution, noise_deviation), strict=True)
             )
             died_away = [
                 mode
@@ -123,7 +123,9 @@ def backbones(
             break
         if not is_ringing.any():
             break
-    return tuple(_backbone(mode, points_of_mode) for mode, points_of_mode in enumerate(points, 1))
+    return tuple(
+        _backbone_of_points(mode, points_of_mode) for mode, points_of_mode in enumerate(points, 1)
+    )
 
 
 class BackbonePoint(NamedTuple):
@@ -147,7 +149,7 @@ class BackbonePoint(NamedTuple):
         return is_above_error and change < _GREATEST_CHANGE and abs(self.damping_ratio) < 0.5
 
 
-def _backbone(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
+def _backbone_of_points(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
     """Return the points of a mode as one record of arrays."""
     arrays: dict[str, FloatArray] = {}
     for name in BackbonePoint._fields:
@@ -155,7 +157,7 @@ def _backbone(mode: int, points: Sequence[BackbonePoint]) -> Backbone:
     return Backbone(mode=mode, **arrays)
 
 
-def _points(
+def _points_of_window(
     time: FloatArray, solution: DampedCosineFit, noise_deviation: float | None
 ) -> list[BackbonePoint]:
     """Return amplitude, frequency and damping of each mode in a window, with standard errors.

@@ -9,7 +9,7 @@ import numpy as np
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.noise import NOISE_RECORD_LEVEL, record_at_rest, whiteness_is_tested
 from discrepancy.campaign.records import FloatArray
-from discrepancy.location.residuals import ResidualSet, mean_square
+from discrepancy.location.residuals import ResidualSet, mean_square_ratio
 
 LEAST_FREEDOM = 0.5
 """Fewest degrees of freedom of residuals whose variance is tested."""
@@ -54,7 +54,7 @@ def noise_groups(residuals: ResidualSet) -> dict[str, tuple[str, ...]]:
         Names of the channels of each group, by the first of them.
     """
     groups: dict[tuple[object, ...], list[str]] = {}
-    for name in residuals.recorded:
+    for name in residuals.recorded_channels:
         channel = residuals.channels[name]
         noise = channel.noise
         assert noise is not None
@@ -78,7 +78,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
     OmnibusTest
         The test; its statistic is nan if no channel has a noise record.
     """
-    subsets = [residuals, *_by_kind(residuals)]
+    subsets = [residuals, *_split_by_kind(residuals)]
     p_values_of_groups: list[float] = []
     records: list[_RecordVariance] = []
     weighted_sum = 0.0
@@ -87,7 +87,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
         noise_freedom = residuals.degrees_of_freedom(names[0])
         p_values = []
         for subset in subsets:
-            square, freedom = mean_square(subset, names)
+            square, freedom = mean_square_ratio(subset, names)
             if freedom < LEAST_FREEDOM:
                 continue
             p_values.append(noise_tests.variance_p_value(square, freedom, noise_freedom))
@@ -96,7 +96,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
                 total_freedom = total_freedom + freedom
         if p_values:
             p_values_of_groups.append(min(1.0, len(p_values) * min(p_values)))
-        records += _variances_of_records(residuals, names)
+        records += _variance_tests_of_records(residuals, names)
     if not p_values_of_groups:
         return OmnibusTest("variance", np.nan, np.nan, "")
     p_value = noise_tests.combine(p_values_of_groups)
@@ -116,7 +116,7 @@ class _RecordVariance(NamedTuple):
     p_value: float
 
 
-def _variances_of_records(
+def _variance_tests_of_records(
     residuals: ResidualSet, channels: Sequence[str]
 ) -> Iterator[_RecordVariance]:
     """Yield the variance test of each record of channels that share a noise record."""
@@ -124,13 +124,13 @@ def _variances_of_records(
     for fitted in residuals.trials:
         single_trial = replace(residuals, trials=(fitted,))
         for name in channels:
-            square, freedom = mean_square(single_trial, (name,))
+            square, freedom = mean_square_ratio(single_trial, (name,))
             if freedom >= LEAST_FREEDOM:
                 p_value = noise_tests.variance_p_value(square, freedom, noise_freedom)
                 yield _RecordVariance(f"{fitted.trial.name}, {name}", p_value)
 
 
-def _by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
+def _split_by_kind(residuals: ResidualSet) -> tuple[ResidualSet, ...]:
     """Return the set split by the kind of its trials; nothing if there is only one kind."""
     kinds = list(dict.fromkeys(fitted.trial.kind for fitted in residuals.trials))
     if len(kinds) < 2:
@@ -162,7 +162,7 @@ def serial_tests(
     ljung_box: list[_SerialTest] = []
     cumulative_periodogram: list[_SerialTest] = []
     fisher_g: list[_SerialTest] = []
-    for fitted, name, series in residuals.series(white):
+    for fitted, name, series in residuals.dynamic_series(white):
         if name in coloured:
             continue
         where = f"{fitted.trial.name}, {name}"
@@ -174,9 +174,9 @@ def serial_tests(
         frequency = index / (len(series) * fitted.trial.interval)
         fisher_g.append(_SerialTest(statistic, p_value, f"{where}, {frequency:.4g} Hz"))
     return (
-        _combined("Ljung-Box", ljung_box),
-        _combined("cumulative periodogram", cumulative_periodogram),
-        _combined("Fisher g", fisher_g),
+        _combine_series_tests("Ljung-Box", ljung_box),
+        _combine_series_tests("cumulative periodogram", cumulative_periodogram),
+        _combine_series_tests("Fisher g", fisher_g),
     )
 
 
@@ -188,7 +188,7 @@ class _SerialTest(NamedTuple):
     where: str
 
 
-def _combined(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
+def _combine_series_tests(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
     """Return the tests of all series combined into one; its p-value is nan if there are none.
 
     Statistic and place are those of the series with the least p-value.
@@ -200,7 +200,7 @@ def _combined(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
     return OmnibusTest(name, p_value, worst.statistic, worst.where)
 
 
-def coloured_noise(residuals: ResidualSet) -> dict[str, str]:
+def coloured_noise_remarks(residuals: ResidualSet) -> dict[str, str]:
     """Return a remark on each channel whose noise record is not white itself, by its name."""
     remarks = {}
     for name, channel in residuals.channels.items():

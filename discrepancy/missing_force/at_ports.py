@@ -52,7 +52,7 @@ class MissingForces:
     """
 
     def __init__(self, problem: Problem) -> None:
-        linear_model, self.laws = problem.model.apart()
+        linear_model, self.laws = problem.model.without_laws()
         trials = tuple(data.trial for data in problem.trials)
         self.model = problem.model
         self.problem = problem.with_trials(trials, linear_model)

@@ -75,7 +75,7 @@ def log_prior(candidate: Candidate, count: int, setting: Setting) -> float:
         return log(SEARCH.prior_none)
     log_places = sum(log(len(term.effect.places(setting))) for term in terms)
     shape_price = sum(SHAPE_GAIN for term in terms if term.free_shape)
-    probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_shares[len(terms) - 1]
+    probability_of_length = (1.0 - SEARCH.prior_none) * SEARCH.set_probabilities[len(terms) - 1]
     number_of_sets = comb(max(count, len(terms)), len(terms))
     return log(probability_of_length / number_of_sets) - log_places - shape_price
 
@@ -385,7 +385,7 @@ class ColumnBuilder:
         added_by_all = np.zeros_like(motion.added)
         readings = np.zeros_like(trial.residual)
         forces: dict[int, FloatArray] = {}
-        for law in self.problem.model.at_ports(laws):
+        for law in self.problem.model.forces_at_ports(laws):
             if not isinstance(law, PortForce):
                 continue
             port = trial.system.ports.index(law.port)

@@ -582,7 +582,7 @@ def _ported(
     outputs = problem.campaign.outputs(trial)
 
     def system(u: FloatArray) -> PortedSystem:
-        return problem.model.ported(trial, outputs, unknowns.parameters(u))
+        return problem.model.ported_system(trial, outputs, unknowns.parameters(u))
 
     slopes: list[PortedSystem | None] = []
     for k in range(unknowns.count):

@@ -60,7 +60,7 @@ def gap_windows(
         that the fit has absorbed.
     """
     dynamic_trials = tuple(fitted.trial for fitted in residuals.trials if fitted.trial.is_dynamic)
-    _, own_laws = problem.model.apart()
+    _, own_laws = problem.model.without_laws()
     if not dynamic_trials or not problem.model.shows_ports or len(own_laws):
         return residual_windows(residuals, seed=seed)
     try:

@@ -120,7 +120,7 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
     """
     model = choice.label or choice.model.name
     priors = []
-    moments = choice.model.stated(campaign)
+    moments = choice.model.prior_moments(campaign)
     for parameter, (mean, deviation) in zip(choice.model.parameters, moments, strict=True):
         name = parameter.name
         if not parameter.low <= mean <= parameter.high:
@@ -209,7 +209,7 @@ def findings(
         Remarks of the campaign.
     """
     sentences: list[str] = []
-    if gate.passed is False:
+    if gate.has_failed:
         sentences.append(
             f"The campaign is not explained by these parameters: {small(gate.reason)} The "
             "posterior is too narrow, and may be of the wrong thing; `uav-twin discrepancy run` on "

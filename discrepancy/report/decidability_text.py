@@ -7,7 +7,12 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, TrialKind
 from discrepancy.catalogue.entry import Effect
-from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability
+from discrepancy.judgement.separability import (
+    CONFUSION_DISTANCE,
+    DETECTION_DISTANCE,
+    Detectability,
+    Separability,
+)
 from discrepancy.report.text import WORDS, number, unit_text
 from reporting.words import listing
 
@@ -24,7 +29,7 @@ def seen_of(detectability: Detectability) -> tuple[str, str, str]:
     median : str
         Prior median of its size, with unit; empty for an effect without a size.
     """
-    is_visible = detectability.distance >= DETECTED
+    is_visible = detectability.distance >= DETECTION_DISTANCE
     visible = "yes" if is_visible else "larger than usual only"
     if not detectability.parameter:
         return visible, "at once" if is_visible else "not at its prior median", ""
@@ -42,7 +47,7 @@ def neighbours(separability: Separability, name: str) -> list[str]:
         return []
     index = separability.identifiers.index(name)
     distance = np.minimum(separability.distance[index], separability.distance[:, index])
-    is_confusable = distance < CONFUSED
+    is_confusable = distance < CONFUSION_DISTANCE
     return [
         other
         for other_index, other in enumerate(separability.identifiers)
@@ -152,14 +157,14 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
         if not item.reason
         and item.parameter
         and isfinite(item.detectable)
-        and item.distance < DETECTED
+        and item.distance < DETECTION_DISTANCE
     ]
     if not hidden:
         return []
     nearest = max(hidden, key=lambda item: item.distance)
     factor = inf
     if nearest.distance > 0.0:
-        factor = (DETECTED / nearest.distance) ** 0.5
+        factor = (DETECTION_DISTANCE / nearest.distance) ** 0.5
     sentence = WORDS.say(
         "unseen" if len(hidden) > 1 else "unseen_one",
         unseen=listing(item.effect.identifier.replace("_", " ") for item in hidden),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from discrepancy.campaign.records import FloatArray
 from discrepancy.document import Origin
 from discrepancy.files.verdict import PrimitiveInterval
-from discrepancy.judgement.separability import CONFUSED, DETECTED, Separability
+from discrepancy.judgement.separability import CONFUSION_DISTANCE, DETECTION_DISTANCE, Separability
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.port_force import MissingForce
 from discrepancy.proof_record import Scores
@@ -126,15 +126,15 @@ def separability_figure(separability: Separability) -> Figure | None:
     np.fill_diagonal(cells, np.nan)
     labels = [names[index] for index in order]
     figure, axes, image = _map_of_names(cells, labels, labels, LogNorm(1.0, _LARGEST_DISTANCE))
-    for row, column in zip(*np.nonzero(distance < CONFUSED), strict=True):
+    for row, column in zip(*np.nonzero(distance < CONFUSION_DISTANCE), strict=True):
         if row != column:
             axes.plot(column, row, "x", color=style.PREDICTION, ms=4.0, mew=1.1)
     cell_width = 1.0 / len(names)
     bar_axes = axes.inset_axes((1.0 + 0.4 * cell_width, 0.0, 0.4 * cell_width, 1.0))
     bar = style.color_bar(figure, image, "squared distance d²", cax=bar_axes)
     style.plain_powers(bar.yaxis, (1.0,))
-    bar.axhline(CONFUSED, color=style.PREDICTION, lw=1.2)
-    bar.axhline(DETECTED, color="white", lw=1.2)
+    bar.axhline(CONFUSION_DISTANCE, color=style.PREDICTION, lw=1.2)
+    bar.axhline(DETECTION_DISTANCE, color="white", lw=1.2)
     return figure
 
 
@@ -312,7 +312,7 @@ class ReportInput:
 
 def _unit_of_noise(before: ResidualSet) -> str:
     """Return the sentence on the unit of the rms residuals in figures: the noise, if recorded."""
-    unknown = [name for name in before.measured if name not in before.recorded]
+    unknown = [name for name in before.channel_names if name not in before.recorded_channels]
     if not unknown:
         return "1 is noise."
     return (
@@ -346,7 +346,7 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         _add(figures, "pit", pit_figure(with_pit), where=where)
     if content.separability is not None:
         figure = separability_figure(content.separability)
-        _add(figures, "separability", figure, confused=CONFUSED)
+        _add(figures, "separability", figure, confused=CONFUSION_DISTANCE)
     if content.self_calibration is not None:
         _add(figures, "self_calibration", confusion_figure(content.self_calibration))
     return figures

@@ -14,7 +14,7 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.errors import FitError
 from discrepancy.location.backbones import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
-from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
+from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
 from discrepancy.report.residual_figures import DrawnModel, draw_noise, models, panels, size
 from reporting import figures as style
 
@@ -168,7 +168,7 @@ def _spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
     trials with equal frequencies is averaged. None if no trial has 32 samples.
     """
     groups: dict[float, list[_Spectrum]] = {}
-    for fitted, column, _ in of_channel(residuals.trials, channel):
+    for fitted, column, _ in channel_fits(residuals.trials, channel):
         if not fitted.trial.is_dynamic or len(fitted.trial.time) < 32:
             continue
         interval = fitted.trial.interval
@@ -324,7 +324,7 @@ def _backbones(
         True for the readings.
     """
     backbones_of_modes: dict[int, list[Backbone]] = {}
-    for fitted, column, used in of_channel(residuals.trials, channel):
+    for fitted, column, used in channel_fits(residuals.trials, channel):
         if fitted.trial.kind is not TrialKind.RINGDOWN:
             continue
         noise = float(fitted.noise_deviation[column])

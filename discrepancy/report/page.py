@@ -9,7 +9,7 @@ from typing import Any
 
 from discrepancy.campaign.units import UNITS
 from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
-from discrepancy.judgement.remarks import NO_GAP, when_sentence
+from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
 from discrepancy.report import text as words
 from discrepancy.report.decidability_text import group_lines, neighbours, seen_of
 from discrepancy.report.figures import ReportInput
@@ -194,7 +194,7 @@ def deciding(verdict: Verdict) -> list[Gate]:
         for gate in verdict.gates
         if isfinite(gate.statistic) and gate.name not in ("shape", "held-out trials")
     ]
-    return sorted(compared, key=lambda gate: gate.passed is not False)
+    return sorted(compared, key=lambda gate: not gate.has_failed)
 
 
 def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Proportion]]:
@@ -220,7 +220,7 @@ FUNCTIONS = (
     group_lines,
     neighbours,
     seen_of,
-    when_sentence,
+    gap_times_sentence,
     words.hypothesis_name,
     words.headline,
     words.error_sentence,
@@ -258,7 +258,7 @@ def said_on_page(content: ReportInput) -> dict[str, Any]:
         "location": investigation.location,
         "fitted": verdict.kind is not VerdictKind.DATA_ERROR,
         "named": verdict.kind in words.NAMING,
-        "nothing": verdict.kind in NO_GAP,
+        "nothing": verdict.kind in KINDS_WITHOUT_GAP,
         "label": words.added_label(investigation),
         "members": words.members_of(verdict),
         "scored": None if proof is None else words.scored(proof),

@@ -13,8 +13,8 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from discrepancy.campaign.records import Channel, FloatArray, Quantity
-from discrepancy.judgement.closed_share import with_noise_of
-from discrepancy.location.residuals import FittedTrial, ResidualSet, of_channel
+from discrepancy.judgement.closed_share import residuals_with_noise_of
+from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
 from fe.runtime.wing_rows import strain_gauge
 from fe.wing.design import WingDesign
 from reporting import figures as style
@@ -41,7 +41,7 @@ def models(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
     if after is None:
         return [was]
     was = was._replace(label="model as it was", title="a  model as it was")
-    with_effect = with_noise_of(after, before)
+    with_effect = residuals_with_noise_of(after, before)
     return [was, DrawnModel(with_effect, style.PAST, "-", "D", AFTER, f"b  {AFTER}")]
 
 
@@ -165,7 +165,7 @@ def size(trials: Sequence[FittedTrial], channel: str) -> float:
     """Return the rms residual of a channel over the noise; nan if no sample is used."""
     sum_of_squares = 0.0
     count = 0
-    for fitted, column, used in of_channel(trials, channel):
+    for fitted, column, used in channel_fits(trials, channel):
         sum_of_squares += float(np.sum(fitted.standardised[used, column] ** 2))
         count += int(used.sum())
     return float(np.sqrt(sum_of_squares / count)) if count else float("nan")
@@ -181,7 +181,7 @@ def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray
     sizes : (C, T) ndarray
         rms residuals over the noise; nan if a trial lacks a channel.
     """
-    measured = {*residuals.measured}
+    measured = {*residuals.channel_names}
     channels = [name for name in residuals.channels if name in measured]
     trial_names = []
     sizes = np.full((len(channels), len(residuals.trials)), np.nan)

@@ -9,7 +9,7 @@ from discrepancy.campaign.records import Campaign, Quantity
 from discrepancy.campaign.units import UNITS
 from discrepancy.document import PRIMITIVE_UNITS
 from discrepancy.files.verdict import PrimitiveInterval
-from discrepancy.judgement.closed_share import closed_text, share_text
+from discrepancy.judgement.closed_share import closed_share_text, percent_with_interval
 from discrepancy.judgement.conclusion import effects_text, probability_text
 from discrepancy.proof_record import Proof, Scores
 from discrepancy.system.interface import Model
@@ -175,7 +175,7 @@ def error_sentence(investigation: Investigation) -> str:
     if proof.closed is None:
         return proof.closed_reason
     is_named = investigation.verdict.kind in NAMING
-    predicate = closed_text(before, after, proof.closed).removeprefix("it ")
+    predicate = closed_share_text(before, after, proof.closed).removeprefix("it ")
     if proof.closed.grew:
         subject = "With it" if is_named else "With the best hypothesis, which is no name,"
     else:
@@ -245,7 +245,7 @@ def parameter_text(estimate: Estimate) -> str:
 _NUMBERS: tuple[Any, ...] = (
     number,
     nats,
-    share_text,
+    percent_with_interval,
     formula,
     p_value_text,
     estimate_text,

@@ -126,7 +126,7 @@ class FittedCandidates:
         if key in self.wide_fits:
             return self.wide_fits[key]
         known = self.exact_fits.get(key)
-        if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
+        if known is None or known.log_evidence < rough.log_evidence - SEARCH.refit_gain:
             exact = attempt(self.problem, rough.candidate, rough.point)
             # the rough fit may be at a point from which the model cannot be fitted further
             self.record(rough if exact is None else exact, exact=True)

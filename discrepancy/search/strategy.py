@@ -123,7 +123,7 @@ class Search(FittedCandidates):
 
     def _misfits(self, base: CandidateFit) -> bool:
         """Return whether the residuals of a fit are much larger than the noise."""
-        return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
+        return base.chi_square > SEARCH.far_chi_square * float(self.problem.counts.sum())
 
     def _is_far(self, base: CandidateFit) -> bool:
         """Return whether a fit is far from the truth.
@@ -133,7 +133,9 @@ class Search(FittedCandidates):
         """
         has_prior = self.problem.shared.precision > 0.0
         deviations = np.abs(base.point.shared[has_prior])
-        return self._misfits(base) or bool(deviations.max(initial=0.0) > SEARCH.strained)
+        return self._misfits(base) or bool(
+            deviations.max(initial=0.0) > SEARCH.far_prior_deviations
+        )
 
     def _fit_from_screen(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
         """Fit effects by few steps from the best points of a screen, the most promising first.
@@ -151,7 +153,7 @@ class Search(FittedCandidates):
             The best fit of each effect that was fitted.
         """
         has_effects = bool(base.candidate.terms)
-        least_gain = SEARCH.worth_adding if has_effects else SEARCH.worth_fitting
+        least_gain = SEARCH.least_gain_to_add if has_effects else SEARCH.least_gain_to_fit
         screen = Screen(self.problem, base)
         changes_by_effect = []
         for effect in with_progress(
@@ -217,12 +219,12 @@ class Search(FittedCandidates):
                     start.candidate,
                     start.point,
                     known=base.linearisations or None,
-                    iterations=SEARCH.rough_steps,
+                    iterations=SEARCH.rough_fit_iterations,
                     give_up=give_up,
                 )
                 if rough is not None:  # None if the effect is larger than the model allows
                     fits.append(rough)
-                    give_up = min(give_up, rough.objective + SEARCH.out_of_reach)
+                    give_up = min(give_up, rough.objective + SEARCH.largest_rough_deficit)
             if fits:
                 best_fits.append(max(fits, key=self.score))
         return best_fits
@@ -243,9 +245,9 @@ class Search(FittedCandidates):
             return []
         best_score = self.score(rough[0])
         # after few steps far from the truth the scores are only roughly in order
-        margin = max(SEARCH.close, SEARCH.close_share * (best_score - floor))
+        margin = max(SEARCH.exact_fit_range, SEARCH.exact_fit_share * (best_score - floor))
         least_score = max(best_score - margin, floor)
-        chosen = [fit for fit in rough[: SEARCH.exact_fits] if self.score(fit) > least_score]
+        chosen = [fit for fit in rough[: SEARCH.most_exact_fits] if self.score(fit) > least_score]
         exact = []
         for fit in with_progress(
             self.on_progress, chosen, lambda fit: f"fitting {fit.candidate.description} to the end"
@@ -261,12 +263,12 @@ class Search(FittedCandidates):
         """
         problem = self.problem
         while (
-            problem.refinement < SEARCH.finest
-            and time_step_error(problem, self.best()) > SEARCH.solver_share
+            problem.refinement < SEARCH.largest_step_reduction
+            and time_step_error(problem, self.best()) > SEARCH.largest_step_error
         ):
             problem.refinement *= 2
             ranked = sorted(self.exact_fits.values(), key=lambda fit: -self.score(fit))
-            for fit in ranked[: SEARCH.refitted]:
+            for fit in ranked[: SEARCH.most_refitted]:
                 if not fit.candidate.terms:
                     continue
                 finer = attempt(problem, fit.candidate, fit.point)
@@ -278,7 +280,7 @@ class Search(FittedCandidates):
     def search_single_effects(self) -> None:
         """Fit all single effects, and refine the time steps for the best of them."""
         rough = self.fit_roughly_beside(self.no_effect, self.effects)
-        self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.hopeless)
+        self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.largest_single_deficit)
         self.refine_time_steps()
 
     def search_sets(self) -> None:
@@ -318,11 +320,11 @@ class Search(FittedCandidates):
                 eligible.append(hypothesis)
         leading = []
         for hypothesis in eligible:
-            if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.followed:
+            if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.force_fit_range:
                 leading.append(hypothesis)
         for hypothesis in with_progress(
             self.on_progress,
-            leading[: SEARCH.far_fits],
+            leading[: SEARCH.most_far_fits],
             lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
         ):
             start = force_search.whole_point(hypothesis)
@@ -375,7 +377,7 @@ class Search(FittedCandidates):
             present = {term.effect.identifier for term in current.candidate.terms}
             others = [effect for effect in self.effects if effect.identifier not in present]
             rough = self.fit_roughly_beside(current, others)
-            exact = self.fit_best_exactly(rough, current_score - SEARCH.hopeless_longer)
+            exact = self.fit_best_exactly(rough, current_score - SEARCH.largest_longer_set_deficit)
             if not exact or self.score(exact[0]) <= current_score:
                 break
             current = exact[0]
@@ -388,7 +390,7 @@ class Search(FittedCandidates):
         """
         best = self.best()
         while len(best.candidate.terms) > 1 and self.is_unexplained():
-            give_up = best.objective + SEARCH.out_of_reach
+            give_up = best.objective + SEARCH.largest_rough_deficit
             for candidate in sets_at_other_places(best.candidate, self.problem.setting):
                 if candidate.key in self.exact_fits:
                     continue
@@ -407,7 +409,7 @@ class Search(FittedCandidates):
         """
         best = self.best()
         while len(best.candidate.terms) > 1:
-            give_up = best.objective + SEARCH.out_of_reach
+            give_up = best.objective + SEARCH.largest_rough_deficit
             numbers = range(len(best.candidate.terms))
             for dropped in numbers:
                 remaining = [number for number in numbers if number != dropped]
@@ -438,7 +440,7 @@ class Search(FittedCandidates):
             is_best = key not in best_families or self.score(best_families[key]) < self.score(
                 family
             )
-            if is_best and check_absolute_fit(self.problem, family).passed is not False:
+            if is_best and not check_absolute_fit(self.problem, family).has_failed:
                 best_families[key] = family
         for family in best_families.values():
             self.record(family, exact=True)
@@ -455,16 +457,16 @@ class Search(FittedCandidates):
         for fit in self.exact_fits.values():
             if len(fit.candidate.terms) == 1 and not fit.candidate.is_family:
                 singles.append(fit)
-        singles = sorted(singles, key=self.score, reverse=True)[: SEARCH.exact_fits]
+        singles = sorted(singles, key=self.score, reverse=True)[: SEARCH.most_exact_fits]
         fitting = []
         for fit in singles:
-            if check_absolute_fit(self.problem, fit).passed is not False:
+            if not check_absolute_fit(self.problem, fit).has_failed:
                 fitting.append(fit)
         if not fitting or fitting[0] is not singles[0]:
             return singles
-        least = self.score(singles[0]) - SEARCH.rivals
+        least = self.score(singles[0]) - SEARCH.family_fit_range
         competing = [fit for fit in fitting if self.score(fit) > least]
-        model_fits = check_absolute_fit(self.problem, self.no_effect).passed is not False
+        model_fits = not check_absolute_fit(self.problem, self.no_effect).has_failed
         if len(competing) == 1 or model_fits:
             return []
         return competing
@@ -476,7 +478,7 @@ class Search(FittedCandidates):
         for effect in self.effects:
             changes.extend(starting_changes(screen, effect))
         starts_by_pair = []
-        for pair in best_pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
+        for pair in best_pairs(changes, screen.sign)[: SEARCH.most_fitted_pairs]:
             candidate = Candidate((pair.first.term, pair.second.term))
             if candidate.key in self.exact_fits:
                 continue
@@ -487,4 +489,4 @@ class Search(FittedCandidates):
         for fit in rough:
             self.record(fit, exact=False)
         rough.sort(key=lambda fit: -self.score(fit))
-        self.fit_best_exactly(rough, self.score(self.best()) - SEARCH.close)
+        self.fit_best_exactly(rough, self.score(self.best()) - SEARCH.exact_fit_range)

@@ -51,18 +51,20 @@ def search(
     """
     on_progress("fitting the model as it is")
     start = problem.start(Candidate())
-    no_effect = fit(problem, Candidate(), start, iterations=SEARCH.none_steps)
-    no_effect = refit_from_first_readings(problem, no_effect, iterations=SEARCH.none_steps)
+    no_effect = fit(problem, Candidate(), start, iterations=SEARCH.no_effect_iterations)
+    no_effect = refit_from_first_readings(
+        problem, no_effect, iterations=SEARCH.no_effect_iterations
+    )
     usable = [effect for effect in effects if effect.unavailable(problem.setting) is None]
     usable_effects = (*usable, *in_events(tuple(usable), problem.setting))
     result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
-    _, own_laws = problem.model.apart()
+    _, own_laws = problem.model.without_laws()
     if len(own_laws) and result.force_search is not None and result.is_unexplained():
         # a nonlinear law of the model itself, such as dry friction that ends a motion, has many
         # optima: fit again from the unknowns of a fit that includes a missing force
         start = result.force_search.whole_point(result.force_search.whole)
         second_fit = attempt(problem, Candidate(), start)
-        least_gain = SEARCH.worth_fitting
+        least_gain = SEARCH.least_gain_to_fit
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
     on_search(result)

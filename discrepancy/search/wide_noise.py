@@ -337,8 +337,8 @@ def compare_under_wide_noise(search: Search) -> None:
 def _most_probable_sets(search: Search) -> list[CandidateFit]:
     """Return the best fits of the most probable sets of one, two and three effects.
 
-    Each set of effects is represented by its best fit over places. `SEARCH.weighed_sets` has the
-    number of sets of each length.
+    Each set of effects is represented by its best fit over places. `SEARCH.most_weighed_sets` has
+    the number of sets of each length.
     """
     best: dict[tuple[str, ...], CandidateFit] = {}
     for fit in search.compared_fits().values():
@@ -348,7 +348,7 @@ def _most_probable_sets(search: Search) -> list[CandidateFit]:
         ):
             best[identifiers] = fit
     chosen: list[CandidateFit] = []
-    for length, count in enumerate(SEARCH.weighed_sets, start=1):
+    for length, count in enumerate(SEARCH.most_weighed_sets, start=1):
         fits_of_length = [fit for fit in best.values() if len(fit.candidate.terms) == length]
         chosen += sorted(fits_of_length, key=lambda fit: -search.score(fit))[:count]
     return chosen
@@ -370,8 +370,10 @@ def _fits_under(
     """
     fits_with_scores = [(fit, _expected_score(search, wide_problem, fit)) for fit in chosen]
     fits_with_scores.sort(key=lambda entry: entry[1], reverse=True)
-    least = fits_with_scores[0][1] - SEARCH.weighed_within if fits_with_scores else 0.0
-    promising = [fit for fit, score in fits_with_scores[: SEARCH.weighed_fits] if score > least]
+    least = fits_with_scores[0][1] - SEARCH.weighed_range if fits_with_scores else 0.0
+    promising = [
+        fit for fit, score in fits_with_scores[: SEARCH.most_weighed_fits] if score > least
+    ]
     wide_fits: dict[CandidateKey, CandidateFit] = {}
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
     for fit in with_progress(

@@ -289,7 +289,7 @@ def run_model(folder: Path | str) -> tuple[WingModel, Path, Path | None]:
         gauge_count = len(run["observed"]["sensor"])
         effects = load_patch(patch_file).for_gauges(gauge_count).effects
     for effect in effects:
-        model = model.patched(effect.patch)
+        model = model.with_patch(effect.patch)
     return model, wing_file, patch_file
 
 

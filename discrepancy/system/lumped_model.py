@@ -101,7 +101,7 @@ class LumpedModel(DescribedModel, SystemModel):
         }
         return carried.get(primitive, primitive in SENSORS)
 
-    def losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
+    def region_losses(self, trial: Trial, health: FloatArray) -> list[Losses]:
         """Return one row without losses: health has no meaning here."""
         return [()]
 
@@ -205,14 +205,14 @@ class LumpedModel(DescribedModel, SystemModel):
         section = self._inputs.get(recorded.name)
         if section is None:
             raise ModelError(
-                f"The trial {trial.name!r} records the input {recorded.name!r}, which {self.what} "
-                f"does not have; it has {comma_list(self._inputs)}."
+                f"The trial {trial.name!r} records the input {recorded.name!r}, which "
+                f"{self.quoted_name} does not have; it has {comma_list(self._inputs)}."
             )
         moving = section.quantity.moving
         if recorded.quantity is not section.quantity and recorded.quantity not in moving:
             raise ModelError(
-                f"The input {recorded.name!r} of {self.what} is {section.quantity.value}, but the "
-                f"trial {trial.name!r} records {recorded.quantity.value}."
+                f"The input {recorded.name!r} of {self.quoted_name} is {section.quantity.value}, "
+                f"but the trial {trial.name!r} records {recorded.quantity.value}."
             )
         if moving and recorded.hold not in (None, Hold.SMOOTH):
             raise ModelError(
@@ -229,7 +229,7 @@ class LumpedModel(DescribedModel, SystemModel):
             for name, section in self._inputs.items()
             if name == place or not section.quantity.moving
         ]
-        return self._inputs[choose_load_place(candidates, place, self.what)]
+        return self._inputs[choose_load_place(candidates, place, self.quoted_name)]
 
     def _input_direction(self, rig: Rig, section: InputSection, change: LoadChange) -> FloatArray:
         """Return the load (N,) of one unit of an input whose place may have been moved."""

@@ -213,7 +213,7 @@ class StructureModel(SystemModel):
             If there is no such force, or none is named of several.
         """
         places = self.forces or (LOAD_FACTOR,)
-        return self._unit_load(state, choose_load_place(places, place, self.what))
+        return self._unit_load(state, choose_load_place(places, place, self.quoted_name))
 
     def lift_loads(self, state: SystemState, change: ModelPatch) -> FloatArray:
         """Return the load (1, n) of the load factor."""
@@ -410,7 +410,7 @@ class WingModel(SystemModel):
         return equations
 
     @property
-    def shown_outputs(self) -> tuple[str, ...]:
+    def outputs_with_quantities(self) -> tuple[str, ...]:
         """The outputs as they are listed in a sentence."""
         return (
             f"strain[1] to strain[{len(self.wing.arrays.gauge_stations)}]",
@@ -427,7 +427,7 @@ class WingModel(SystemModel):
         """Return the units of force and motion at a port: the root turns, others move."""
         return TURNS if port == ROTATING_PORT else MOVES
 
-    def at_ports(self, forces: ModelPatch) -> ModelPatch:
+    def forces_at_ports(self, forces: ModelPatch) -> ModelPatch:
         """Return forces as they act at ports of `port_rows`."""
         return self.wing.internal_forces(forces)
 

@@ -158,7 +158,7 @@ class SystemModel(Model):
 
     def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
         """Return the laws at the ports, those of the model and those of a patch."""
-        forces = self.at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
+        forces = self.forces_at_ports(self.own_laws(parameters) + patch.of(*INTERNAL_FORCES))
         return port_laws(forces, self.port_rows, in_windows=self.follows_windows)
 
     def patched_trial(
@@ -178,7 +178,7 @@ class SystemModel(Model):
         temperature_rise = float(trial.temperature[0]) if _depends_on_temperature(patch) else 0.0
         state = SystemState(
             parameters=tuple(conditions.parameters.tolist()),
-            losses=self.losses(trial, conditions.health)[0],
+            losses=self.region_losses(trial, conditions.health)[0],
             structure=patch.of(*STRUCTURE),
             temperature_rise=temperature_rise,
         )
@@ -300,7 +300,7 @@ class SystemModel(Model):
             A slice of rows, and the state of the structure in all of them.
         """
         row_count = len(case.trial.force)
-        losses_of_rows = self.losses(case.trial, case.conditions.health)
+        losses_of_rows = self.region_losses(case.trial, case.conditions.health)
         # a single entry holds for all rows
         if len(losses_of_rows) == 1:
             losses_of_rows = losses_of_rows * row_count
@@ -318,7 +318,9 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ ports
 
-    def _ported(self, trial: Trial, outputs: Outputs, parameters: FloatArray) -> PortedSystem:
+    def _ported_system(
+        self, trial: Trial, outputs: Outputs, parameters: FloatArray
+    ) -> PortedSystem:
         """Return the linear system from missing forces to outputs, in the modes at the prior mean.
 
         These modes are the same for all parameters, so that systems at several parameters have the
@@ -353,7 +355,7 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ natural sizes and scales
 
-    def initial_sizes(self, campaign: Campaign, trial: Trial) -> FloatArray:
+    def initial_state_magnitudes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
 
         See `natural_state`; the motion from rest is that of the prior mean.
@@ -463,7 +465,7 @@ class SystemModel(Model):
             motion = self.motion(self.patched_trial(from_rest, conditions), laws)
         if not np.any(motion.q) and not np.any(motion.velocity):
             # no input moves it: the structure was released
-            initial = self.initial_sizes(campaign, trial)
+            initial = self.initial_state_magnitudes(campaign, trial)
             let_go = self.patched_trial(trial, replace(conditions, initial=initial))
             motion = self.motion(let_go, laws)
         return motion

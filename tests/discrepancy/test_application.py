@@ -305,7 +305,7 @@ def test_a_built_in_sensor_is_that_of_its_channel():
         Channel(name, Quantity.DISPLACEMENT, "displacement", noise) for name in ("laser", "transducer")
     )
     campaign = example_campaign(model, "static", 0, replace(plan_of(model), channels=channels))
-    patched, given = model.patched(ModelPatch((SensorGain("laser", 0.1),))), Conditions(np.ones(2))
+    patched, given = model.with_patch(ModelPatch((SensorGain("laser", 0.1),))), Conditions(np.ones(2))
     seen = observe(patched, campaign, campaign.trials[0], ModelPatch(), given).values
     np.testing.assert_allclose(seen[:, 0], 1.1 * seen[:, 1], rtol=1e-12)
     assert np.abs(seen[:, 1]).max() > 0.0
@@ -316,7 +316,7 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings():
     model = uav_twin.load_model("single_mass_rig")
     friction = "coulomb_friction", {"friction_ratio": 0.04}, "slide"
     campaign = simulated(model, "ringdown", 1, friction)
-    patched = model.patched(hiding(campaign, model, *friction))
+    patched = model.with_patch(hiding(campaign, model, *friction))
     problem = problem_of(campaign, patched)
     count = problem.counts.sum()
     assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count

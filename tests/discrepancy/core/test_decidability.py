@@ -15,12 +15,12 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.fits.candidate import EffectTerm
 from discrepancy.judgement.next_experiment import (
     Proposal,
+    feasible_proposals,
     mutual_information,
     next_experiments,
     oscillates,
-    proposals,
 )
-from discrepancy.judgement.separability import CONFUSED, as_predicted, separability
+from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, separability
 from discrepancy.report.decidability_text import group_lines
 from discrepancy.self_calibration import outcome_of, self_calibrate, wilson, write_self_calibration
 from discrepancy.simulation import Simulator
@@ -122,7 +122,7 @@ def test_a_whole_laboratory_test_separates():
     small = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
     effects = [*others, replace(gauge, parameters=(replace(gain, prior=small),))]
     unseen = separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, effects)
-    assert 1e-6 < unseen.detectability[-1].distance < 0.1 * CONFUSED
+    assert 1e-6 < unseen.detectability[-1].distance < 0.1 * CONFUSION_DISTANCE
     assert "gauge_gain" in unseen.identifiers
     assert unseen.groups == ()
 
@@ -131,7 +131,7 @@ def test_an_unknown_noise_is_taken_as_a_thousandth_of_the_range():
     """Detectable sizes are finite, and those of a stated deviation of that size."""
     given, model = kit.BENCH.measured(1), kit.BENCH.model
     blank = kit.with_noise(kit.problem_of(given, model), **dict.fromkeys(given.channels))
-    ideal = as_predicted(blank.campaign, model, blank.setting)
+    ideal = campaign_as_predicted(blank.campaign, model, blank.setting)
     found, again = (
         decided(model, replace(blank.campaign, channels=channels), "gauge_gain", "quadratic_damping")
         for channels in (blank.campaign.channels, ideal.channels)
@@ -188,7 +188,7 @@ def test_another_amplitude_decides_between_amplitude_and_time():
     stiffening, drift = kit.chosen("cubic_stiffness", "stiffness_drift")
     fits = [kit.fitted(problem, term) for term in (EffectTerm(stiffening, "end"), EffectTerm(drift))]
     information = {
-        item.trial.name: mutual_information(problem, item, fits, HALF) for item in proposals(problem)
+        item.trial.name: mutual_information(problem, item, fits, HALF) for item in feasible_proposals(problem)
     }
     assert all(0.0 <= value <= log(2.0) + 1e-9 for value in information.values())
     same = Proposal(problem.campaign.trials[0], "", "", 1.0)
@@ -206,7 +206,7 @@ def test_another_amplitude_decides_between_amplitude_and_time():
 def test_proposals_are_trials_of_the_kinds_that_were_done():
     """A longer record is one of what swings."""
     problem = kit.BENCH.problem(1)
-    found = list(proposals(problem))
+    found = list(feasible_proposals(problem))
     assert {item.trial.kind for item in found} == {TrialKind.STATIC, TrialKind.RINGDOWN}
     assert len({item.description for item in found}) == len(found)
     for item in found:
@@ -224,7 +224,7 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
         for data, part in zip(problem.trials, none.linearisations, strict=True)
     )
     assert not oscillates(problem, replace(none, linearisations=decay))
-    names = [item.trial.name for item in proposals(problem, swings=False)]
+    names = [item.trial.name for item in feasible_proposals(problem, is_oscillating=False)]
     assert names
     assert "longer record" not in names
 

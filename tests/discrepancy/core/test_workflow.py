@@ -13,7 +13,7 @@ from discrepancy.catalogue.library import in_events, library
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.candidate import Candidate, EffectTerm
 from discrepancy.fits.fitting import fit
-from discrepancy.judgement.separability import as_predicted
+from discrepancy.judgement.separability import campaign_as_predicted
 from discrepancy.sources.examples import example_campaign, plan_for
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
@@ -122,7 +122,7 @@ def test_verdicts_that_name_nothing():
         judged(misspelt)
 
     # what the model says, to the last bit, and no noise record: nothing to weigh the rest by
-    exact = as_predicted(LABORATORY.campaign, LABORATORY.model, LABORATORY.setting)
+    exact = campaign_as_predicted(LABORATORY.campaign, LABORATORY.model, LABORATORY.setting)
     channels = {name: replace(item, noise=None) for name, item in exact.channels.items()}
     result = judged(replace(exact, trials=exact.fitted, channels=channels), thorough=False)
     assert result.verdict.kind is VerdictKind.NOTHING_MISSING
@@ -168,7 +168,7 @@ def test_trials_that_came_and_went_are_not_mistaken_for_each_other():
     channels = problem.campaign.channels
     outputs = tuple((channels[name].output, channels[name].quantity) for name in template.channels)
     memo = problem.model
-    plain = memo.patched(ModelPatch())
+    plain = memo.with_patch(ModelPatch())
     conditions = Conditions(np.array([1.0, 0.5]), health=np.zeros((9, 2)))
     for number in range(200):
         trial = replace(template, force=float(number) * template.force)

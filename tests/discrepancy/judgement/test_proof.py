@@ -14,7 +14,7 @@ from discrepancy.campaign.records import Campaign, Channel, NoiseRecord, Quantit
 from discrepancy.errors import FitError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.judgement.closed_share import closed_share
-from discrepancy.judgement.consistency_gate import check_consistency, directions, score_tests
+from discrepancy.judgement.consistency_gate import check_consistency, directions_by_test, score_tests
 from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.proof import check_held_out, correlation_time, log_density, prove, scores
 from discrepancy.verdict import VerdictKind
@@ -216,7 +216,7 @@ def changed(problem, *, record=None, size=None, shift=0.0, place="middle", fligh
 def asked(problem, term=kit.OFFSET):
     """Return the fit of a term, the directions beside it and their tests."""
     found = kit.fitted(problem, term)
-    along = directions(problem, found)
+    along = directions_by_test(problem, found)
     return found, along, score_tests(problem, found, along)
 
 

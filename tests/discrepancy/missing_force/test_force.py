@@ -345,7 +345,7 @@ def test_a_model_with_the_right_law_of_its_own_has_no_gap_at_any_time():
     model = LumpedModel.load("single_mass_rig")
     values = {"friction_ratio": 0.02}
     rubs = hiding(simulated(model, "ringdown", 4), model, "coulomb_friction", values, "slide")
-    found = investigate(simulated(model, "ringdown", 4, rubs), model.patched(rubs), FEW[:1]).verdict
+    found = investigate(simulated(model, "ringdown", 4, rubs), model.with_patch(rubs), FEW[:1]).verdict
     assert (found.kind, found.windows) == (VerdictKind.NOTHING_MISSING, ())
 
 

@@ -19,7 +19,13 @@ from discrepancy.errors import VerdictFileError
 from discrepancy.files.residuals import read_residuals
 from discrepancy.files.verdict import primitive_intervals, read_patch, read_verdict, read_verdict_file
 from discrepancy.judgement.conclusion import probability_text
-from discrepancy.judgement.separability import CONFUSED, DETECTED, Detectability, Separability, separability
+from discrepancy.judgement.separability import (
+    CONFUSION_DISTANCE,
+    DETECTION_DISTANCE,
+    Detectability,
+    Separability,
+    separability,
+)
 from discrepancy.report.decidability_text import group_lines, needs, neighbours, seen_of
 from discrepancy.report.figures import ReportInput, report_figures
 from discrepancy.report.page import parameter_rows, render_report, what_is_missing
@@ -29,8 +35,8 @@ from discrepancy.report.text import (
     formula,
     headline,
     number,
+    percent_with_interval,
     remainders_sentence,
-    share_text,
     si_sizes,
 )
 from discrepancy.system.structures import WingModel
@@ -68,12 +74,12 @@ def page_of(investigation, **verdict):
 
 def test_a_verdict_begins_with_what_is_missing_how_large_and_what_is_left(drag):
     closed, held = drag.proof.closed, drag.proof.held_out_after
-    said = f"It explains {share_text(closed)} of the mean square error in "
+    said = f"It explains {percent_with_interval(closed)} of the mean square error in "
     text = page_of(drag)  # without intervals, by its parameters
     force = drag.verdict.force
     opening = (
         f">Quadratic aerodynamic damping at {force.port}<", f">{number(force.rms)} N<",
-        f">{share_text(closed)}<", f">{probability_text(drag.verdict.probability)}<",
+        f">{percent_with_interval(closed)}<", f">{probability_text(drag.verdict.probability)}<",
         f">{headline(drag.verdict)}<", "Its size: ", said,
     )  # fmt: skip
     places = [text.index(words) for words in opening]
@@ -148,7 +154,7 @@ def test_what_explains_most_of_the_gap_is_told_first(drag):
 @pytest.mark.parametrize("count", [1, 3])
 def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     hidden = tuple(
-        Detectability(effect, "", "", DETECTED / (n + 2) ** 2, "size", 1.0, "1", 0.5)
+        Detectability(effect, "", "", DETECTION_DISTANCE / (n + 2) ** 2, "size", 1.0, "1", 0.5)
         for n, effect in enumerate(FEW[:count])
     )
     (told,) = (
@@ -177,7 +183,7 @@ def test_what_can_be_decided(drag, able):
     for line in confused:
         assert all(other in line for other in neighbours(able, line.split()[1]))
     for row, name in enumerate(able.identifiers):
-        near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSED
+        near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSION_DISTANCE
         near[row] = False
         assert neighbours(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
     assert group_lines(able)
