@@ -31,7 +31,7 @@ ENDINGS = (".toml", ".json", ".fmu")
 
 
 @dataclass(frozen=True)
-class Applied:
+class AppliedVerdict:
     """A patched model.
 
     Attributes
@@ -57,7 +57,7 @@ def apply_verdict(
     member: str | None = None,
     replace: bool = False,
     progress: Progress | None = None,
-) -> Applied:
+) -> AppliedVerdict:
     """Write the model of a verdict with the effects that were found, and its parameters.
 
     Parameters
@@ -108,11 +108,11 @@ def apply_verdict(
         out = f"{stem}_patched{'.toml' if has_laws_only else '.json'}"
     path = Path(out)
     _check_destination(path, choice, verdict_file, replace=replace)
-    sentence = f"{_applied_effects(applied_patch)}, {_certainty(applied_patch, stored)}."
+    sentence = f"{_applied_effects(applied_patch)}, {_certainty_clause(applied_patch, stored)}."
     patch = changed(patch, sentence=f"{sentence} {stored.verdict.sentence}")
     if path.suffix == ".fmu":
         pack_patched(choice, patch, path, activate=True, replace=replace, progress=progress)
-        return Applied(path, sentence, "")
+        return AppliedVerdict(path, sentence, "")
     if path.suffix == ".toml":
         if not has_laws_only:
             raise ModelError(
@@ -122,7 +122,7 @@ def apply_verdict(
         atomic_write_text(path, _lumped_text(choice, patch))
     else:
         files.write_patch(path, patch)
-    return Applied(path, sentence, _command_with_model(stored.origin.command, path))
+    return AppliedVerdict(path, sentence, _command_with_model(stored.origin.command, path))
 
 
 def _check_destination(
@@ -162,7 +162,7 @@ def _applied_effects(patch: files.StoredPatch) -> str:
     return capital(" and ".join(phrases))
 
 
-def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
+def _certainty_clause(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
     """Return how certain the effects of a patch are, as the end of a sentence."""
     certainty = {
         VerdictKind.NAMED: "named",
@@ -177,7 +177,7 @@ def _certainty(patch: files.StoredPatch, stored: files.StoredVerdict) -> str:
     return certainty[patch.verdict]
 
 
-def gives(verdict: Verdict, proof: Proof | None) -> bool:
+def has_applicable_effects(verdict: Verdict, proof: Proof | None) -> bool:
     """Return whether a verdict has effects that can be applied to the model.
 
     Effects that increase the error are never applied.
@@ -391,7 +391,7 @@ def pack_patched(
     return [f"effect.{effect.id}.active" for effect in effects.effects]
 
 
-def packed_beside(choice: ModelChoice, patch_file: Path, path: Path) -> str:
+def pack_beside_verdict(choice: ModelChoice, patch_file: Path, path: Path) -> str:
     """Pack the FMU of a wing with the patch of a verdict, and return a sentence about it.
 
     Its effects are switched off.

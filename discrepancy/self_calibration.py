@@ -21,13 +21,13 @@ from scipy.stats import binomtest
 
 from discrepancy.campaign.records import Campaign, IntArray
 from discrepancy.catalogue.entry import Effect
-from discrepancy.document import Origin, plain
+from discrepancy.document import Origin, plain_data
 from discrepancy.errors import ModelError
 from discrepancy.judgement.separability import usable_effects
-from discrepancy.simulation import Hidden, Simulator
+from discrepancy.simulation import HiddenEffect, Simulator
 from discrepancy.system.interface import Model
 from discrepancy.verdict import VerdictKind
-from discrepancy.workflow import checked, investigate
+from discrepancy.workflow import check_and_prepare, investigate
 from reporting.files import atomic_write_text
 
 SELF_CALIBRATION_NAME = "self_calibration.json"
@@ -43,7 +43,7 @@ OUTCOMES = {VerdictKind.FAMILY: "family", VerdictKind.NAMED_IN_PART: "in part"}
 
 
 @dataclass(frozen=True)
-class Covered:
+class ParameterCoverage:
     """A parameter of a named effect: its true value, and the 90 % interval that was found."""
 
     parameter: str
@@ -87,7 +87,7 @@ class CalibrationCase:
     kind: VerdictKind
     named: tuple[str, ...]
     outcome: str
-    covered: tuple[Covered, ...]
+    covered: tuple[ParameterCoverage, ...]
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class SelfCalibration:
         """
         hidden = {case.hidden for case in self.cases}
         rows = sorted(hidden, key=lambda name: (name != NOTHING, name))
-        verdicts = {_column(case) for case in self.cases}
+        verdicts = {_confusion_column(case) for case in self.cases}
         other_verdicts = [name for name in dict.fromkeys(OTHER.values()) if name in verdicts]
         names = verdicts.difference(other_verdicts)
         columns = [name for name in rows if name in names]
@@ -166,11 +166,11 @@ class SelfCalibration:
         columns += [name for name in other_verdicts if name not in columns]
         counts = np.zeros((len(rows), len(columns)), dtype=np.int64)
         for case in self.cases:
-            counts[rows.index(case.hidden), columns.index(_column(case))] += 1
+            counts[rows.index(case.hidden), columns.index(_confusion_column(case))] += 1
         return rows, columns, counts
 
 
-def _column(case: CalibrationCase) -> str:
+def _confusion_column(case: CalibrationCase) -> str:
     """Return the column of a case in the confusion matrix: the name, or the kind of verdict."""
     return " + ".join(case.named) if case.kind is VerdictKind.NAMED else OTHER[case.kind]
 
@@ -221,7 +221,7 @@ def self_calibrate(
     DiscrepancyError
         If nothing can be tested here.
     """
-    campaign, _ = checked(campaign, model)
+    campaign, _ = check_and_prepare(campaign, model)
     simulator = Simulator(campaign, model)
     testable = usable_effects(effects, simulator.setting)
     drawing_seed, *case_seeds = np.random.SeedSequence(seed).spawn(count + 1)
@@ -229,7 +229,7 @@ def self_calibrate(
         simulator, testable, count, np.random.default_rng(drawing_seed)
     )
     cases: list[CalibrationCase] = []
-    investigate_case = partial(_investigated, simulator, effects)
+    investigate_case = partial(_investigate_simulated, simulator, effects)
     with ProcessPoolExecutor(max(workers, 1), get_context("spawn")) as pool:
         map_cases = pool.map if workers > 1 and count > 1 else map
         for case in map_cases(investigate_case, hidden, case_seeds):
@@ -244,7 +244,7 @@ def _hidden_effects(
     testable: Sequence[Effect],
     count: int,
     generator: np.random.Generator,
-) -> tuple[list[Hidden | None], list[str]]:
+) -> tuple[list[HiddenEffect | None], list[str]]:
     """Draw the effects that are hidden in the campaigns.
 
     All testable effects are used in a random order before one is used again. Every `NULL_SHARE`-th
@@ -271,9 +271,9 @@ def _hidden_effects(
     screen = simulator.screen()
     queue: list[Effect] = []
     not_detectable: list[str] = []
-    hidden: list[Hidden | None] = []
+    hidden: list[HiddenEffect | None] = []
     for number in range(count):
-        drawn: Hidden | None = None
+        drawn: HiddenEffect | None = None
         hides_nothing = number % NULL_SHARE == 0
         while not hides_nothing and drawn is None and len(not_detectable) < len(testable):
             if not queue:
@@ -288,10 +288,10 @@ def _hidden_effects(
     return hidden, not_detectable
 
 
-def _investigated(
+def _investigate_simulated(
     simulator: Simulator,
     effects: Sequence[Effect],
-    hidden: Hidden | None,
+    hidden: HiddenEffect | None,
     seed: np.random.SeedSequence,
 ) -> CalibrationCase:
     """Simulate a campaign, investigate it, and compare the verdict with the hidden effect.
@@ -319,7 +319,7 @@ def _investigated(
         distance = hidden.distance
     named = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
     outcome = outcome_of(identifier, verdict.kind, named, verdict.group)
-    covered: list[Covered] = []
+    covered: list[ParameterCoverage] = []
     if outcome == "right" and hidden is not None:
         true_values = hidden.term.values(hidden.normal)
         for effect in verdict.effects:
@@ -327,7 +327,9 @@ def _investigated(
                 continue
             for estimate in effect.parameters:
                 true_value = true_values[estimate.name]
-                covered.append(Covered(estimate.name, true_value, estimate.low, estimate.high))
+                covered.append(
+                    ParameterCoverage(estimate.name, true_value, estimate.low, estimate.high)
+                )
     return CalibrationCase(
         hidden=identifier,
         place=place,
@@ -382,7 +384,7 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
     rows, columns, counts = self_calibration.confusion()
     content = {
         "schema": SCHEMA,
-        **plain(origin),
+        **plain_data(origin),
         "seed": self_calibration.seed,
         "not_detectable": list(self_calibration.not_detectable),
         "outcomes": {
@@ -391,7 +393,7 @@ def write_self_calibration(path: Path, self_calibration: SelfCalibration, origin
         },
         "coverage_90": _proportion_table(self_calibration.coverage()),
         "confusion": {"hidden": rows, "verdict": columns, "counts": counts.tolist()},
-        "cases": [plain(case) for case in self_calibration.cases],
+        "cases": [plain_data(case) for case in self_calibration.cases],
     }
     return atomic_write_text(path, json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
@@ -414,7 +416,7 @@ def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str
 
 def _proportion_table(proportion: Proportion) -> dict[str, Any]:
     """Return a proportion as plain data."""
-    return {**plain(proportion), "share": plain(proportion.value)}
+    return {**plain_data(proportion), "share": plain_data(proportion.value)}
 
 
 def outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[str]:

@@ -16,7 +16,7 @@ from discrepancy.catalogue.entry import Effect, Setting
 from discrepancy.catalogue.library import load_catalogue
 from discrepancy.checks.fault import DataFault, FaultKind
 from discrepancy.checks.model_check import check_against_model
-from discrepancy.checks.outliers import mark_outliers, wrong_ends
+from discrepancy.checks.outliers import mark_outliers, wrong_end_readings
 from discrepancy.checks.quality import check_data
 from discrepancy.errors import CampaignDataError
 from discrepancy.fits.beginnings import refit_from_first_readings
@@ -50,7 +50,11 @@ from discrepancy.search_settings import SEARCH
 from discrepancy.sources.from_run import RUN_FILE, run_campaign
 from discrepancy.system.interface import Model
 from discrepancy.verdict import Experiment, GapWindow, Verdict, VerdictKind, effect_label
-from discrepancy.verdict_remarks import not_fitted, strained, without_port
+from discrepancy.verdict_remarks import (
+    effects_not_fitted,
+    implausible_value_remarks,
+    missing_port_remark,
+)
 from fe.runtime.patch import ModelPatch
 from reporting.progress import Progress, reporter
 from reporting.words import brief, is_or_are
@@ -156,7 +160,7 @@ def investigate(
         seconds[key] = time.perf_counter() - began
 
     with stage("Checking the data", "check"):
-        campaign, faults = checked(campaign, model)
+        campaign, faults = check_and_prepare(campaign, model)
     remarks = [fault.sentence for fault in faults]
     fatal = [fault for fault in faults if fault.fatal]
     if fatal:
@@ -164,7 +168,7 @@ def investigate(
         verdict = Verdict(kind, fatal[0].sentence, nan, nan, remarks=tuple(remarks))
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
     with stage("Fitting what is known, and searching the catalogue", "name") as tell:
-        problem = without_wrong_ends(campaign, model)
+        problem = problem_without_wrong_ends(campaign, model)
         campaign, setting = problem.campaign, problem.setting
         catalogue = load_catalogue() if effects is None else effects
         verdict, search, fit = reach_verdict(
@@ -202,7 +206,7 @@ def investigate(
             missing = seen_force(problem, search.force_search, search.force_hypotheses, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
-            proof = prove(before, after, effects=added_effects(fit), seed=seed)
+            proof = prove(before, after, effects=effect_labels(fit), seed=seed)
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):
@@ -212,7 +216,7 @@ def investigate(
         sentence=sentence_with_times(verdict, windows),
         remarks=tuple(remarks),
         next_experiments=experiments,
-        not_fitted=not_fitted(problem.setting, catalogue, search),
+        not_fitted=effects_not_fitted(problem.setting, catalogue, search),
         windows=windows,
         parameters=calibrated_parameters(problem, fit),
         force=None if missing is None else missing.at_port,
@@ -234,7 +238,7 @@ def investigate(
     )
 
 
-def added_effects(fit: CandidateFit) -> tuple[str, ...]:
+def effect_labels(fit: CandidateFit) -> tuple[str, ...]:
     """Return the effects of a fit with their places, sorted, as `Hypothesis.labels` has them."""
     terms = fit.candidate.terms
     labels = [
@@ -253,8 +257,8 @@ def _remarks(
 ) -> list[str]:
     """Return the remarks on a verdict, without those on its residuals."""
     remarks = [*problem.campaign.remarks]
-    remarks += strained(problem, fit)
-    remarks += without_port(problem.setting, catalogue)
+    remarks += implausible_value_remarks(problem, fit)
+    remarks += missing_port_remark(problem.setting, catalogue)
     if verdict.kind not in KINDS_WITHOUT_GAP:
         remarks += exact_sensor_remarks(problem, search.no_effect)
     look_alikes = look_alike_remark(verdict, search.effects)
@@ -286,7 +290,7 @@ def _read_input(
     return campaign, model
 
 
-def checked(
+def check_and_prepare(
     campaign: Campaign, model: Model, *, hold_out: bool = True
 ) -> tuple[Campaign, tuple[DataFault, ...]]:
     """Return the campaign with outliers marked and trials held out, and the faults of its data.
@@ -319,11 +323,11 @@ def checked(
     return choose_held_out(campaign) if hold_out else campaign, faults
 
 
-def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
+def problem_without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     """Return the problem of a campaign and a model, with wrong readings at record ends left out.
 
-    The model need not describe the data well; `outliers.wrong_ends` states the rule. Each such
-    reading is reported by a remark.
+    The model need not describe the data well; `outliers.wrong_end_readings` states the rule. Each
+    such reading is reported by a remark.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
     from_start = fit_to(problem, Candidate(), problem.start(Candidate()))
@@ -342,7 +346,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
             # it counts as not known, which is 0 here.
             has_noise = [campaign.channels[name].noise is not None for name in trial.channels]
             noise = np.array(has_noise, dtype=float)
-            is_wrong = wrong_ends(residual, data.weight > 0.0, noise)
+            is_wrong = wrong_end_readings(residual, data.weight > 0.0, noise)
             is_wrong &= ~_accepts_outliers(campaign, trial)
             for column in np.flatnonzero(is_wrong.any(axis=0)):
                 count = int(is_wrong[:, column].sum())
@@ -362,7 +366,7 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
 def _accepts_outliers(campaign: Campaign, trial: Trial) -> BoolArray:
     """Return for which channels (C,) of a trial the campaign accepts readings like outliers."""
     word = FaultKind.OUTLIERS.value
-    return np.array([word in campaign.accepted(name, trial.name) for name in trial.channels])
+    return np.array([word in campaign.accepted_faults(name, trial.name) for name in trial.channels])
 
 
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:

@@ -118,7 +118,7 @@ def _show_understanding(understanding: "parts.LaboratoryImport") -> None:
         cells = sheet.columns[sheet.heads.index(column.head)]
         nonzero_rows = [row for row, cell in enumerate(cells) if re.search("[1-9]", cell)]
         row = nonzero_rows[0] if nonzero_rows else -1
-        si_value = column.in_si(understanding.decimals[sheet.name])[row]
+        si_value = column.cells_in_si(understanding.decimals[sheet.name])[row]
         rows.append(
             (
                 sheet.name,
@@ -167,7 +167,7 @@ def example(
     """Write a simulated campaign, with an effect hidden in it if asked for."""
     refuse_filled(out, "folder")
     chosen = parts.choose_model(model).model
-    plan = parts.plan_of(chosen)
+    plan = parts.usual_plan(chosen)
     patch = parts.ModelPatch()
     if effect:
         plain = parts.example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # it checks

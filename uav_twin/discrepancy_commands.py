@@ -1,7 +1,7 @@
 """`uav-twin discrepancy run`, `check` and `apply`: a verdict on a campaign, a patched model.
 
-`check` says what a campaign can decide before anything is fitted. The commands that make campaigns
-are in `discrepancy_campaigns`.
+`check` says what a campaign can decide before anything is fitted. The commands that make
+campaigns are in `discrepancy_campaigns`.
 """
 
 import dataclasses
@@ -71,7 +71,7 @@ def run(
     separability, self_calibration = _decidability(
         investigation, choice, catalogue, calibrate, seed
     )
-    pack = None if choice.design is None else partial(parts.packed_beside, choice)
+    pack = None if choice.design is None else partial(parts.pack_beside_verdict, choice)
     content = parts.ReportInput(
         investigation, origin, separability, self_calibration, choice.design, pack=pack
     )
@@ -183,7 +183,7 @@ def _conclude(
         terminal.say(f"Verdict: {folder}" if report is None else f"Report: {report}")
     if has_faulty_data:
         raise typer.Exit(1)
-    if not json and parts.gives(verdict, investigation.proof):
+    if not json and parts.has_applicable_effects(verdict, investigation.proof):
         terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 
@@ -267,7 +267,7 @@ def _show_verdict(content: "parts.ReportInput", folder: Path) -> None:
         intervals = [effect.intervals for effect in parts.read_patch(patch_file).effects]
         content = dataclasses.replace(content, intervals=intervals)
     terminal.say(f"Verdict: {content.investigation.verdict.kind.value}", bold=True)
-    options.show("run", words=WORDS, **parts.said_on_page(content))
+    options.show("run", words=WORDS, **parts.template_values(content))
 
 
 def check(
@@ -280,7 +280,7 @@ def check(
     """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""  # noqa: E501
     catalogue = parts.load_catalogue(effects or ())
     chosen = parts.choose_model(model).model
-    data, faults = parts.checked(parts.read_campaign(campaign), chosen)
+    data, faults = parts.check_and_prepare(parts.read_campaign(campaign), chosen)
     separability = None
     if not any(fault.fatal for fault in faults):
         with stage("What this campaign can decide"):
@@ -299,10 +299,10 @@ def check(
             model=chosen,
             faults=faults,
             catalogue=catalogue,
-            seen_of=parts.seen_of,
-            neighbours=parts.neighbours,
+            detectability_texts=parts.detectability_texts,
+            confused_effects=parts.confused_effects,
             group_lines=parts.group_lines,
-            needs=parts.needs,
+            campaign_needs=parts.campaign_needs,
         )
     if separability is None:
         raise terminal.error_exit(

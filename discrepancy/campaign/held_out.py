@@ -42,7 +42,7 @@ def choose_held_out(campaign: Campaign) -> Campaign:
     split: dict[str, tuple[Trial, Trial]] = {}
     for kind in TrialKind:
         trials = [trial for trial in campaign.trials if trial.kind is kind]
-        spared = _spared_trials(trials, campaign, held_out)
+        spared = _choose_trials(trials, campaign, held_out)
         held_out |= spared
         if not spared and kind in (TrialKind.STATIC, TrialKind.FLIGHT):
             for trial in trials:
@@ -55,11 +55,11 @@ def choose_held_out(campaign: Campaign) -> Campaign:
             trials_marked += split[trial.name]
         else:
             trials_marked.append(replace(trial, held_out=trial.name in held_out))
-    remark = _remark(trials_marked)
+    remark = _held_out_remark(trials_marked)
     return replace(campaign, trials=tuple(trials_marked), remarks=(*campaign.remarks, remark))
 
 
-def _remark(trials: Sequence[Trial]) -> str:
+def _held_out_remark(trials: Sequence[Trial]) -> str:
     """Return the sentence on which of the trials are held out."""
     names = [trial.name for trial in trials if trial.held_out]
     if names:
@@ -70,7 +70,7 @@ def _remark(trials: Sequence[Trial]) -> str:
     )
 
 
-def _spared_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[str]) -> set[str]:
+def _choose_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[str]) -> set[str]:
     """Choose the trials of one kind to hold out, and return their names.
 
     At most a quarter are chosen, in the order of `_order_of_candidates`, and only trials whose

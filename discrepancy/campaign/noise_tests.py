@@ -172,7 +172,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     return rho, pair_counts[1:] / pair_counts[0] ** 2
 
 
-def times_fewer(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> float:
+def statistical_inefficiency(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> float:
     """Return the number of samples over the effective number of independent ones.
 
     For a variance estimate this factor is 1 + 2 sum_k rho_k^2. Estimated autocorrelations are not
@@ -300,7 +300,7 @@ def fisher_g(series: FloatArray) -> tuple[float, float, int]:
     return g, float(-np.expm1(-first_term)), largest + 1
 
 
-def combine(p_values: Sequence[float]) -> float:
+def combine_p_values(p_values: Sequence[float]) -> float:
     """Combine independent p-values into one: twice the lesser of Fisher's and Bonferroni's.
 
     Fisher's sum -2 sum log p detects many small departures, and Bonferroni's least p-value a single
@@ -314,7 +314,7 @@ def combine(p_values: Sequence[float]) -> float:
     return float(min(1.0, 2.0 * min(fisher, bonferroni)))
 
 
-def holm(p_values: Sequence[float], level: float) -> tuple[bool, ...]:
+def holm_rejections(p_values: Sequence[float], level: float) -> tuple[bool, ...]:
     """Return which null hypotheses Holm's rule rejects (Holm 1979, Scand. J. Statist. 6, 65-70).
 
     A p-value of nan stands for a test that was not made, and is never rejected.

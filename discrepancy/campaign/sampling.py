@@ -45,7 +45,7 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     Returns
     -------
     (N,) ndarray
-        Times [s]; see `as_meant`.
+        Times [s]; see `undo_rounding`.
 
     Raises
     ------
@@ -61,11 +61,11 @@ def check_sampling(time: FloatArray, cells: Sequence[str], user: str, file: str)
     steps = np.diff(time)
     least = int(np.argmin(steps))
     if steps[least] <= 0.0:
-        raise CampaignDataError(time_goes_back(file, user, cells, least))
-    return as_meant(time, cells)
+        raise CampaignDataError(decreasing_times_message(file, user, cells, least))
+    return undo_rounding(time, cells)
 
 
-def time_goes_back(file: str, user: str, cells: Sequence[str], index: int) -> str:
+def decreasing_times_message(file: str, user: str, cells: Sequence[str], index: int) -> str:
     """Return the message that the times of a record do not increase.
 
     Parameters
@@ -84,7 +84,7 @@ def time_goes_back(file: str, user: str, cells: Sequence[str], index: int) -> st
     )
 
 
-def as_meant(time: FloatArray, cells: Sequence[str]) -> FloatArray:
+def undo_rounding(time: FloatArray, cells: Sequence[str]) -> FloatArray:
     """Undo the rounding of printed times: return them evenly spaced if rounding explains the rest.
 
     Times that were printed with few decimals are not evenly spaced even if the samples were. They
@@ -137,7 +137,7 @@ def is_even(time: FloatArray) -> bool:
     return unevenness(time) <= EVEN
 
 
-def nearly_even(time: FloatArray) -> bool:
+def is_nearly_even(time: FloatArray) -> bool:
     """Return whether every step of times (N,) is within a tenth of the mean step.
 
     A filter for evenly spaced samples then still holds.

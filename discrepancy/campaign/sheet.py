@@ -21,7 +21,7 @@ from discrepancy.campaign.cells import (
     plain_number,
     seconds_of_clock_times,
 )
-from discrepancy.campaign.heads import named
+from discrepancy.campaign.heads import split_head
 from discrepancy.campaign.matlab_file import read_matlab
 from discrepancy.campaign.table_layout import SEPARATORS, Rows, find_table
 from discrepancy.errors import CampaignFileError
@@ -163,7 +163,7 @@ def _sheet_of_rows(
     columns: list[tuple[str, ...]] = []
     left_out = ""
     for index, title in enumerate(layout.head):
-        head, unit = named(title or f"column {index + 1}", layout.units[index])
+        head, unit = split_head(title or f"column {index + 1}", layout.units[index])
         cells = cells_of_columns[index]
         if index in seconds_of_columns:
             unit = "s"
@@ -186,7 +186,7 @@ def _sheet_of_rows(
     return Sheet(
         name=name,
         digest=hash_file(file),
-        heads=tuple(_numbered(heads)),
+        heads=tuple(_number_repeated_heads(heads)),
         units=tuple(units),
         columns=tuple(columns),
         lines=lines,
@@ -209,7 +209,7 @@ def _remark_on_texts(title: str, numbers: int, texts: int) -> str:
     return f"; the column {title!r} holds {content} and is left out"
 
 
-def _numbered(heads: Sequence[str]) -> list[str]:
+def _number_repeated_heads(heads: Sequence[str]) -> list[str]:
     """Make heads unique: the second one of a name gets the number 2, and so on."""
     numbered = []
     for index, head in enumerate(heads):

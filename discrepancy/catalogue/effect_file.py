@@ -24,11 +24,12 @@ A TOML file describes one effect at its top level, or several as tables `[[effec
     station = "0.5 * length"
 
 Keys that may be left out: `confusable` (identifiers), `places` (names, or a word of `PLACES` such
-as "ports"), `preferred` (ports of a wing that stand for its others), `needs` (words of `NEEDS`),
-`spectral` (see `Effect`), `[[shape]]` (as a parameter, with `canonical` in place of `unit` and
-`magnitude`), `levels` of a parameter. Names in arithmetic are the parameters and `SCALES`. Text
-values of a primitive (port, channel, run) are taken as they are; "place" stands for the place,
-"quantity of the place" for what it measures. A primitive with `if` is left out where that is zero.
+as "ports"), `preferred` (ports of a wing that stand for its others), `campaign_needs` (words of
+`NEEDS`), `spectral` (see `Effect`), `[[shape]]` (as a parameter, with `canonical` in place of
+`unit` and `magnitude`), `levels` of a parameter. Names in arithmetic are the parameters and
+`SCALES`. Text values of a primitive (port, channel, run) are taken as they are; "place" stands for
+the place, "quantity of the place" for what it measures. A primitive with `if` is left out where
+that is zero.
 
 Time and events of the campaign (`docs/when.md`)::
 
@@ -62,7 +63,7 @@ from discrepancy.catalogue.effect_in_setting import (
     Target,
 )
 from discrepancy.catalogue.entry import Effect, EffectKeys, Setting
-from discrepancy.catalogue.needs import NEEDS, reason_against
+from discrepancy.catalogue.needs import NEEDS, untestable_reason
 from discrepancy.catalogue.places import PLACES, places_of
 from discrepancy.catalogue.scale_names import SCALES, SHAPES_OF_SCALES, BuildContext
 from discrepancy.errors import CatalogueError
@@ -120,8 +121,8 @@ def _effect(table: object, place: str) -> Effect:
         _primitive_template(row, names, moments, f"{place}, primitives {number}")
         for number, row in enumerate(section.primitives, start=1)
     )
-    _check_trials_of_courses(section, templates)
-    effect = _EffectOfFile(section, templates)
+    _check_acts_on_dynamic_trials(section, templates)
+    effect = _EffectFunctions(section, templates)
     return Effect(
         build=effect.build,
         places=effect.places,
@@ -167,14 +168,14 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
         raise CatalogueError(f"{place} has no [[primitives]].")
 
 
-def _check_trials_of_courses(
+def _check_acts_on_dynamic_trials(
     section: EffectSection, templates: Sequence["_PrimitiveTemplate"]
 ) -> None:
     """Refuse an effect on static or flight trials that has primitives which depend on time."""
     timed = [
         template
         for template in templates
-        if template.in_windows or PRIMITIVES[template.kind].formula_fields
+        if template.acts_in_windows or PRIMITIVES[template.kind].formula_fields
     ]
     if not timed:
         return
@@ -217,7 +218,7 @@ class _PrimitiveTemplate:
     moments: frozenset[str]
 
     @property
-    def in_windows(self) -> bool:
+    def acts_in_windows(self) -> bool:
         """Whether the primitive acts only in a window of time."""
         return "begin" in self.conditions or "end" in self.conditions
 
@@ -232,7 +233,7 @@ class _PrimitiveTemplate:
             numbers[name] = SCALES[name](context)
         if "if" in self.conditions and self.conditions["if"].value(numbers) == 0.0:
             return
-        if not self.moments and not self.in_windows:
+        if not self.moments and not self.acts_in_windows:
             yield self._primitive(numbers, context.target)
             return
         for trial in context.setting.campaign.trials:
@@ -271,14 +272,14 @@ class _PrimitiveTemplate:
         """
         # texts of a primitive that stand for the place of the effect
         words = {"place": target.name, "quantity of the place": target.quantity}
-        courses = PRIMITIVES[self.kind].formula_fields
+        formulas = PRIMITIVES[self.kind].formula_fields
         row: dict[str, str | float] = {}
         for name, value in self.values.items():
             if isinstance(value, str):
                 row[name] = words.get(value, value)
             elif not isinstance(value, Expression):
                 row[name] = value
-            elif name in courses:  # a formula in time stays a formula
+            elif name in formulas:  # a formula in time stays a formula
                 used_numbers = {key: numbers[key] for key in value.used_names() if key in numbers}
                 row[name] = value.with_numbers(used_numbers)
             else:
@@ -368,7 +369,7 @@ def _check_values(kind: str, values: Mapping[str, str | float | Expression]) -> 
 
 
 @dataclass(frozen=True)
-class _EffectOfFile:
+class _EffectFunctions:
     """The functions of an `Effect` that a file describes.
 
     Attributes
@@ -396,7 +397,7 @@ class _EffectOfFile:
 
     def unavailable(self, setting: Setting) -> str | None:
         """Return why it cannot be tested, or None."""
-        return reason_against(self._in_setting(setting))
+        return untestable_reason(self._in_setting(setting))
 
     def build(self, setting: Setting, values: Mapping[str, float], place: str) -> ModelPatch:
         """Return the patch of the effect.

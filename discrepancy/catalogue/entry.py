@@ -57,7 +57,7 @@ class Prior:
             return exp(mean + deviation * u)
         return mean + deviation * u
 
-    def normal(self, value: float) -> float:
+    def standard_normal(self, value: float) -> float:
         """Return the standard normal variable of a value: the inverse of the method `value`."""
         if self.shape == "uniform":
             probability = (value - self.low) / (self.high - self.low)
@@ -67,7 +67,7 @@ class Prior:
             value = log(value)
         return (value - mean) / deviation
 
-    def stepped(self, u: float, step: float) -> float:
+    def step_within_prior(self, u: float, step: float) -> float:
         """Return the standard normal variable after a step of an iteration.
 
         A prediction that is proportional to a log-normal value x is not linear in u, but linear in

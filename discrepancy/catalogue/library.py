@@ -90,7 +90,7 @@ def load_catalogue(
             effects.append(effect_or_file)
         else:
             effects += effects_of_file(effect_or_file)
-    check(effects)
+    check_effects(effects)
     return tuple(effects)
 
 
@@ -104,7 +104,7 @@ def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
     return known[identifier]
 
 
-def in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
+def variants_in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
     """Return variants of effects that act only during an event, as further hypotheses.
 
     Such a variant acts in all trials that have the event, also in held-out ones, from the begin of
@@ -130,7 +130,7 @@ def in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]
         return ()
     switchable_effects = [effect for effect in effects if _can_act_in_windows(effect, setting)]
     return tuple(
-        _during_event(effect, name, setting)
+        _variant_in_event(effect, name, setting)
         for name in event_names
         for effect in switchable_effects
     )
@@ -156,7 +156,7 @@ def _can_act_in_windows(effect: Effect, setting: Setting) -> bool:
     return setting.model.follows_windows or only_sensors
 
 
-def _during_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
+def _variant_in_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
     """Return the variant of an effect that acts only during all events of a name."""
     windows: list[Window] = []
     for event in setting.campaign.events:
@@ -176,12 +176,12 @@ def _during_event(effect: Effect, event_name: str, setting: Setting) -> Effect:
     )
 
 
-def check(effects: Iterable[Effect]) -> None:
+def check_effects(effects: Iterable[Effect]) -> None:
     """Raise `CatalogueError` for the first effect that is not valid, or if identifiers clash."""
     effects = tuple(effects)
     counts = Counter(effect.identifier for effect in effects)
     for effect in effects:
-        for fault in _faults(effect):
+        for fault in _effect_faults(effect):
             raise CatalogueError(f"The effect {effect.identifier!r}{fault}")
     for identifier, count in counts.items():
         if count > 1:
@@ -197,7 +197,7 @@ def check(effects: Iterable[Effect]) -> None:
                 )
 
 
-def _faults(effect: Effect) -> Iterator[str]:
+def _effect_faults(effect: Effect) -> Iterator[str]:
     """Yield the faults of an effect, each as the end of a sentence that begins with the effect."""
     if not (effect.name and _IDENTIFIER.fullmatch(str(effect.identifier))):
         yield " must have a name, and an identifier of lower-case letters, digits and underscores."

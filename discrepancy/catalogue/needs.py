@@ -179,7 +179,7 @@ NEEDS: dict[str, Callable[[EffectInSetting], str | None]] = {
 """Functions that return why a need is not met, or None, by the word in the file."""
 
 
-def reason_against(effect: EffectInSetting) -> str | None:
+def untestable_reason(effect: EffectInSetting) -> str | None:
     """Return why an effect cannot be tested: the first of its needs that is not met.
 
     None if all are.

@@ -5,7 +5,7 @@ from math import isinf
 
 import numpy as np
 
-from discrepancy.campaign.noise import MAINS, aliased
+from discrepancy.campaign.noise import MAINS, aliased_frequency
 from discrepancy.campaign.records import FloatArray, Quantity
 from discrepancy.catalogue.effect_in_setting import (
     ALL,
@@ -19,7 +19,7 @@ from discrepancy.catalogue.entry import Setting
 from fe.runtime.patch import EVERY_CHANNEL
 
 
-def _or_all(names: Names) -> Names:
+def _with_place_of_all(names: Names) -> Names:
     """Return places, with the place of all channels before them if there are several."""
     return (EVERY_CHANNEL, *names) if len(names) > 1 else names
 
@@ -53,7 +53,7 @@ def _calibrated_channels(effect: EffectInSetting) -> Names:
     return effect.channels_of(lambda channel: not isinf(channel.gain_deviation))
 
 
-def _timed_gauges(effect: EffectInSetting) -> Names:
+def _gauges_read_repeatedly(effect: EffectInSetting) -> Names:
     """Return the strain gauges (without gauges, all channels) that were read at several times."""
     places = []
     for name in effect.strain_channels or effect.channels_of():
@@ -102,7 +102,7 @@ def mains_lines(setting: Setting) -> Names:
         counts = []
         for trial in trials:
             duration = float(trial.time[-1] - trial.time[0])
-            counts.append(aliased(frequency, trial.interval) * duration)
+            counts.append(aliased_frequency(frequency, trial.interval) * duration)
         return np.array(counts)
 
     groups: list[list[float]] = []
@@ -137,10 +137,10 @@ def _lines_in_channels(effect: EffectInSetting) -> Names:
 PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports": lambda effect: effect.setting.model.ports,
     "channels": EffectInSetting.channels_of,
-    "channels, or all": lambda effect: _or_all(effect.channels_of()),
+    "channels, or all": lambda effect: _with_place_of_all(effect.channels_of()),
     CHANNELS_OR_ALL_OF_A_QUANTITY: _channels_or_all_of_a_quantity,
     "strain channels": lambda effect: effect.strain_channels,
-    "strain channels, or all": lambda effect: _or_all(effect.strain_channels),
+    "strain channels, or all": lambda effect: _with_place_of_all(effect.strain_channels),
     "runs": _runs,
     "ports of forces": EffectInSetting.force_ports,
     "held ports": _held_ports,
@@ -149,7 +149,7 @@ PLACES: dict[str, Callable[[EffectInSetting], Names]] = {
     "ports of states": lambda effect: effect.state_ports,
     "ports of states, or all": _state_ports_or_all,
     "calibrated channels": _calibrated_channels,
-    "timed gauges": _timed_gauges,
+    "timed gauges": _gauges_read_repeatedly,
     "zeroed runs": _zeroed_runs,
     "loggers": _loggers,
     "mains lines": _lines_in_channels,

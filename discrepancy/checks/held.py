@@ -14,7 +14,7 @@ from discrepancy.campaign.records import (
     TrialKind,
 )
 from discrepancy.campaign.sampling import lattice_step, least_beyond_rounding, quantum_of
-from discrepancy.checks.fault import DataFault, FaultKind, place_of
+from discrepancy.checks.fault import DataFault, FaultKind, samples_text
 
 LEAST_HELD = 8
 """Fewest equal readings in a row that are examined."""
@@ -61,7 +61,7 @@ def roughness(values: FloatArray) -> float:
     return float(1.4826 * np.median(np.abs(differences)) / np.sqrt(924.0))
 
 
-def runs_of(flags: BoolArray) -> IntArray:
+def runs_of_true(flags: BoolArray) -> IntArray:
     """Return the runs of consecutive true entries in an array of flags.
 
     Returns
@@ -74,11 +74,11 @@ def runs_of(flags: BoolArray) -> IntArray:
     return np.stack((edges[::2], edges[1::2]), axis=1)
 
 
-def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
+def stuck_sensor_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
     """Yield a fault for each span of a dynamic trial in which a sensor or its logger was stuck.
 
-    `held_spans` distinguishes such a span of equal readings from a true standstill of the structure
-    and from a coarse digital converter.
+    `stuck_spans` distinguishes such a span of equal readings from a true standstill of the
+    structure and from a coarse digital converter.
     """
     series = [trial.values]
     series += [recorded.values[:, np.newaxis] for recorded in trial.inputs]
@@ -87,7 +87,7 @@ def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
     recorded_values = np.concatenate(series, axis=1)
     for column, name in enumerate(trial.channels):
         channel = campaign.channels[name]
-        spans = held_spans(
+        spans = stuck_spans(
             trial.values[:, column],
             trial.used[:, column],
             np.delete(recorded_values, column, axis=1),
@@ -96,8 +96,8 @@ def held_faults(campaign: Campaign, trial: Trial) -> Iterator[DataFault]:
         for start, stop in spans:
             sentence = (
                 f"The channel {name!r} holds one value over {stop - start} samples within a "
-                f"motion, in {place_of(channel, trial, start, stop)}: empty these cells, or leave "
-                "the channel out of the trial, and check sensor and logger."
+                f"motion, in {samples_text(channel, trial, start, stop)}: empty these cells, or "
+                "leave the channel out of the trial, and check sensor and logger."
             )
             yield DataFault(FaultKind.FROZEN, sentence, name, trial.name)
 
@@ -111,7 +111,7 @@ class _RunsOfRecord(NamedTuple):
         The record.
     changes : (N + 1,) ndarray
         Absolute change into each sample; the last entry is zero.
-    digit : float
+    quantum : float
         Quantum of the record.
     bounds : (R, 2) ndarray of int
         First sample of each run, and the one after its last.
@@ -121,13 +121,13 @@ class _RunsOfRecord(NamedTuple):
 
     values: FloatArray
     changes: FloatArray
-    digit: float
+    quantum: float
     bounds: IntArray
     lengths: IntArray
 
 
-def held_spans(
-    values: FloatArray, used: BoolArray, others: FloatArray, noise: float = 0.0
+def stuck_spans(
+    values: FloatArray, used: BoolArray, other_records: FloatArray, noise: float = 0.0
 ) -> list[tuple[int, int]]:
     """Return the runs of equal readings that show a failure of a sensor or logger.
 
@@ -149,7 +149,7 @@ def held_spans(
         A record in time.
     used : (N,) ndarray of bool
         False for samples that are left out.
-    others : (N, K) ndarray
+    other_records : (N, K) ndarray
         The records of the K other channels and inputs of the trial.
     noise : float
         Standard deviation of the channel's noise; 0 if it is not known.
@@ -160,7 +160,7 @@ def held_spans(
         First sample of each run, and the one after its last.
     """
     is_equal_to_next = (np.diff(values) == 0.0) & used[1:] & used[:-1]
-    bounds_of_runs = runs_of(is_equal_to_next) + np.array([0, 1])
+    bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
     lengths = bounds_of_runs[:, 1] - bounds_of_runs[:, 0]
     long_runs = bounds_of_runs[lengths >= LEAST_HELD].tolist()
     distinct = np.unique(values)
@@ -169,19 +169,25 @@ def held_spans(
     # runs at an extreme value are clipped, which is another fault
     extremes = (distinct[0], distinct[-1])
     inner_runs = [(start, stop) for start, stop in long_runs if values[start] not in extremes]
-    quantum = _digit_in_time(values)
+    quantum = _quantum_in_time(values)
     if min(noise, roughness(values)) > _NOISE_DIGITS * quantum:
         least_length = _LEAST_UPDATES * update_length(values)
         return [(start, stop) for start, stop in inner_runs if stop - start >= least_length]
     changes = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))
     runs = _RunsOfRecord(values, changes, quantum, bounds_of_runs, lengths)
-    return [(start, stop) for start, stop in inner_runs if _is_failure(start, stop, runs, others)]
+    return [
+        (start, stop)
+        for start, stop in inner_runs
+        if _is_sensor_failure(start, stop, runs, other_records)
+    ]
 
 
-def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) -> bool:
+def _is_sensor_failure(
+    start: int, stop: int, runs: _RunsOfRecord, other_records: FloatArray
+) -> bool:
     """Return whether a run in a record without much noise is a failure and not a rest.
 
-    `held_spans` states the rules.
+    `stuck_spans` states the rules.
 
     Parameters
     ----------
@@ -189,11 +195,11 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
         First sample of the run, and the one after its last.
     runs : _RunsOfRecord
         The record and all its runs.
-    others : (N, K) ndarray
+    other_records : (N, K) ndarray
         The other records.
     """
     length = stop - start
-    least_jump = _JUMP * runs.digit
+    least_jump = _JUMP * runs.quantum
     if max(runs.changes[start], runs.changes[stop]) < least_jump:
         return False
 
@@ -228,9 +234,12 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
     sides_at_speed = np.count_nonzero(runs.changes[[start, stop]] >= speed)
 
     # do other records move meanwhile, compared with windows of the same length around?
-    ranges = [np.ptp(others[first : first + length], axis=0) for first in window_starts]
+    ranges = [
+        np.ptp(other_records[window_start : window_start + length], axis=0)
+        for window_start in window_starts
+    ]
     usual_range = np.median(ranges, axis=0)
-    range_meanwhile = np.ptp(others[start:stop], axis=0)
+    range_meanwhile = np.ptp(other_records[start:stop], axis=0)
     moves = (range_meanwhile > _MOVING * usual_range) & (usual_range > 0.0)
     another_moves = bool(np.any(moves))
     another_rests = not another_moves and bool(np.any(range_meanwhile < _RESTING * usual_range))
@@ -240,7 +249,7 @@ def _is_failure(start: int, stop: int, runs: _RunsOfRecord, others: FloatArray) 
     return sides_at_speed == 1 and another_moves and is_only_one
 
 
-def _digit_in_time(values: FloatArray) -> float:
+def _quantum_in_time(values: FloatArray) -> float:
     """Return the quantum of the readings (N,) of a record in time.
 
     Readings that rise steadily may differ by several quanta at every step. Their second differences

@@ -10,9 +10,9 @@ import numpy as np
 from discrepancy.campaign.records import Campaign, FloatArray, Hold, Trial, TrialKind
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.catalogue.entry import Setting
-from discrepancy.checks.fault import DataFault, FaultKind, with_acceptance
+from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
 from discrepancy.checks.quality import dead_fault, is_still
-from discrepancy.checks.rest import rest_faults
+from discrepancy.checks.rest import noise_record_faults
 from discrepancy.checks.scales import ABOVE_NOISE, data_scales, swap_fault, swapped_channels
 from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.fits.candidate import Candidate
@@ -29,7 +29,7 @@ MOST_OF_PRIOR = 0.9
 """Fraction of its prior standard deviation above which a parameter is not observable."""
 
 
-def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
+def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, float]:
     """Return how much the records determine each calibrated parameter.
 
     The measure is the posterior standard deviation over the prior one, from the information matrix
@@ -62,12 +62,12 @@ def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
     }
 
 
-def unobservable(campaign: Campaign, model: Model) -> Iterator[DataFault]:
+def unobservable_parameter_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     """Yield one fault that names the calibrated parameters that the records do not determine.
 
     Those keep more than `MOST_OF_PRIOR` of their prior standard deviation.
     """
-    ratios = posterior_over_prior(campaign, model)
+    ratios = posterior_to_prior_ratios(campaign, model)
     undetermined = {name: ratio for name, ratio in ratios.items() if ratio > MOST_OF_PRIOR}
     if undetermined:
         names = ", ".join(f"{name!r} ({ratio:.0%})" for name, ratio in undetermined.items())
@@ -118,10 +118,10 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     if model.oscillates:
         frequency = model.scales(campaign).angular_frequency / (2.0 * pi)
         faults += _length_faults(campaign, frequency)
-        faults += rest_faults(campaign, frequency)
+        faults += noise_record_faults(campaign, frequency)
     predictions: dict[str, FloatArray] = {}
     for trial in campaign.trials:
-        conditions = prior_mean(campaign, model, trial)
+        conditions = prior_conditions(campaign, model, trial)
         predictions[trial.name] = observe(model, campaign, trial, ModelPatch(), conditions).values
     faults += _dead_faults(campaign, predictions)
     scales = data_scales(campaign, predictions)
@@ -134,12 +134,12 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
     for trial in campaign.trials:
         faults += _hold_faults(campaign, model, trial)
     if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
-        faults += unobservable(campaign, model)
+        faults += unobservable_parameter_faults(campaign, model)
     faults += [swap_fault(first, second) for first, second in swaps]
-    return with_acceptance(faults, campaign)
+    return mark_accepted(faults, campaign)
 
 
-def prior_mean(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
+def prior_conditions(campaign: Campaign, model: Model, trial: Trial) -> Conditions:
     """Return the conditions under which a trial is simulated before any fit.
 
     The parameters have their prior means, the release its nominal displacement, the clock no error.
@@ -186,7 +186,7 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
     smooth_trial = replace(
         trial, inputs=smooth_inputs, hold=Hold.SMOOTH if force_is_open else trial.hold
     )
-    conditions = prior_mean(campaign, model, trial)
+    conditions = prior_conditions(campaign, model, trial)
     response_to_lines = observe(model, campaign, trial, ModelPatch(), conditions).values
     response_to_curves = observe(model, campaign, smooth_trial, ModelPatch(), conditions).values
     # infinite without a noise record, so that the difference counts as zero
@@ -219,7 +219,7 @@ def _output_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
                 f"{model.name} does not have: correct `output`, or leave the channel out."
             )
             yield DataFault(FaultKind.MISSING_OUTPUT, sentence, name)
-        elif not channel.quantity.shows(quantity):
+        elif not channel.quantity.can_measure(quantity):
             sentence = (
                 f"The channel {name!r} measures {channel.quantity.value}, but the output "
                 f"{channel.output!r} of {model.name} is {quantity.value}: correct `quantity` or "
@@ -231,7 +231,8 @@ def _output_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
 def _length_faults(campaign: Campaign, frequency: float) -> Iterator[DataFault]:
     """Yield a fault for each record that is too short, or sampled too slowly, for the first mode.
 
-    A driven trial is long enough if the parameters are observable in it; see `unobservable`.
+    A driven trial is long enough if the parameters are observable in it; see
+    `unobservable_parameter_faults`.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ from discrepancy.checks.local_polynomial import (
     Weights,
     even_weights,
     event_patterns,
-    weights_at,
+    weights_for_times,
 )
 from discrepancy.checks.row_outliers import NORMAL_OVER_MAD, repeat_outliers, row_outlier
 
@@ -74,7 +74,7 @@ def mark_outliers(campaign: Campaign) -> Campaign:
         count = int(is_outlier.sum())
         total = len(is_outlier)
         too_many = trial.is_dynamic and count > LARGEST_SHARE * total
-        if too_many or "outliers" in campaign.accepted(channel, trial.name):
+        if too_many or "outliers" in campaign.accepted_faults(channel, trial.name):
             continue
         used[trial.name][is_outlier, trial.channels.index(channel)] = False
         outliers = "is an outlier" if count == 1 else "are outliers"
@@ -99,7 +99,9 @@ def find_outliers(campaign: Campaign) -> Iterator[tuple[Trial, str, BoolArray]]:
         Which of its readings are outliers.
     """
     # all channels of a trial have its times
-    weights = {trial.name: weights_at(trial.time) for trial in campaign.trials if trial.is_dynamic}
+    weights = {
+        trial.name: weights_for_times(trial.time) for trial in campaign.trials if trial.is_dynamic
+    }
     for name, channel in campaign.channels.items():
         outliers_of_repeats = repeat_outliers(campaign, channel)
         for trial, values, used in campaign.records(name):
@@ -157,13 +159,13 @@ def sample_outliers(
 
     # readings within the noise are no outliers
     noise_limit = SIGNIFICANT * noise / largest_reading
-    suspects, cleaned = _suspects(record, polynomial, rounding, noise_limit)
+    suspects, cleaned = _find_suspects(record, polynomial, rounding, noise_limit)
     # judge the suspects again, now with clean neighbours
     residual = polynomial.residual(cleaned)
     weight_of_sample = polynomial.weight_of_sample(count)
     deviation = np.abs((record - cleaned) * weight_of_sample + residual)
     is_beyond_noise = deviation > noise_limit
-    is_beyond_scatter = deviation > SIGNIFICANT * _scale(residual, rounding)
+    is_beyond_scatter = deviation > SIGNIFICANT * _comparison_deviation(residual, rounding)
     outliers = used & suspects & is_beyond_noise & is_beyond_scatter
     # three outliers among five samples in a row are an event and not single wrong readings
     is_crowded = np.convolve(outliers, np.ones(5), mode="same") >= 3
@@ -182,7 +184,7 @@ def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
     return min(polynomials, key=lambda polynomial: _scatter(polynomial.residual(record)))
 
 
-def _suspects(
+def _find_suspects(
     record: FloatArray, polynomial: LocalPolynomial, rounding: float, noise_limit: float
 ) -> tuple[BoolArray, FloatArray]:
     """Find the samples that may be outliers, and replace them by their predictions.
@@ -215,19 +217,19 @@ def _suspects(
     edge = _EDGE if polynomial.degree == LOW_DEGREE else polynomial.width
     for _ in range(_PASSES):
         residual = polynomial.residual(cleaned)
-        ratio = np.abs(residual) / _scale(residual, rounding)
+        ratio = np.abs(residual) / _comparison_deviation(residual, rounding)
         ratio[:edge] = 0.0
         ratio[-edge:] = 0.0
         neighbourhood = 2 * polynomial.width + 1
         is_worst = ratio == maximum_filter1d(ratio, neighbourhood, mode="constant")
         is_beyond_noise = np.abs(residual) > noise_limit
         is_significant = (ratio > SIGNIFICANT) & is_beyond_noise & is_worst
-        new = np.flatnonzero(is_significant & ~suspects & ~events)
-        if not new.size:
+        new_indices = np.flatnonzero(is_significant & ~suspects & ~events)
+        if not new_indices.size:
             break
-        at_event = np.array([_is_event(residual, int(index), polynomial) for index in new])
-        events[new[at_event]] = True
-        new_suspects = new[~at_event]
+        at_event = np.array([_is_event(residual, int(index), polynomial) for index in new_indices])
+        events[new_indices[at_event]] = True
+        new_suspects = new_indices[~at_event]
         suspects[new_suspects] = True
         # for unevenly spaced samples the weight of a sample in its own residual is not one
         correction = residual / polynomial.weight_of_sample(count)
@@ -235,7 +237,9 @@ def _suspects(
     return suspects, cleaned
 
 
-def wrong_ends(residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0) -> BoolArray:
+def wrong_end_readings(
+    residual: FloatArray, used: BoolArray, noise: FloatArray | float = 0.0
+) -> BoolArray:
     """Return which of the first and last three samples of records are single wrong readings.
 
     `sample_outliers` does not judge these samples, because they lack neighbours on one side. The
@@ -334,7 +338,7 @@ def _scatter(residual: FloatArray) -> float:
     return NORMAL_OVER_MAD * float(np.median(np.abs(residual[_EDGE:-_EDGE])))
 
 
-def _scale(residual: FloatArray, least: float) -> FloatArray:
+def _comparison_deviation(residual: FloatArray, least: float) -> FloatArray:
     """Return the robust standard deviation (N,) with which each residual (N,) is compared.
 
     It is that of the whole record or that of the samples around it, whichever is larger, and at

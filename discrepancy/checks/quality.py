@@ -15,10 +15,10 @@ from discrepancy.campaign.noise_records import repeat_record
 from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArray, Trial
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.checks.copies import copy_faults
-from discrepancy.checks.fault import DataFault, FaultKind, with_acceptance
-from discrepancy.checks.held import held_faults, roughness, runs_of, update_length
+from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
+from discrepancy.checks.held import roughness, runs_of_true, stuck_sensor_faults, update_length
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
-from discrepancy.checks.rest import rest_faults
+from discrepancy.checks.rest import noise_record_faults
 
 CLIPPED_RUN = 3
 """Fewest samples in a row at an extreme value that make a record clipped."""
@@ -45,11 +45,11 @@ def check_data(campaign: Campaign) -> tuple[DataFault, ...]:
         for column, name in enumerate(trial.channels):
             faults += _clipped_faults(trial, name, trial.values[:, column], trial.used[:, column])
         if trial.is_dynamic:
-            faults += held_faults(campaign, trial)
+            faults += stuck_sensor_faults(campaign, trial)
     faults += copy_faults(campaign)
-    faults += rest_faults(campaign)
+    faults += noise_record_faults(campaign)
     faults += _outlier_faults(campaign)
-    return with_acceptance(faults, campaign)
+    return mark_accepted(faults, campaign)
 
 
 def _outlier_faults(campaign: Campaign) -> Iterator[DataFault]:
@@ -199,7 +199,7 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
     digit = quantum_of(values)
     least_length = CLIPPED_RUN * (update_length(values) if load is None else 1.0)
     longest = 0
-    for start, stop in runs_of(values == extreme).tolist():
+    for start, stop in runs_of_true(values == extreme).tolist():
         if stop - start < max(least_length, longest + 1):
             continue
         if load is None:

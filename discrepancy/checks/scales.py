@@ -222,16 +222,16 @@ def swapped_channels(
     return swaps
 
 
-def swap_fault(first: str, second: str) -> DataFault:
+def swap_fault(first_channel: str, second_channel: str) -> DataFault:
     """Return the fault of two channels that are swapped."""
     sentence = (
-        f"The channels {first!r} and {second!r} fit the model clearly better exchanged: see which "
-        "wire or column is which, and exchange their `column` or `output`."
+        f"The channels {first_channel!r} and {second_channel!r} fit the model clearly better "
+        "exchanged: see which wire or column is which, and exchange their `column` or `output`."
     )
-    return DataFault(FaultKind.SWAPPED, sentence, first)
+    return DataFault(FaultKind.SWAPPED, sentence, first_channel)
 
 
-def _exchange_is_better(misfits: FloatArray, first: int, second: int) -> bool:
+def _exchange_is_better(misfits: FloatArray, first_index: int, second_index: int) -> bool:
     """Return whether two channels fit clearly better if they are exchanged.
 
     Each misfit must become less than half, and their sum must fall by more than 30.
@@ -240,11 +240,11 @@ def _exchange_is_better(misfits: FloatArray, first: int, second: int) -> bool:
     ----------
     misfits : (C, C) ndarray
         Chi-squared of each channel (row) to the prediction of each channel (column).
-    first, second : int
+    first_index, second_index : int
         Indices of the two channels.
     """
-    pair = [first, second]
-    exchanged = [second, first]
+    pair = [first_index, second_index]
+    exchanged = [second_index, first_index]
     before = misfits[pair, pair]
     after = misfits[pair, exchanged]
     return bool(np.all(after < 0.5 * before) and np.sum(before - after) > 30.0)

@@ -8,7 +8,7 @@ from statistics import median
 from typing import NamedTuple
 
 from discrepancy.campaign.records import Campaign, Quantity, Trial, TrialKind
-from discrepancy.campaign.units import UNITS, conversion_of
+from discrepancy.campaign.units import UNITS, factor_to_si
 from discrepancy.checks.fault import DataFault, FaultKind
 
 _DRIVES = {
@@ -73,7 +73,7 @@ class Slip(NamedTuple):
         return f"({meant} given as {stated}?)"
 
 
-def slip_between(
+def find_slip(
     scale: float, quantity: Quantity, stated: str = "", *, drive: bool = False
 ) -> Slip | None:
     """Return the two units of a quantity whose confusion best explains a ratio of data to model.
@@ -100,7 +100,7 @@ def slip_between(
     names = {*UNITS[quantity].usual}
     if stated:
         names.add(stated)
-    units_in_si = {unit: conversion_of(quantity, unit) for unit in sorted(names)}
+    units_in_si = {unit: factor_to_si(quantity, unit) for unit in sorted(names)}
     units_in_si |= UNITS[quantity].foreign
     distances: dict[Slip, float] = {}
     for assumed, assumed_in_si in units_in_si.items():
@@ -143,7 +143,7 @@ def unit_slips(campaign: Campaign, scales: Mapping[tuple[str, str], float]) -> I
             "or of the channels"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence)
-        yield from _graded(fault, common, agreeing=len(input_slips))
+        yield from _grade_slip(fault, common, agreeing=len(input_slips))
         return
     wrong_channels = set()
     for channel, trial_names in trials_of_channels.items():
@@ -189,7 +189,7 @@ def _slips_in_trial(
             "force, load factor, release displacement or inputs"
         )
         fault = DataFault(FaultKind.INPUT_SLIP, sentence, trial=trial.name)
-        yield from _graded(fault, common, agreeing=len(keys))
+        yield from _grade_slip(fault, common, agreeing=len(keys))
         return
     for key in keys:
         channel, _ = key
@@ -209,7 +209,7 @@ def _common_slip(slips: Sequence[Slip | None]) -> Slip | None:
 def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> Slip | None:
     """Return the slip between a channel's units that explains all its scales; None if none does."""
     channel = campaign.channels[name]
-    slip = slip_between(median(map(abs, scales)), channel.quantity, channel.unit)
+    slip = find_slip(median(map(abs, scales)), channel.quantity, channel.unit)
     if slip is None:
         return None
     if any(slip.distance(scale) > 2.0 * log(slip.width) for scale in scales):
@@ -228,7 +228,7 @@ def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
         drives.append(_DRIVES[trial.kind])
     drives += [(recorded.quantity, recorded.unit) for recorded in trial.inputs]
     for quantity, unit in drives:
-        slip = slip_between(scale, quantity, unit, drive=True)
+        slip = find_slip(scale, quantity, unit, drive=True)
         if slip is not None:
             return slip
     return None
@@ -257,19 +257,19 @@ def _channel_faults(
         column = f", column {channel.column!r} of {first.file},"
     number_of_trials = sum(name in trial.channels for trial in campaign.trials)
     is_in_one_of_several = len(trials) == 1 and number_of_trials > 1
-    where = f" in the trial {first.name!r}" if is_in_one_of_several else ""
+    trials_text = f" in the trial {first.name!r}" if is_in_one_of_several else ""
     sentence = (
         f"The channel {name!r}{column} shows about {slip.factor:.6g} times what the model "
-        f"says{where} {slip}: correct its `unit`, or convert the column"
+        f"says{trials_text} {slip}: correct its `unit`, or convert the column"
     )
     trial_name = first.name if is_in_one_of_several else ""
     fault = DataFault(FaultKind.UNIT_SLIP, sentence, name, trial_name)
     # an accelerometer also shows gravity, whose value is known: this counts as a second record
     witnesses = 1 if channel.quantity is Quantity.ACCELERATION else 0
-    yield from _graded(fault, slip, agreeing=len(trials) + witnesses)
+    yield from _grade_slip(fault, slip, agreeing=len(trials) + witnesses)
 
 
-def _graded(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
+def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[DataFault]:
     """Yield a slip as a fault, as a doubt, or not at all, by its size and the evidence for it.
 
     Parameters

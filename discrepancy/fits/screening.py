@@ -344,13 +344,13 @@ def parameter_grid(
             has_magnitude = True
         elif parameter.name == term.effect.spectral and peaks:
             scaled_peaks = [
-                float(np.clip(parameter.prior.normal(peak), -3.0, 3.0)) for peak in peaks
+                float(np.clip(parameter.prior.standard_normal(peak), -3.0, 3.0)) for peak in peaks
             ]
             axes.append(tuple(scaled_peaks))
         elif parameter.levels:
             axes.append(_prior_quantiles(parameter))
         elif parameter in term.effect.shape:
-            axes.append((parameter.prior.normal(parameter.canonical),))
+            axes.append((parameter.prior.standard_normal(parameter.canonical),))
         else:
             axes.append(levels)
     for values in product(*axes):

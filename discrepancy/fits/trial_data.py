@@ -374,8 +374,10 @@ class TrialData:
         """
         scaled = columns / self.deviation
         for number, noise in enumerate(self.noise):
-            if noise.applies(self.trial.whitened_at):
-                scaled[..., number] = noise.whiten(scaled[..., number], self.trial.whitened_at)
+            if noise.can_whiten(self.trial.whitening_interval):
+                scaled[..., number] = noise.whiten(
+                    scaled[..., number], self.trial.whitening_interval
+                )
         return np.asarray(scaled * self.weight)
 
     @classmethod
@@ -397,7 +399,9 @@ class TrialData:
         """
         channel_names = list(campaign.channels)
         noise = tuple(models[name] for name in trial.channels)
-        is_whitened = [channel_noise.applies(trial.whitened_at) for channel_noise in noise]
+        is_whitened = [
+            channel_noise.can_whiten(trial.whitening_interval) for channel_noise in noise
+        ]
         sample_deviation = [channel_noise.static_deviation for channel_noise in noise]
         innovation_deviation = [channel_noise.standard_deviation for channel_noise in noise]
         deviation = trial.noise_factor * np.where(

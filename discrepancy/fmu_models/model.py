@@ -276,7 +276,7 @@ class FmuModel(DescribedModel):
             Factor on the number of samples of the trial.
         """
         laws = self._laws_at_ports(patch)
-        times = subdivide(conditions.stamps(trial.time), parts)
+        times = subdivide(conditions.motion_times(trial.time), parts)
         first_stamp = float(trial.time[0])
         record_length = float(trial.time[-1]) - first_stamp
         # An FMU begins at time zero. If the stamps count from elsewhere (a time of day), they are
@@ -389,7 +389,7 @@ class FmuModel(DescribedModel):
     def _load_change(self, patch: ModelPatch) -> LoadChange:
         """Return the change of loads by those primitives that the FMU does not simulate itself."""
         effects = self.description.effects
-        return LoadChange.of_patch(
+        return LoadChange.from_patch(
             primitive for primitive in patch if primitive.kind not in effects
         )
 

@@ -95,7 +95,7 @@ def system_motion(
         excitation.sample_times,
         refinement,
         SMOOTH_PARTS if excitation.is_smooth else 1,
-        excitation.edges,
+        excitation.jump_times,
     )
     begin_force, end_force = equivalent_ramps(
         lambda times: excitation.loads_at(times, coupled.directions.T), boundaries.time

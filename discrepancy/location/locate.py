@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from discrepancy.campaign.noise_tests import holm, variance_p_value
+from discrepancy.campaign.noise_tests import holm_rejections, variance_p_value
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 from discrepancy.location.dependence import (
@@ -115,7 +115,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     white = fitted.white(np.random.default_rng(seed))
     coloured = coloured_noise_remarks(fitted)
     tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
-    rejected = holm([test.p_value for test in tests], GLOBAL_LEVEL)
+    rejected = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)
     tests = tuple(
         replace(test, rejected=is_rejected)
         for test, is_rejected in zip(tests, rejected, strict=True)

@@ -99,7 +99,7 @@ def variance_test(residuals: ResidualSet) -> OmnibusTest:
         records += _variance_tests_of_records(residuals, names)
     if not p_values_of_groups:
         return OmnibusTest("variance", np.nan, np.nan, "")
-    p_value = noise_tests.combine(p_values_of_groups)
+    p_value = noise_tests.combine_p_values(p_values_of_groups)
     worst = min(records, key=lambda record: record.p_value, default=_RecordVariance("", 2.0))
     if len(records) > 1:
         p_value = min(1.0, 2.0 * min(p_value, len(records) * worst.p_value))
@@ -196,7 +196,7 @@ def _combine_series_tests(name: str, tests: Sequence[_SerialTest]) -> OmnibusTes
     if not tests:
         return OmnibusTest(name, np.nan, np.nan, "")
     worst = min(tests, key=lambda test: test.p_value)
-    p_value = noise_tests.combine([test.p_value for test in tests])
+    p_value = noise_tests.combine_p_values([test.p_value for test in tests])
     return OmnibusTest(name, p_value, worst.statistic, worst.where)
 
 

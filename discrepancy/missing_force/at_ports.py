@@ -125,7 +125,7 @@ class MissingForces:
     def own_laws(self, shared: FloatArray) -> ModelPatch:
         """Return the model's own laws at values (K,) of the shared unknowns."""
         parameters = self.problem.shared.parameters(shared)
-        return self.model.own_laws(parameters) + self.model.patch.of(PortForce)
+        return self.model.built_in_laws(parameters) + self.model.patch.of(PortForce)
 
     def whole_size(self, port: int) -> float:
         """Return the standard deviation of the missing force at a port without any effect.

@@ -26,7 +26,7 @@ from discrepancy.campaign.records import BoolArray, FloatArray, IntArray, Trial
 from discrepancy.fits.candidate import PARAMETER_STEP, Candidate, Point, with_step
 from discrepancy.fits.problem import Problem
 from discrepancy.system.response import PortedSystem
-from discrepancy.system.sensing import in_own_clock
+from discrepancy.system.sensing import shift_clock_to_first_sample
 from discrepancy.system.time_history import subdivide
 from fe.runtime.patch import ModelPatch
 
@@ -362,7 +362,7 @@ def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, flo
         The share of the correlated part in the variance, and its decay rate [1/s]; None if the
         noise is white.
     """
-    if interval is None or not noise.applies(interval):
+    if interval is None or not noise.can_whiten(interval):
         return None
     impulse_response = lfilter(
         [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)]
@@ -408,7 +408,7 @@ def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
         residual=residual / deviation * trial.used,
         used=trial.used,
         deviation=deviation,
-        coloured=_coloured_noises(data.noise, trial.whitened_at),
+        coloured=_coloured_noises(data.noise, trial.whitening_interval),
         shared=by_shared / deviation * trial.used,
         local=by_local / deviation * trial.used,
         local_precision=data.unknowns.precision,
@@ -537,7 +537,7 @@ def _port_motion(
     """
     data = problem.trials[number]
     shared = problem.shared
-    trial_in_own_clock, _ = in_own_clock(data.trial, ModelPatch())
+    trial_in_own_clock, _ = shift_clock_to_first_sample(data.trial, ModelPatch())
 
     def motion(shared_values: FloatArray, local_values: FloatArray) -> FloatArray:
         parameters = shared.parameters(shared_values)

@@ -26,7 +26,7 @@ from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
 from discrepancy.search.wide_noise import residual_process_of
 from discrepancy.verdict import Gate
-from discrepancy.workflow import checked, without_wrong_ends
+from discrepancy.workflow import check_and_prepare, problem_without_wrong_ends
 from reporting.progress import Progress, reporter
 from reporting.provenance import collect_provenance
 from reporting.words import counted, small
@@ -77,11 +77,11 @@ def calibrate_parameters(
     # before the model is evaluated: it may fail for values outside its range
     priors = stated_priors(campaign, choice)
     with progress.stage("Checking the data"):
-        campaign, faults = checked(campaign, model, hold_out=False)
+        campaign, faults = check_and_prepare(campaign, model, hold_out=False)
     for fault in faults:
         if fault.fatal:
             raise CampaignDataError(fault.sentence)
-    problem = without_wrong_ends(campaign, model)
+    problem = problem_without_wrong_ends(campaign, model)
     campaign = problem.campaign
     with progress.stage("Posterior of the parameters"):
         posterior = parameter_posterior(problem, samples, seed)

@@ -17,7 +17,7 @@ from discrepancy.report.text import WORDS, number, unit_text
 from reporting.words import listing
 
 
-def seen_of(detectability: Detectability) -> tuple[str, str, str]:
+def detectability_texts(detectability: Detectability) -> tuple[str, str, str]:
     """Return texts on the detectability of an effect, for a row of a table.
 
     Returns
@@ -41,7 +41,7 @@ def seen_of(detectability: Detectability) -> tuple[str, str, str]:
     return visible, least_size, median
 
 
-def neighbours(separability: Separability, name: str) -> list[str]:
+def confused_effects(separability: Separability, name: str) -> list[str]:
     """Return the effects that these data cannot distinguish from one, in either direction."""
     if name not in separability.identifiers:
         return []
@@ -85,7 +85,7 @@ def group_lines(separability: Separability, hint: str = "the table says to which
     return lines
 
 
-def needs(
+def campaign_needs(
     separability: Separability,
     campaign: Campaign,
     effects: Sequence[Effect],

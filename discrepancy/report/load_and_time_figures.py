@@ -14,11 +14,11 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.report.residual_figures import (
     DrawnModel,
+    add_size_bar,
     draw_noise,
-    models,
-    panels,
-    scale_of,
-    size_bar,
+    models_to_draw,
+    new_panels,
+    size_colour_scale,
 )
 from discrepancy.verdict import GapWindow
 from reporting import figures as style
@@ -77,12 +77,12 @@ def load_figure(before: ResidualSet, after: ResidualSet | None) -> Figure | None
         return None
     columns = min(len(load_panels), 2)
     rows = (len(load_panels) + columns - 1) // columns
-    figure, grid = panels(rows, columns, 2.25 * rows + 0.3)
+    figure, grid = new_panels(rows, columns, 2.25 * rows + 0.3)
     all_axes = style.keep_first_panels(grid, len(load_panels))
     for letter, axes, panel in zip("abcd", all_axes, load_panels, strict=False):
         factor, unit = UNITS[panel.quantity].drawn
         noises = []
-        for drawn in models(before, after):
+        for drawn in models_to_draw(before, after):
             noises.append(_draw_loads(axes, drawn, panel.kind, panel.names, factor))
         draw_noise(axes, noises[0], 0.25)
         axes.axhline(0.0, color=style.OBSERVED, lw=0.6)
@@ -170,9 +170,9 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
         largest_gap_of_trial, key=lambda name: -largest_gap_of_trial[name]
     )[:MOST_RECORDS]
     trials = [name for name in largest_gap_of_trial if name in trials_with_largest_gaps]
-    norm = scale_of([window.size for window in windows])
+    norm = size_colour_scale([window.size for window in windows])
     has_two_rows = any(window.with_effect for window in windows)
-    figure, ((axes,),) = panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
+    figure, ((axes,),) = new_panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
     for row, name in enumerate(trials):
         windows_of_trial = [window for window in windows if window.trial == name]
         _draw_record(axes, row, windows_of_trial, norm, both=has_two_rows)
@@ -181,7 +181,7 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
     axes.set_xlabel("time since the start of the trial, s")
-    size_bar(figure, norm, [axes])
+    add_size_bar(figure, norm, [axes])
     return figure
 
 

@@ -15,7 +15,13 @@ from discrepancy.errors import FitError
 from discrepancy.location.backbones import Backbone, backbones
 from discrepancy.location.dependence import predicted_frequencies
 from discrepancy.location.residuals import FittedTrial, ResidualSet, channel_fits
-from discrepancy.report.residual_figures import DrawnModel, draw_noise, models, panels, size
+from discrepancy.report.residual_figures import (
+    DrawnModel,
+    draw_noise,
+    models_to_draw,
+    new_panels,
+    rms_over_noise,
+)
 from reporting import figures as style
 
 _ARRAYS = [entry.name for entry in fields(Backbone) if entry.name != "mode"]
@@ -45,7 +51,7 @@ def worst_record(trials: Sequence[FittedTrial]) -> Worst | None:
         if not fitted.trial.is_dynamic:
             continue
         for name in fitted.trial.channels:
-            size_of_record = size([fitted], name)
+            size_of_record = rms_over_noise([fitted], name)
             if np.isfinite(size_of_record):
                 candidates.append((size_of_record, index, name))
     if not candidates:
@@ -69,10 +75,10 @@ def history_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst)
     used = fitted.used[:, column]
     time = fitted.trial.time
     factor, unit = UNITS[before.channels[worst.channel].quantity].drawn
-    drawn_models = models(before, after)
+    drawn_models = models_to_draw(before, after)
     panel_count = 1 + len(drawn_models)
     height_ratios = [1.25, *[1.0] * len(drawn_models)]
-    figure, ((axes,), *rows_below) = panels(
+    figure, ((axes,), *rows_below) = new_panels(
         panel_count, 1, 1.45 * panel_count + 0.35, height_ratios=height_ratios, sharex=True
     )
     axes.margins(x=0.01)
@@ -101,13 +107,13 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
     The power is relative to white noise of the stated variance. None if no trial is long enough.
     """
     spectra = []
-    for drawn in models(before, after):
+    for drawn in models_to_draw(before, after):
         spectrum = _spectrum(drawn.residuals, worst.channel)
         if spectrum is not None:
             spectra.append((spectrum, drawn))
     if not spectra:
         return None
-    figure, ((axes,),) = panels(1, 1, 2.7)
+    figure, ((axes,),) = new_panels(1, 1, 2.7)
     _draw_noise_spectrum(axes, before.channels[worst.channel].noise)
     axes.axhline(1.0, color=style.TRUTH, lw=0.7, ls="-.", label="white noise of the stated size")
     for spectrum, drawn in spectra:
@@ -215,7 +221,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     channel = worst.channel
     measured = _backbones(before, channel, frequencies, measured=True)
     curves = []
-    for drawn in models(before, after):
+    for drawn in models_to_draw(before, after):
         curves.append((drawn, _backbones(drawn.residuals, channel, frequencies)))
     modes = [
         mode for mode in sorted(measured) if np.isfinite(measured[mode].time).sum() >= LEAST_POINTS
@@ -223,7 +229,7 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     if not modes:
         return None
     factor, unit = UNITS[before.channels[channel].quantity].drawn
-    figure, grid = panels(len(modes), 2, 2.3 * len(modes) + 0.3)
+    figure, grid = new_panels(len(modes), 2, 2.3 * len(modes) + 0.3)
     letters = iter("abcd")
     for row, mode in zip(grid, modes, strict=True):
         curves_of_mode = [(drawn, curve[mode]) for drawn, curve in curves if mode in curve]

@@ -11,7 +11,11 @@ from discrepancy.campaign.units import UNITS
 from discrepancy.judgement.conclusion import calibrated_parameters, effects_text, named_effects
 from discrepancy.judgement.remarks import KINDS_WITHOUT_GAP, gap_times_sentence
 from discrepancy.report import text as words
-from discrepancy.report.decidability_text import group_lines, neighbours, seen_of
+from discrepancy.report.decidability_text import (
+    confused_effects,
+    detectability_texts,
+    group_lines,
+)
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import WORDS
 from discrepancy.self_calibration import Proportion, SelfCalibration, outcomes
@@ -143,7 +147,7 @@ def effect_rows(verdict: Verdict) -> list[dict[str, Any]]:
     `item`.
     """
     rows = []
-    members = [*words.members_of(verdict).values()] or [verdict.effects]
+    members = [*words.group_members(verdict).values()] or [verdict.effects]
     for number, effects in enumerate(members, start=1):
         label: int | str = number
         for effect in effects:
@@ -157,9 +161,9 @@ LONGEST_CARD = 60
 """Most characters of a card of the page; the sentence below it has all names."""
 
 
-def what_is_missing(verdict: Verdict) -> str:
+def missing_effects_text(verdict: Verdict) -> str:
     """Return what the model lacks in a few words, for a card at the top of the page."""
-    members = words.members_of(verdict)
+    members = words.group_members(verdict)
     if members:
         names = listing(members, "or")
         return names if len(names) <= LONGEST_CARD else f"one of {len(members)} hypotheses"
@@ -187,7 +191,7 @@ def sizes_sentence(content: ReportInput) -> str:
     return WORDS.say("sizes", effects=verdict.effects if verdict.kind in words.NAMING else ())
 
 
-def deciding(verdict: Verdict) -> list[Gate]:
+def deciding_gates(verdict: Verdict) -> list[Gate]:
     """Return the gates that compared a p-value; those that did not pass come first."""
     compared = [
         gate
@@ -213,13 +217,13 @@ FUNCTIONS = (
     parameter_rows,
     score_rows,
     effect_rows,
-    what_is_missing,
+    missing_effects_text,
     sizes_sentence,
-    deciding,
+    deciding_gates,
     calibration_rows,
     group_lines,
-    neighbours,
-    seen_of,
+    confused_effects,
+    detectability_texts,
     gap_times_sentence,
     words.hypothesis_name,
     words.headline,
@@ -232,7 +236,7 @@ FUNCTIONS = (
 """Functions that the templates of the page and of the command call by name."""
 
 
-def said_on_page(content: ReportInput) -> dict[str, Any]:
+def template_values(content: ReportInput) -> dict[str, Any]:
     """Return the names that the templates of the page and of the command use, with their values."""
     investigation = content.investigation
     verdict = investigation.verdict
@@ -260,8 +264,8 @@ def said_on_page(content: ReportInput) -> dict[str, Any]:
         "named": verdict.kind in words.NAMING,
         "nothing": verdict.kind in KINDS_WITHOUT_GAP,
         "label": words.added_label(investigation),
-        "members": words.members_of(verdict),
-        "scored": None if proof is None else words.scored(proof),
+        "members": words.group_members(verdict),
+        "scored": None if proof is None else words.proof_scores(proof),
         "without": without_effects,
         "catalogue": {effect.identifier: effect for effect in effects},
         "remarks": [remark for remark in verdict.remarks if remark not in fault_sentences],
@@ -292,5 +296,5 @@ def render_report(
             f"{origin.provenance.seed}.",
         ),
     )
-    WORDS.fill(page, drawings, figures=figures, **said_on_page(content))
+    WORDS.fill(page, drawings, figures=figures, **template_values(content))
     return page.render()

@@ -35,7 +35,7 @@ class DrawnModel(NamedTuple):
     title: str
 
 
-def models(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
+def models_to_draw(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
     """Return the residuals to draw, with style and label: before and, if given, with the effect."""
     was = DrawnModel(before, style.PREDICTION, "--", "o", "model", "model as it is")
     if after is None:
@@ -45,7 +45,9 @@ def models(before: ResidualSet, after: ResidualSet | None) -> list[DrawnModel]:
     return [was, DrawnModel(with_effect, style.PAST, "-", "D", AFTER, f"b  {AFTER}")]
 
 
-def panels(rows: int, columns: int, height: float, **grid: Any) -> tuple[Figure, list[list[Axes]]]:
+def new_panels(
+    rows: int, columns: int, height: float, **grid: Any
+) -> tuple[Figure, list[list[Axes]]]:
     """Return a new figure and its grid of panels.
 
     Parameters
@@ -74,7 +76,7 @@ def draw_noise(axes: Axes, deviation: float, opacity: float) -> None:
     )
 
 
-def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
+def size_colour_scale(values: Sequence[float] | FloatArray) -> Normalize:
     """Return the logarithmic colour scale of sizes of residuals; 1 (noise) is dark.
 
     Sizes below the scale have the colour of its end: a window whose readings are all missing has
@@ -84,7 +86,7 @@ def scale_of(values: Sequence[float] | FloatArray) -> Normalize:
     return LogNorm(0.7, max(largest, 3.0), clip=True)
 
 
-def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
+def add_size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
     """Draw the colour bar of sizes of residuals beside panels."""
     bar = style.color_bar(
         figure,
@@ -99,7 +101,7 @@ def size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
     style.plain_powers(bar.yaxis, (1.0, 2.0, 5.0) if largest < 50.0 else (1.0,))
 
 
-def heat_map(
+def draw_heat_map(
     axes: Axes,
     values: FloatArray,
     names: tuple[Iterable[str], Iterable[str]],
@@ -161,7 +163,7 @@ BELOW: dict[str, Any] = {
 """How gauges and their names are drawn on the wing."""
 
 
-def size(trials: Sequence[FittedTrial], channel: str) -> float:
+def rms_over_noise(trials: Sequence[FittedTrial], channel: str) -> float:
     """Return the rms residual of a channel over the noise; nan if no sample is used."""
     sum_of_squares = 0.0
     count = 0
@@ -171,7 +173,7 @@ def size(trials: Sequence[FittedTrial], channel: str) -> float:
     return float(np.sqrt(sum_of_squares / count)) if count else float("nan")
 
 
-def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
+def rms_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray]:
     """Return the sizes of residuals by channel and trial.
 
     Returns
@@ -191,7 +193,7 @@ def size_table(residuals: ResidualSet) -> tuple[list[str], list[str], FloatArray
         mark = " (held out)" if trial.held_out and not is_marked else ""
         trial_names.append(f"{trial.name}{mark}")
         for row, channel in enumerate(channels):
-            sizes[row, column] = size([fitted], channel)
+            sizes[row, column] = rms_over_noise([fitted], channel)
     return channels, trial_names, sizes
 
 
@@ -224,13 +226,13 @@ def planform_figure(
     places = gauge_places(list(before.channels.values()), design)
     if not places:
         return None
-    drawn_models = models(before, after)
+    drawn_models = models_to_draw(before, after)
     sizes_of_models = []
     for drawn in drawn_models:
-        sizes_of_models.append([size(drawn.residuals.trials, name) for name in places])
-    norm = scale_of(np.array(sizes_of_models))
+        sizes_of_models.append([rms_over_noise(drawn.residuals.trials, name) for name in places])
+    norm = size_colour_scale(np.array(sizes_of_models))
     row_count = len(drawn_models)
-    figure, grid = panels(row_count, 1, 1.62 * row_count + 0.35, sharex=True)
+    figure, grid = new_panels(row_count, 1, 1.62 * row_count + 0.35, sharex=True)
     all_axes = [axes for (axes,) in grid]
     for axes, sizes, drawn in zip(all_axes, sizes_of_models, drawn_models, strict=True):
         _draw_planform(axes, design)
@@ -243,7 +245,7 @@ def planform_figure(
                 axes.annotate(name, position, (0.0, -6.5), **BELOW)
         axes.set(title=drawn.title, ylabel="chord, m")
     all_axes[-1].set_xlabel("distance from the root, m")
-    size_bar(figure, norm, all_axes)
+    add_size_bar(figure, norm, all_axes)
     return figure
 
 
@@ -302,24 +304,24 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
 
     Both maps share one colour scale.
     """
-    drawn_models = models(before, after)
+    drawn_models = models_to_draw(before, after)
     tables = []
     for drawn in drawn_models:
-        _, _, sizes = size_table(drawn.residuals)
+        _, _, sizes = rms_table(drawn.residuals)
         tables.append(sizes)
-    channels, trials, _ = size_table(before)
-    norm = scale_of(np.concatenate([sizes.ravel() for sizes in tables]))
+    channels, trials, _ = rms_table(before)
+    norm = size_colour_scale(np.concatenate([sizes.ravel() for sizes in tables]))
     longest_name = max(len(name) for name in trials)
     below = min(0.22 + 0.042 * longest_name, 1.5)
     height = max(0.22 * len(channels), 0.9) + below + 0.35
-    figure, (row,) = panels(1, len(tables), height)
+    figure, (row,) = new_panels(1, len(tables), height)
     has_texts = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
     for number, (axes, sizes, drawn) in enumerate(zip(row, tables, drawn_models, strict=True)):
         row_names = channels if number == 0 else [""] * len(channels)
         texts = _cell_texts(sizes) if has_texts else None
-        heat_map(axes, sizes, (row_names, trials), norm, 40, texts)
+        draw_heat_map(axes, sizes, (row_names, trials), norm, 40, texts)
         axes.set_title(drawn.title)
-    size_bar(figure, norm, row)
+    add_size_bar(figure, norm, row)
     return figure
 
 

@@ -89,7 +89,7 @@ def headline(verdict: Verdict) -> str:
     return f"{sentence} ({role} {probability_text(verdict.probability)})."
 
 
-def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
+def group_members(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
     """Return the effects of each member of a group by its name; empty for any other verdict."""
     if verdict.kind is not VerdictKind.GROUP:
         return {}
@@ -106,7 +106,7 @@ def members_of(verdict: Verdict) -> dict[str, tuple[NamedEffect, ...]]:
     return members
 
 
-def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
+def port_motion_units(force: ForceAtPort) -> tuple[str, str, str]:
     """Return the name of a missing force and the units of its port's motion.
 
     Returns
@@ -124,7 +124,7 @@ def motion_of(force: ForceAtPort) -> tuple[str, str, str]:
 
 def force_sentence(force: ForceAtPort) -> str:
     """Return the sentence on a missing force: where, how large, and what its law leaves."""
-    name, displacement_unit, speed_unit = motion_of(force)
+    name, displacement_unit, speed_unit = port_motion_units(force)
     evidence = force.evidence[force.port]
     other_ports = {port: value for port, value in force.evidence.items() if port != force.port}
     nearest = max(other_ports, key=lambda port: other_ports[port], default="")
@@ -155,7 +155,7 @@ def tested_trials(force: ForceAtPort | None) -> list[tuple[str, ForceLeft]]:
     return tested
 
 
-def scored(proof: Proof) -> tuple[Scores, Scores, str]:
+def proof_scores(proof: Proof) -> tuple[Scores, Scores, str]:
     """Return the scores before and after, and their trials: held-out ones if there are any."""
     if proof.held_out_before is not None and proof.held_out_after is not None:
         return proof.held_out_before, proof.held_out_after, "held-out"
@@ -185,7 +185,7 @@ def error_sentence(investigation: Investigation) -> str:
 
 def noise_levels(proof: Proof) -> tuple[str, str]:
     """Return the rms of the residuals over the noise, before and after, as texts."""
-    before, after, _ = scored(proof)
+    before, after, _ = proof_scores(proof)
     rms_before = number(before.chi_square_per_sample**0.5, 2)
     rms_after = number(after.chi_square_per_sample**0.5, 2)
     return rms_before, rms_after

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 from discrepancy.catalogue.entry import Effect
-from discrepancy.catalogue.library import in_events
+from discrepancy.catalogue.library import variants_in_events
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import attempt, fit
@@ -56,7 +56,7 @@ def search(
         problem, no_effect, iterations=SEARCH.no_effect_iterations
     )
     usable = [effect for effect in effects if effect.unavailable(problem.setting) is None]
-    usable_effects = (*usable, *in_events(tuple(usable), problem.setting))
+    usable_effects = (*usable, *variants_in_events(tuple(usable), problem.setting))
     result = Search(problem, usable_effects, no_effect, on_progress=on_progress)
     _, own_laws = problem.model.without_laws()
     if len(own_laws) and result.force_search is not None and result.is_unexplained():

@@ -135,7 +135,7 @@ def _channel_process(
     else:
         wide_variance = mean_square
     process.noise_factor = np.sqrt(
-        wide_variance * noise_tests.times_fewer(autocorrelation, white_variance)
+        wide_variance * noise_tests.statistical_inefficiency(autocorrelation, white_variance)
     )
     # the process without the noise: white noise adds to the variance of the residuals, but not to
     # their correlation, so the correlation of the process is larger by the ratio of the variances
@@ -144,7 +144,7 @@ def _channel_process(
         return process
     process_over_residuals = (1.0 + process_variance) / process_variance
     process.amplitude = np.sqrt(process_variance)
-    process.correlation_time = interval * noise_tests.times_fewer(
+    process.correlation_time = interval * noise_tests.statistical_inefficiency(
         autocorrelation, white_variance, process_over_residuals
     )
     process_autocorrelation = autocorrelation * process_over_residuals
@@ -247,7 +247,7 @@ def _recorded_colour(
                 residuals.steps / record.interval, lags, np.r_[1.0, autocorrelation]
             )
             correlation = float(np.mean(at_steps))
-            times_fewer = noise_tests.times_fewer(autocorrelation, white_variance)
+            times_fewer = noise_tests.statistical_inefficiency(autocorrelation, white_variance)
         colours.append(_RecordedColour(correlation, 1.0 / len(centred_record), times_fewer))
     return _RecordedColour(*np.mean(colours, axis=0).tolist())
 

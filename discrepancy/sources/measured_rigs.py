@@ -85,7 +85,7 @@ def write_rig_campaign(rig: str, data: Path, folder: Path, **options: Any) -> Pa
     return folder
 
 
-def _numbers(
+def _read_numbers(
     file: Path, columns: Sequence[str], separator: str | None = ",", skipped: int = 1
 ) -> dict[str, FloatArray]:
     """Return the first columns of a published table, by name.
@@ -124,7 +124,7 @@ def _numbers(
     return numbers
 
 
-def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
+def longest_fall(file: Path) -> tuple[FloatArray, FloatArray]:
     """Return the longest free fall in a record of a phone, without `CUT` seconds at its ends.
 
     Returns
@@ -139,7 +139,7 @@ def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
     CampaignFileError
         If the file is not as it was published, or holds no fall.
     """
-    columns = _numbers(file, ("time", "x", "y", "z"))
+    columns = _read_numbers(file, ("time", "x", "y", "z"))
     is_falling = np.abs(columns["z"]) < FALLING
     edges = np.flatnonzero(np.diff(np.r_[False, is_falling, False].astype(int)))
     begins, ends = edges[::2], edges[1::2]
@@ -154,12 +154,14 @@ def fall_of(file: Path) -> tuple[FloatArray, FloatArray]:
     return np.round(time[is_inside] - time[0], 9), z[is_inside]
 
 
-def _phone(data: Path) -> RigFiles:
+def _phone_files(data: Path) -> RigFiles:
     """Return the files of a campaign of falls of a phone.
 
     Its sensor shows acceleration minus gravity, thus only its bias in a free fall.
     """
-    at_rest = _numbers(data / "at_rest.txt", ("time", "x", "y", "z"), separator=None, skipped=0)
+    at_rest = _read_numbers(
+        data / "at_rest.txt", ("time", "x", "y", "z"), separator=None, skipped=0
+    )
     files = sorted(data.glob("fall_*.csv"), key=lambda path: path.stem.split("_")[1].zfill(9))
     if not files:
         raise CampaignFileError(
@@ -168,7 +170,7 @@ def _phone(data: Path) -> RigFiles:
     tables = {}
     trials = []
     for file in files:
-        time, z = fall_of(file)
+        time, z = longest_fall(file)
         tables[file.name] = table_text({"time": time, "z": z})
         trials.append(
             {
@@ -183,9 +185,9 @@ def _phone(data: Path) -> RigFiles:
     return RigFiles(tables, {"trial": trials})
 
 
-def _tanks(data: Path) -> RigFiles:
+def _tank_files(data: Path) -> RigFiles:
     """Return the records of two tanks for estimation and for validation."""
-    columns = _numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
+    columns = _read_numbers(data / "dataBenchmark.csv", ("uEst", "uVal", "yEst", "yVal"))
     time: FloatArray = 4.0 * np.arange(len(columns["uEst"]), dtype=np.float64)
     tables = {}
     for name, suffix in (("estimation", "Est"), ("validation", "Val")):
@@ -197,7 +199,7 @@ def _tanks(data: Path) -> RigFiles:
     return RigFiles(tables, {})
 
 
-def _pendulum(data: Path) -> RigFiles:
+def _pendulum_files(data: Path) -> RigFiles:
     """Return the files of two records of a pendulum, with the angle as input and torque as output.
 
     The rod turns over: a motion that was simulated from the torque would soon diverge from the
@@ -205,11 +207,11 @@ def _pendulum(data: Path) -> RigFiles:
     """
     tables = {}
     for name in ("pd_trajectory", "ilqr"):
-        columns = _numbers(data / f"{name}.csv", ("time", "position", "velocity", "torque"))
+        columns = _read_numbers(data / f"{name}.csv", ("time", "position", "velocity", "torque"))
         published_interval = float(np.median(np.diff(columns["time"])))
         averaged = max(round(STEP / published_interval), 1)
         samples = np.stack((columns["time"], columns["position"], columns["torque"]), axis=1)
-        time, angle, torque = _means(samples, averaged).T
+        time, angle, torque = _group_means(samples, averaged).T
         angle = savgol_filter(angle, SMOOTHED, 3)
         tables[f"{name}.csv"] = table_text(
             {"time": np.round(time, 9), "angle": angle, "torque": torque}
@@ -217,7 +219,7 @@ def _pendulum(data: Path) -> RigFiles:
     return RigFiles(tables, {})
 
 
-def _means(samples: FloatArray, averaged: int) -> FloatArray:
+def _group_means(samples: FloatArray, averaged: int) -> FloatArray:
     """Return the means of successive groups of samples.
 
     Parameters
@@ -239,8 +241,8 @@ def _means(samples: FloatArray, averaged: int) -> FloatArray:
 
 RIGS: dict[str, Callable[..., RigFiles]] = {
     "real_wing": real_wing,
-    "falling_phone": _phone,
-    "two_tanks": _tanks,
-    "pendulum": _pendulum,
+    "falling_phone": _phone_files,
+    "two_tanks": _tank_files,
+    "pendulum": _pendulum_files,
 }
 """Functions that make the files of a campaign from a published folder, by the name of the rig."""

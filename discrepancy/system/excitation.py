@@ -97,9 +97,9 @@ class Excitation:
     release: ReleasePoint | None = None
 
     @property
-    def edges(self) -> list[float]:
+    def jump_times(self) -> list[float]:
         """Times at which a load jumps, begins or ends [s]."""
-        return [edge for load in self.loads for edge in load.history.edges]
+        return [edge for load in self.loads for edge in load.history.jump_times]
 
     @property
     def is_smooth(self) -> bool:
@@ -107,7 +107,7 @@ class Excitation:
         return any(load.history.hold is Hold.SMOOTH for load in self.loads)
 
     @property
-    def levels(self) -> LoadLevels:
+    def load_levels(self) -> LoadLevels:
         """The recorded loads of a trial at rest, in each of its rows."""
         directions = []
         values = []

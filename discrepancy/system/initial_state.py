@@ -47,7 +47,7 @@ def state_at_first_stamp(
         If the record begins at rest but the system has no equilibrium.
     """
     mode_count = len(system.angular_frequency)
-    displacement_mode_count = system.displacement_modes
+    displacement_mode_count = system.displacement_mode_count
     first_stamp = excitation.time[:1]
     motions = list(excitation.prescribed_motions.values())
     drive_positions = np.array([float(motion.values_at(first_stamp)[0]) for motion in motions])
@@ -178,7 +178,9 @@ def _held_state(
         total_force = holding_force * row + load[0] - memory[:, LAGGED_FORCE] @ law_rows
         if system.is_truncated:
             # the part of the port's position that fades after the release
-            memory[:, FADING_POSITION] = holding_force * (law_rows @ system.residual(row))
+            memory[:, FADING_POSITION] = holding_force * (
+                law_rows @ system.residual_displacements(row)
+            )
     frequency = system.angular_frequency
     q = total_force @ system.shapes / frequency**2 + deviation
     return ReleasedState(InitialMotion(q, np.zeros(len(frequency)), memory), holding_force * row)

@@ -160,7 +160,7 @@ class Model(ABC):
         """Return the units of force and motion at a port; `EITHER` if they are not known."""
         return EITHER
 
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+    def built_in_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws that the model itself has at ports."""
         return NO_PATCH
 
@@ -215,7 +215,7 @@ class Model(ABC):
                     f"{capital(self.quoted_name)} has no output {output!r}; it has "
                     f"{', '.join(self.outputs_with_quantities)}."
                 )
-            if not measured.shows(quantity):
+            if not measured.can_measure(quantity):
                 raise ModelError(
                     f"The output {output!r} of {self.quoted_name} is a {quantity.value}, but a "
                     f"channel measures {measured.value}."
@@ -412,7 +412,7 @@ class Model(ABC):
 
     def without_laws(self) -> tuple[Self, ModelPatch]:
         """Return the model without laws at its ports, and these laws at the prior means."""
-        laws = self.own_laws(self.prior_mean()) + self.patch.of(PortForce)
+        laws = self.built_in_laws(self.prior_mean()) + self.patch.of(PortForce)
         without_laws = self._copy_with(
             patch=self.patch.without(PortForce), linear=True, _responses=None
         )

@@ -224,7 +224,7 @@ class LinearSystem:
         return self.modes.shapes
 
     @property
-    def displacement_modes(self) -> int:
+    def displacement_mode_count(self) -> int:
         """Number of the modes that are of displacements; the others are states."""
         return self.modes.displacement_count
 
@@ -239,7 +239,7 @@ class LinearSystem:
         return float(np.sqrt(HEAVY * np.max(np.abs(self.mass))))
 
     @cached_property
-    def all_shapes(self) -> FloatArray:
+    def shapes_with_drives(self) -> FloatArray:
         """Mass-normalised shapes (N, M + P) of the modes and of the drives."""
         if not len(self.drives):
             return self.shapes
@@ -251,7 +251,7 @@ class LinearSystem:
         mode_count = len(self.angular_frequency)
         drive_count = len(self.drives)
         frequency = np.pad(self.angular_frequency, (0, drive_count))
-        shapes = self.all_shapes
+        shapes = self.shapes_with_drives
         damping = shapes.T @ self.damping @ shapes
         stiffness = shapes.T @ self.stiffness @ shapes
         # the motion of a drive is prescribed: no damping or stiffness acts on it
@@ -277,7 +277,7 @@ class LinearSystem:
         if not self.is_truncated or not self.ports:
             return None
         rows = np.array(list(self.ports.values()))
-        residual_compliance = np.einsum("pn,np->p", rows, self.residual(rows.T))
+        residual_compliance = np.einsum("pn,np->p", rows, self.residual_displacements(rows.T))
         compliance = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
         is_flexible = [name not in self.on_modes for name in self.ports]
         is_above_rounding = residual_compliance > 1e-9 * compliance
@@ -290,7 +290,7 @@ class LinearSystem:
         mass times these shapes and the accelerations goes to the right-hand side. The force on a
         drive is the one that gives it the prescribed acceleration.
         """
-        forces = excitation.loads_at(time, self.all_shapes)
+        forces = excitation.loads_at(time, self.shapes_with_drives)
         if excitation.prescribed_motions:
             motions = excitation.prescribed_motions.values()
             accelerations = np.transpose([motion.values_at(time, 2) for motion in motions])
@@ -329,7 +329,7 @@ class LinearSystem:
         inverse = self._inverse_cholesky
         return np.asarray(inverse.T @ (inverse @ loads))
 
-    def residual(self, loads: FloatArray) -> FloatArray:
+    def residual_displacements(self, loads: FloatArray) -> FloatArray:
         """Return the displacements of the modes without inertia under loads (N,) or (N, k).
 
         They are the residual flexibility times the loads: K^-1 loads minus the static displacements
@@ -338,7 +338,7 @@ class LinearSystem:
         in_modes = (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
         return self.flexibility(loads) - in_modes
 
-    def rest_under(self, loads: FloatArray) -> FloatArray:
+    def equilibrium_under(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) in equilibrium under constant loads (L, N).
 
         Raises
@@ -351,7 +351,7 @@ class LinearSystem:
         # In equilibrium displacements q and states v are constant, so K q + D v = modal loads.
         # Least squares: rigid motions may be unrestored, if no load acts along them.
         mode_count = len(self.angular_frequency)
-        displacement_mode_count = self.displacement_modes
+        displacement_mode_count = self.displacement_mode_count
         modal_loads = loads @ self.shapes
         restoring = np.hstack(
             (
@@ -423,11 +423,11 @@ class LinearSystem:
         if levels is None:
             levels = np.eye(len(directions))
         # displacements under unit loads, and under unit forces of the laws
-        displacements = self.rest_under(directions) + offset
-        flexibility = self.rest_under(law_rows)
+        displacements = self.equilibrium_under(directions) + offset
+        flexibility = self.equilibrium_under(law_rows)
         if fixed_row is not None:
             # subtract the displacements under the reaction that holds the point
-            point_force_displacement = self.rest_under(fixed_row[None])
+            point_force_displacement = self.equilibrium_under(fixed_row[None])
             flexibility = flexibility - np.outer(
                 flexibility @ fixed_row, point_force_displacement
             ) / float(point_force_displacement[0] @ fixed_row)

@@ -145,20 +145,20 @@ class LumpedDescription(ModelDescription):
         integrals = [controller for controller in self.controller if controller.integral != 0.0]
         return self.displacement_count + self.state_count + len(integrals)
 
-    def padded(self, row: Sequence[float] | FloatArray) -> FloatArray:
+    def pad_to_all_unknowns(self, row: Sequence[float] | FloatArray) -> FloatArray:
         """Return a vector of the file, extended by zeros for the integrals of controllers."""
         padded_row = np.zeros(self.unknown_count)
         padded_row[: len(row)] = row
         return padded_row
 
     @cached_property
-    def is_plain(self) -> bool:
+    def is_structure_on_springs(self) -> bool:
         """Whether it is a plain structure on springs, without states, drives or controllers."""
         if not self.input or self.free:
             return False
         if self.state_count or self.load or self.damping_part or self.controller:
             return False
-        prescribes_motion = any(section.quantity.moving for section in self.input)
+        prescribes_motion = any(section.quantity.motion_chain for section in self.input)
         acts_through_matrix = any(section.through for section in self.input)
         acts_elsewhere = any(port.acts for port in self.port)
         shows_more = any(output.reaction or output.constant for output in self.output)
@@ -216,14 +216,14 @@ class LumpedDescription(ModelDescription):
 
     def faults(self) -> Iterator[Fault]:
         """Yield the contradictions of the file."""
-        yield from self._missing_matrices()
-        yield from self._wrong_names()
-        yield from self._vanishing_matrices()
+        yield from self._missing_matrix_faults()
+        yield from self._name_faults()
+        yield from self._vanishing_matrix_faults()
         for kind in BLOCKS:
-            yield from self._wrong_matrices(kind)
+            yield from self._matrix_faults(kind)
         for kind in ("input", "output", "port", "place", "load", "controller"):
             for section in getattr(self, kind):
-                yield from self._wrong_vectors(kind, section)
+                yield from self._vector_faults(kind, section)
         n = self.displacement_count
         if self.root is not None:
             is_wrong = len(self.root.lever) != n or not any(self.root.lever)
@@ -236,7 +236,7 @@ class LumpedDescription(ModelDescription):
                 f"{counted(count, 'value')} came",
             )
 
-    def _missing_matrices(self) -> Iterator[Fault]:
+    def _missing_matrix_faults(self) -> Iterator[Fault]:
         """Yield the faults of required matrices that are missing."""
         displacement_count = self.displacement_count
         state_count = self.state_count
@@ -253,7 +253,7 @@ class LumpedDescription(ModelDescription):
         yield lacks_conductance, "conductance is missing: give it, or [[conductance_part]]"
         yield displacement_count and not (self.damping or self.free), "'damping' is missing"
 
-    def _wrong_matrices(self, kind: str) -> Iterator[Fault]:
+    def _matrix_faults(self, kind: str) -> Iterator[Fault]:
         """Yield the matrices of a kind with a wrong size, symmetry or definiteness."""
         block = BLOCKS[kind]
         rows = self.state_count if block.rows_of_states else self.displacement_count
@@ -291,7 +291,7 @@ class LumpedDescription(ModelDescription):
             return "damping.matrix"
         return kind if kind in KINDS else f"coupling.{kind}"
 
-    def _vanishing_matrices(self) -> Iterator[Fault]:
+    def _vanishing_matrix_faults(self) -> Iterator[Fault]:
         """Yield parameters whose `low` of zero leaves no mass, capacity or stiffness."""
         needed = ["mass", "capacity"] if self.free else ["mass", "capacity", "stiffness"]
         for parameter in self.parameter:
@@ -313,7 +313,7 @@ class LumpedDescription(ModelDescription):
                     "some unknown: give a low above 0",
                 )
 
-    def _wrong_vectors(
+    def _vector_faults(
         self, kind: str, section: NamedVector | OutputSection | ControllerSection
     ) -> Iterator[Fault]:
         """Yield vectors of a wrong length, zero ones, and ones of displacements and states."""
@@ -337,7 +337,7 @@ class LumpedDescription(ModelDescription):
             f"the {kind} {section.name!r} sees displacements or states, not both",
         )
         if isinstance(section, PortSection) and section.acts is not None:
-            yield self._wrong_flow(section, row, np.array(section.acts))
+            yield self._flow_fault(section, row, np.array(section.acts))
         if isinstance(section, ControllerSection):
             order = section.quantity.order
             sees_speed = order > 0 or any(row[n:])
@@ -347,7 +347,7 @@ class LumpedDescription(ModelDescription):
                 "derivative of a speed or of a state: leave `derivative` out",
             )
 
-    def _wrong_flow(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:
+    def _flow_fault(self, port: PortSection, row: FloatArray, acts: FloatArray) -> Fault:
         """Return the fault of a port whose `acts` takes nothing from the state that it sees."""
         n = self.displacement_count
         is_of_states = not any(row[:n]) and not any(acts[:n])
@@ -359,7 +359,7 @@ class LumpedDescription(ModelDescription):
             "sees",
         )
 
-    def _wrong_names(self) -> Iterator[Fault]:
+    def _name_faults(self) -> Iterator[Fault]:
         """Yield names that are there twice, and references to names that are not there."""
         kinds = ("output", "port", "place", "load", "controller", "law", "parameter", "input")
         names = {kind: [section.name for section in getattr(self, kind)] for kind in kinds}
@@ -373,14 +373,14 @@ class LumpedDescription(ModelDescription):
             "place station": [f"{place.station:g}" for place in self.place],
         }
         for kind, kind_names in unique_names.items():
-            yield from self.repeated(kind, kind_names)
+            yield from self.repeated_name_faults(kind, kind_names)
         # matrices that there are, and what parameters can scale
         kinds_there = [kind for kind in KINDS if self._has_unknowns_of(kind)]
         matrices = [*kinds_there, *part_names]
         scalable = [*matrices, *names["input"], *names["load"], *names["law"], *names["controller"]]
         for controller in names["controller"]:
             scalable += [f"{controller}.{gain}" for gain in GAINS]
-        prescribed = [section.name for section in self.input if section.quantity.moving]
+        prescribed = [section.name for section in self.input if section.quantity.motion_chain]
         for kind, key, verb, known in (
             ("input", "through", "acts through", matrices),
             ("load", "through", "acts through", matrices),
@@ -389,9 +389,9 @@ class LumpedDescription(ModelDescription):
             ("output", "controller", "is what a controller gives,", names["controller"]),
             ("parameter", "terms", "scales", scalable),
         ):
-            yield from self._unknown_references(kind, key, verb, known)
+            yield from self._reference_faults(kind, key, verb, known)
 
-    def _unknown_references(
+    def _reference_faults(
         self, kind: str, key: str, verb: str, known: Sequence[str]
     ) -> Iterator[Fault]:
         """Yield what sections of a kind name by a key and what is not known."""

@@ -60,8 +60,10 @@ class LumpedModel(DescribedModel, SystemModel):
         self.port_rows = {}
         self.law_directions = {}
         for port in description.port:
-            self.port_rows[port.name] = description.padded(port.vector)
-            self.law_directions[port.name] = description.padded(port.acts or port.vector)
+            self.port_rows[port.name] = description.pad_to_all_unknowns(port.vector)
+            self.law_directions[port.name] = description.pad_to_all_unknowns(
+                port.acts or port.vector
+            )
         self._places = sorted(description.place, key=lambda place: place.station)
         if self._places:
             self.stations = (self._places[0].station, self._places[-1].station)
@@ -109,9 +111,9 @@ class LumpedModel(DescribedModel, SystemModel):
     def oscillates(self) -> bool:
         """Whether it has a mode that vibrates."""
         mean_state = SystemState(tuple(self.prior_mean().tolist()))
-        return bool(np.any(self.system(mean_state).angular_frequency > 0.0))
+        return bool(np.any(self.system_in_state(mean_state).angular_frequency > 0.0))
 
-    def own_laws(self, parameters: FloatArray) -> ModelPatch:
+    def built_in_laws(self, parameters: FloatArray) -> ModelPatch:
         """Return the laws that the model itself has at ports, each times its factor."""
         if self.linear:
             return NO_PATCH
@@ -126,8 +128,8 @@ class LumpedModel(DescribedModel, SystemModel):
         self, place: Place, state: SystemState, change: ModelPatch = NO_PATCH
     ) -> FloatArray:
         """Return the load (N,) of 1 N at a place, or of one unit of another input."""
-        load_change = LoadChange.of_patch(change)
-        return self._input_direction(self.rig(state), self._input_at(place), load_change)
+        load_change = LoadChange.from_patch(change)
+        return self._input_direction(self.rig_in_state(state), self._input_at(place), load_change)
 
     def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
         """Return the loads and the prescribed motions in a trial.
@@ -136,7 +138,7 @@ class LumpedModel(DescribedModel, SystemModel):
         if an output measures its reaction force; otherwise it is free.
         """
         trial = case.trial
-        rig = self.rig(case.state)
+        rig = self.rig_in_state(case.state)
         description = self.description
         zero_motion = RecordedHistory(
             trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0
@@ -154,12 +156,12 @@ class LumpedModel(DescribedModel, SystemModel):
         loads = constant_loads + rig.loads_of_references(trial, inputs)
         # recorded loads and motions
         references = {loop.section.reference for loop in rig.loops.values()}
-        load_change = LoadChange.of_patch(case.patch)
+        load_change = LoadChange.from_patch(case.patch)
         for name, offset_input in inputs.items():
             if name in references:
                 continue
             section = self._section_of(trial, offset_input.recorded)
-            if section.quantity.moving:
+            if section.quantity.motion_chain:
                 motions[name] = _prescribed_motion(trial, offset_input, rig.factor(name))
             else:
                 direction = self._input_direction(rig, section, load_change)
@@ -208,7 +210,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 f"The trial {trial.name!r} records the input {recorded.name!r}, which "
                 f"{self.quoted_name} does not have; it has {comma_list(self._inputs)}."
             )
-        moving = section.quantity.moving
+        moving = section.quantity.motion_chain
         if recorded.quantity is not section.quantity and recorded.quantity not in moving:
             raise ModelError(
                 f"The input {recorded.name!r} of {self.quoted_name} is {section.quantity.value}, "
@@ -227,7 +229,7 @@ class LumpedModel(DescribedModel, SystemModel):
         candidates = [
             name
             for name, section in self._inputs.items()
-            if name == place or not section.quantity.moving
+            if name == place or not section.quantity.motion_chain
         ]
         return self._inputs[choose_load_place(candidates, place, self.quoted_name)]
 
@@ -269,8 +271,8 @@ class LumpedModel(DescribedModel, SystemModel):
         if quantity is not section.quantity:
             derivatives = quantity.derivatives_of(section.quantity)
         description = self.description
-        equation = OutputEquation.of_row(
-            description.padded(vector),
+        equation = OutputEquation.from_row(
+            description.pad_to_all_unknowns(vector),
             displacement_derivative=section.quantity.order + derivatives,
             state_derivative=derivatives,
             state_count=description.unknown_count - description.displacement_count,
@@ -282,7 +284,7 @@ class LumpedModel(DescribedModel, SystemModel):
         self, controller: str, case: PatchedTrial, excitation: Excitation | None
     ) -> OutputEquation:
         """Return the equation of an output that is the output of a controller."""
-        loop = self.rig(case.state).loops[controller]
+        loop = self.rig_in_state(case.state).loops[controller]
         # gives the factor x of a load x direction (pseudo-inverse of a vector)
         inverse_direction = loop.direction / float(loop.direction @ loop.direction)
         references: list[Load] = []
@@ -307,7 +309,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 f"The output {section.name!r} of {self.name!r} is the reaction of "
                 f"{section.reaction!r}, whose motion this trial does not prescribe."
             )
-        system = self.system(case.state._replace(drives=tuple(drive_names)))
+        system = self.system_in_state(case.state._replace(drives=tuple(drive_names)))
         drive_shape = system.drive_shapes[:, drive_names.index(section.reaction)]
         rows = [
             drive_shape @ system.stiffness,
@@ -362,7 +364,7 @@ class LumpedModel(DescribedModel, SystemModel):
         sections += self.description.input
         for section in sections:
             vector = section.vector or ()
-            moving = section.quantity.moving
+            moving = section.quantity.motion_chain
             if moving and np.count_nonzero(vector) == 1 and max(vector) == 1.0:
                 unit = TURNS if Quantity.ANGLE in moving else MOVES
                 units.setdefault(vector.index(1.0), set()).add(unit)
@@ -379,7 +381,7 @@ class LumpedModel(DescribedModel, SystemModel):
         return factors
 
     @cached_property
-    def rig(self) -> Callable[[SystemState], Rig]:
+    def rig_in_state(self) -> Callable[[SystemState], Rig]:
         """The function that returns the matrices and controllers in a state, with a cache."""
 
         def build(state: SystemState) -> Rig:
@@ -397,7 +399,7 @@ class LumpedModel(DescribedModel, SystemModel):
         quantity goes to the left with a plus.
         """
         description = self.description
-        rig = self.rig(state)
+        rig = self.rig_in_state(state)
         count = description.unknown_count
         # stiffness, damping and mass, by the derivative that they multiply
         matrices = np.zeros((3, count, count))
@@ -415,13 +417,15 @@ class LumpedModel(DescribedModel, SystemModel):
                     ) - np.outer(loop.direction, output_rows[derivative])
         stiffness, damping, mass = matrices
         beta = None if description.damping is None else description.damping.beta
-        drives = [description.padded(self._inputs[name].vector) for name in state.drives]
+        drives = [
+            description.pad_to_all_unknowns(self._inputs[name].vector) for name in state.drives
+        ]
         return LinearSystem(
             mass,
             damping,
             stiffness,
             self.port_rows,
-            mode_count=MOST_MODES if description.is_plain else None,
+            mode_count=MOST_MODES if description.is_structure_on_springs else None,
             relaxation=rig.factor("damping") * (beta or 0.0),
             state_count=count - description.displacement_count,
             drives=np.array(drives),
@@ -432,7 +436,7 @@ class LumpedModel(DescribedModel, SystemModel):
 def _trial_kinds(description: LumpedDescription) -> frozenset[TrialKind]:
     """Return the kinds of trials that a lumped model can follow."""
     kinds = frozenset(TrialKind) - {TrialKind.FLIGHT}
-    if not description.is_plain:
+    if not description.is_structure_on_springs:
         kinds -= {TrialKind.RINGDOWN}
     if description.free:
         # nothing holds it at rest

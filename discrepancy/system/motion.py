@@ -87,24 +87,26 @@ class Motion:
         acceleration[: self.held_samples] = 0.0
         return acceleration
 
-    def at_rows(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def displacements_and_speeds_at(self, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the displacements and speeds (N, P) of row . u at all samples, for rows (P, n).
 
         A state (such as a temperature) is a speed in this system: the speed that is returned for
         it is the state, and the position is its integral over time.
         """
-        shapes = (rows @ self.system.all_shapes).T
-        without_inertia = self._without_inertia(rows) if self.system.is_truncated else 0.0
+        shapes = (rows @ self.system.shapes_with_drives).T
+        without_inertia = (
+            self._displacements_without_inertia(rows) if self.system.is_truncated else 0.0
+        )
         return self.q @ shapes + without_inertia, self.velocity @ shapes
 
-    def _without_inertia(self, rows: FloatArray) -> FloatArray:
+    def _displacements_without_inertia(self, rows: FloatArray) -> FloatArray:
         """Return the displacements row . u in the modes without inertia, as (N, C) for rows (C, n).
 
         These high modes deform without inertia: applied forces deform them at once, internal forces
         and the end of a holding force with the first-order lag of their damping.
         """
         system = self.system
-        residual_flexibility = system.residual(rows.T)
+        residual_flexibility = system.residual_displacements(rows.T)
         displacement = np.zeros((len(self.time), len(rows)))
         if self.excitation.loads:
             displacement += self.excitation.loads_at(self.time, residual_flexibility)
@@ -126,9 +128,11 @@ class Motion:
 
         Modes without inertia contribute only to outputs that are not differentiated.
         """
-        values, rates = self._of_derivatives(equations)
+        values, rates = self._part_of_derivatives(equations)
         if self.system.is_truncated:
-            values += self._without_inertia(np.array([equation.rows[0] for equation in equations]))
+            values += self._displacements_without_inertia(
+                np.array([equation.rows[0] for equation in equations])
+            )
         for column, equation in enumerate(equations):
             values[:, column] += equation.constant
             for factor, load in equation.feedthrough or ():
@@ -141,7 +145,9 @@ class Motion:
                 rates[:, column] = np.gradient(values[:, column], self.time)
         return Response(values, rates)
 
-    def _of_derivatives(self, equations: Sequence[OutputEquation]) -> tuple[FloatArray, FloatArray]:
+    def _part_of_derivatives(
+        self, equations: Sequence[OutputEquation]
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the part of outputs that depends on the modal coordinates and their derivatives.
 
         Returns
@@ -150,7 +156,7 @@ class Motion:
             That part of each output, and its time derivative. The derivative of the third
             derivative of the coordinates is left out of the rates.
         """
-        rows_by_derivative = rows_in_coordinates(equations, self.system.all_shapes)
+        rows_by_derivative = rows_in_coordinates(equations, self.system.shapes_with_drives)
         is_needed = [bool(np.any(derivative_rows)) for derivative_rows in rows_by_derivative]
         derivatives = [self.q, self.velocity]
         if any(is_needed[1:]):
@@ -168,7 +174,7 @@ class Motion:
         return values, rates
 
 
-def motion_of(
+def simulate_motion(
     system: LinearSystem, excitation: Excitation, laws: PortLaws, refinement: int = 1
 ) -> Motion:
     """Return the motion of a system at the samples of a dynamic trial.
@@ -205,7 +211,7 @@ def _motion_from_record(
     times = excitation.sample_times
     first_stamp = float(excitation.time[0])
     begin = state_at_first_stamp(system, excitation, laws)
-    motion = _advance(system, excitation, laws, first_stamp, times, begin, refinement)
+    motion = _integrate_from(system, excitation, laws, first_stamp, times, begin, refinement)
     starts_at_sample = excitation.begins is not Start.UNKNOWN and times[0] <= first_stamp
     if starts_at_sample and len(laws) and len(system.drives):
         # A speed-dependent law at a port that only drives move has no force at the begin if the
@@ -266,7 +272,7 @@ def _motion_from_release(
         # the transition matrix of the linear system over a negative time step
         transition_back = system.modal.exact_steps(stamps[:1])[0][0]
         begin = InitialMotion(*np.split(transition_back @ np.concatenate((begin.q, begin.v)), 2))
-    motion = _advance(system, excitation, laws, 0.0, stamps, begin, refinement)
+    motion = _integrate_from(system, excitation, laws, 0.0, stamps, begin, refinement)
     if held_count:
         motion = _with_held_samples(motion, released.begin, held_count, len(times))
     return Motion(
@@ -315,7 +321,7 @@ def _with_held_samples(
 # ---------------------------------------------------------------- steps
 
 
-def _advance(
+def _integrate_from(
     system: LinearSystem,
     excitation: Excitation,
     laws: PortLaws,
@@ -351,10 +357,10 @@ def _advance(
             no_forces = np.zeros((len(stamps), 0))
             return ModalMotion(q, v, no_forces, no_forces, laws.unloaded_memory())
     if not is_late:
-        return _advance_in_steps(system, excitation, laws, stamps, begin, refinement)
+        return _integrate_in_steps(system, excitation, laws, stamps, begin, refinement)
     # integrate from the earlier begin, and leave out the begin itself
     from_begin = np.append(first, stamps)
-    motion = _advance_in_steps(system, excitation, laws, from_begin, begin, refinement)
+    motion = _integrate_in_steps(system, excitation, laws, from_begin, begin, refinement)
     return motion._replace(
         q=motion.q[1:],
         v=motion.v[1:],
@@ -363,7 +369,7 @@ def _advance(
     )
 
 
-def _advance_in_steps(
+def _integrate_in_steps(
     system: LinearSystem,
     excitation: Excitation,
     laws: PortLaws,
@@ -375,18 +381,18 @@ def _advance_in_steps(
     modal = system.modal
     follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
     least_parts = SMOOTH_PARTS if follows_curve else 1
-    edges = (*laws.switching_times, *excitation.edges)
+    edges = (*laws.switching_times, *excitation.jump_times)
     boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
     # displacements of the ports under loads in the modes without inertia
     port_displacements = np.zeros((len(boundaries.time), len(laws)))
     if system.is_truncated and len(laws) and excitation.loads:
-        residual = system.residual(system.rows_of_laws(laws).T)
+        residual = system.residual_displacements(system.rows_of_laws(laws).T)
         port_displacements = excitation.loads_at(boundaries.time, residual)
-    steps = _steps(system, excitation, boundaries, port_displacements)
+    steps = _linear_steps(system, excitation, boundaries, port_displacements)
     return integrate_motion(modal, laws, steps, begin, compiled_kernel())
 
 
-def _steps(
+def _linear_steps(
     system: LinearSystem,
     excitation: Excitation,
     boundaries: Boundaries,

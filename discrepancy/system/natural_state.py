@@ -34,7 +34,7 @@ def natural_state(motion: Motion, equations: Sequence[OutputEquation], trial: Tr
     """
     system = motion.system
     mode_count = len(system.angular_frequency)
-    displacement_mode_count = system.displacement_modes
+    displacement_mode_count = system.displacement_mode_count
     position_magnitudes = np.max(np.abs(motion.q[:, :mode_count]), axis=0)
     speed_magnitudes = np.max(np.abs(motion.velocity[:, :mode_count]), axis=0)
     duration = float(trial.time[-1] - trial.time[0])

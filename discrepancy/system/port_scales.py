@@ -26,7 +26,7 @@ class GlobalScales(NamedTuple):
     angular_frequency: float
 
 
-def moving_scales(
+def scales_of_moving_structure(
     system: LinearSystem,
     largest_displacement: float,
     largest_speed: float,
@@ -60,7 +60,7 @@ def moving_scales(
     return GlobalScales(stiffness, mass, frequency)
 
 
-def larger(largest: float, values: FloatArray) -> float:
+def larger_magnitude(largest: float, values: FloatArray) -> float:
     """Return the larger of a number and the largest absolute value of an array."""
     return float(np.maximum(largest, np.max(np.abs(values), initial=0.0)))
 
@@ -94,7 +94,7 @@ class PortScaleEstimator:
     """
 
     def __init__(self, system: LinearSystem, rows: FloatArray) -> None:
-        self.system = system
+        self.system_in_state = system
         self.rows = rows
         count = len(rows)
         self.fitted_displacement = np.zeros(count)
@@ -135,7 +135,7 @@ class PortScaleEstimator:
         (T, N) array
             The loads on all unknowns in the motion [N].
         """
-        position, speed = motion.at_rows(self.rows)
+        position, speed = motion.displacements_and_speeds_at(self.rows)
         largest_position = np.max(np.abs(position), axis=0, initial=0.0)
         largest_speed = np.max(np.abs(speed), axis=0, initial=0.0)
         self._add_largest(largest_position, largest_speed, fitted=fitted)
@@ -148,7 +148,7 @@ class PortScaleEstimator:
         loads = motion.excitation.loads_at(motion.time, np.eye(system.size))
         forces = (
             motion.acceleration[:, :modes] @ (system.mass @ shapes).T,
-            motion.velocity[:, :modes] @ (self.system.damping @ shapes).T,
+            motion.velocity[:, :modes] @ (self.system_in_state.damping @ shapes).T,
             loads,
         )
         # The equivalent force at a port p is the one that excites the modes as the loads do, in
@@ -223,16 +223,16 @@ class PortScaleEstimator:
         force : float
             Its force scale from the trials [N or N m]; zero if nothing acted there.
         """
-        system = self.system
+        system = self.system_in_state
         fitted = float(self.fitted_displacement[number])
         largest = float(self.largest_displacement[number])
         speed = float(self.largest_speed[number])
         displacement = fitted or largest or 1.0
         # modes that move the port
-        frequency = system.angular_frequency[: system.displacement_modes]
+        frequency = system.angular_frequency[: system.displacement_mode_count]
         row = self.rows[number]
         # squared amplitude of the port per unit of each mode (shapes have a modal mass of one)
-        participation = (row @ system.shapes)[: system.displacement_modes] ** 2
+        participation = (row @ system.shapes)[: system.displacement_mode_count] ** 2
         moves = participation > 1e-6 * float(participation.sum())
         is_free = not np.any(frequency[moves] > 0.0)
         is_held = np.any(moves) and np.all(frequency[moves] > 0.0)

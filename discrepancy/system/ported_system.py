@@ -49,7 +49,7 @@ def ported_system(
     by_stiffness = np.linalg.solve(mass, stiffness)
     # first order, s = (q, q'), without the integrals of states
     coordinate_count = len(mass)
-    displacement_mode_count = system.displacement_modes
+    displacement_mode_count = system.displacement_mode_count
     generator = np.zeros(
         (displacement_mode_count + coordinate_count, displacement_mode_count + coordinate_count)
     )
@@ -92,5 +92,5 @@ def _direct_forces(
         if equation.law_direction is not None:
             direct[:, column] = directions @ equation.law_direction
         elif system.is_truncated:
-            direct[:, column] = -directions @ system.residual(equation.rows[0])
+            direct[:, column] = -directions @ system.residual_displacements(equation.rows[0])
     return direct

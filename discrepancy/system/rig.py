@@ -275,8 +275,8 @@ def _control_loops(
         if section.integral:
             error_integral[next_integral] = 1.0
             next_integral += 1
-        measured = OutputEquation.of_row(
-            description.padded(section.vector),
+        measured = OutputEquation.from_row(
+            description.pad_to_all_unknowns(section.vector),
             displacement_derivative=section.quantity.order,
             state_count=unknown_count - displacement_count,
         )
@@ -286,7 +286,7 @@ def _control_loops(
             derivative=derivative,
             integral=integral,
             measured=measured.rows,
-            direction=description.padded(section.acts),
+            direction=description.pad_to_all_unknowns(section.acts),
             error_integral=error_integral,
         )
     return loops

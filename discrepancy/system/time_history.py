@@ -25,7 +25,7 @@ class LoadHistory(Protocol):
         """How the load is interpolated between samples."""
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def jump_times(self) -> tuple[float, ...]:
         """Times at which the load jumps, begins or ends [s]."""
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
@@ -55,7 +55,7 @@ class RecordedHistory:
     motion_order: int | None = None
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def jump_times(self) -> tuple[float, ...]:
         """Times at which the history jumps or has a corner [s]."""
         if self.hold is Hold.SMOOTH:
             return ()
@@ -107,7 +107,7 @@ class FormulaHistory:
     hold: ClassVar[Hold | None] = Hold.SMOOTH
 
     @property
-    def edges(self) -> tuple[float, ...]:
+    def jump_times(self) -> tuple[float, ...]:
         """Times at which the load begins or ends [s]."""
         return tuple(edge for span in self.spans for edge in span if isfinite(edge))
 

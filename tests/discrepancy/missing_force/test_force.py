@@ -32,7 +32,7 @@ from discrepancy.search.whole_search import search
 from discrepancy.system.lumped_model import LumpedModel
 from discrepancy.system.response import Conditions
 from discrepancy.verdict import Verdict, VerdictKind
-from discrepancy.workflow import Investigation, checked, investigate
+from discrepancy.workflow import Investigation, check_and_prepare, investigate
 from fe.runtime.patch import ModelPatch, PowerDamping, PowerStiffness
 from tests.discrepancy.core.kit import fitted, problem_of
 from tests.discrepancy.rigs import FEW, chosen, fmu_rig, hiding, one_mass, simulated
@@ -74,7 +74,7 @@ def write_drive(folder):
 def read(folder):
     """Read a folder with a campaign and its model."""
     model = load_model(folder / "model.toml")
-    campaign, faults = checked(read_campaign(folder), model)
+    campaign, faults = check_and_prepare(read_campaign(folder), model)
     assert not faults
     return problem_of(campaign, model)
 

@@ -26,9 +26,14 @@ from discrepancy.judgement.separability import (
     Separability,
     separability,
 )
-from discrepancy.report.decidability_text import group_lines, needs, neighbours, seen_of
+from discrepancy.report.decidability_text import (
+    campaign_needs,
+    confused_effects,
+    detectability_texts,
+    group_lines,
+)
 from discrepancy.report.figures import ReportInput, report_figures
-from discrepancy.report.page import parameter_rows, render_report, what_is_missing
+from discrepancy.report.page import missing_effects_text, parameter_rows, render_report
 from discrepancy.report.residual_figures import gauge_places, planform_figure
 from discrepancy.report.text import (
     WORDS,
@@ -159,7 +164,9 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
     )
     (told,) = (
         line
-        for line in needs(Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind)
+        for line in campaign_needs(
+            Separability(hidden, (), np.zeros((0, 0)), ()), drag.campaign, FEW, TrialKind
+        )
         if "would not be seen" in line
     )
     first = FEW[0].identifier.replace("_", " ")
@@ -168,34 +175,38 @@ def test_an_effect_is_not_the_nearest_to_itself(drag, count):
 
 
 def test_what_can_be_decided(drag, able):
-    words = {"neighbours": neighbours, "seen_of": seen_of, "able": able}
+    words = {"confused_effects": confused_effects, "detectability_texts": detectability_texts, "able": able}
     _, cells = WORDS.table("decide", [item for item in able.detectability if not item.reason], **words)
     rows = {row[0].replace(" ", "_"): row for row in cells}
     assert set(rows) == {effect.identifier for effect in FEW} - {"washout"}
     assert rows["quadratic_damping"][1] == "yes"
     told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
     said = list(
-        WORDS.rendered_blocks(WORDS.content["printed"]["check"], group_lines=group_lines, needs=needs, **told)
+        WORDS.rendered_blocks(
+            WORDS.content["printed"]["check"], group_lines=group_lines, needs=campaign_needs, **told
+        )
     )
     assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
     confused = [line for kind, line in said if kind == "say" and line.startswith("Confused: ")]
-    assert len(confused) == sum(bool(neighbours(able, name)) for name in able.identifiers)
+    assert len(confused) == sum(bool(confused_effects(able, name)) for name in able.identifiers)
     for line in confused:
-        assert all(other in line for other in neighbours(able, line.split()[1]))
+        assert all(other in line for other in confused_effects(able, line.split()[1]))
     for row, name in enumerate(able.identifiers):
         near = np.minimum(able.distance[row], able.distance[:, row]) < CONFUSION_DISTANCE
         near[row] = False
-        assert neighbours(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
+        assert confused_effects(able, name) == [able.identifiers[place] for place in np.flatnonzero(near)]
     assert group_lines(able)
-    text = " ".join(needs(able, drag.campaign, FEW, TrialKind))
+    text = " ".join(campaign_needs(able, drag.campaign, FEW, TrialKind))
     for group in able.groups:
         assert group[0].replace("_", " ") in text
-    assert " add " not in " ".join(needs(able, drag.campaign, FEW, ()))  # trials that its model cannot follow
-    unproved = needs(able, replace(drag.campaign, trials=drag.campaign.fitted), FEW, ())
+    assert " add " not in " ".join(
+        campaign_needs(able, drag.campaign, FEW, ())
+    )  # trials that its model cannot follow
+    unproved = campaign_needs(able, replace(drag.campaign, trials=drag.campaign.fitted), FEW, ())
     assert [line for line in unproved if "nothing can be proved" in line] == unproved[-1:]
     assert "nothing can be proved" not in text
     quiet = {name: replace(item, noise=None) for name, item in drag.campaign.channels.items()}
-    *_, asked = needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
+    *_, asked = campaign_needs(able, replace(drag.campaign, channels=quiet), FEW, TrialKind)
     assert asked.startswith(f"Give a noise record for {', '.join(quiet)} (")
 
 
@@ -249,7 +260,7 @@ def test_the_card_of_a_group_with_long_names_says_how_many_hypotheses(drag):
     for length, (first, second) in names.items():
         effects = (replace(effect, identifier="a", name=first), replace(effect, identifier="b", name=second))
         verdict = Verdict(VerdictKind.GROUP, "", 0.97, 12.0, effects=effects, group=("a", "b"))
-        cards[length] = what_is_missing(verdict)
+        cards[length] = missing_effects_text(verdict)
     assert cards["short"] == f"play at {effect.place} or drag at {effect.place}"
     assert cards["long"] == "one of 2 hypotheses"
 
