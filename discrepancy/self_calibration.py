@@ -272,9 +272,9 @@ def _hidden_effects(
     queue: list[Effect] = []
     not_detectable: list[str] = []
     hidden: list[HiddenEffect | None] = []
-    for number in range(count):
+    for case_number in range(count):
         drawn: HiddenEffect | None = None
-        hides_nothing = number % NULL_SHARE == 0
+        hides_nothing = case_number % NULL_SHARE == 0
         while not hides_nothing and drawn is None and len(not_detectable) < len(testable):
             if not queue:
                 queue = [testable[index] for index in generator.permutation(len(testable))]

@@ -133,9 +133,9 @@ class Simulator:
         patch = no_patch if hidden is None else candidate.patch(self.setting, hidden.normal)
         noise_ratios = {name: self._noise_ratio(name, generator) for name in self.campaign.channels}
         trials: list[Trial] = []
-        for number, data in enumerate(problem.trials):
+        for trial_index, data in enumerate(problem.trials):
             trial = data.trial
-            fitted_local = self.nuisances.local[number]
+            fitted_local = self.nuisances.local[trial_index]
             local = _draw_unknowns(fitted_local, data.unknowns.precision, generator)
             if has_free_initial_state(
                 trial
@@ -144,11 +144,11 @@ class Simulator:
                 local[initial_state] = fitted_local[initial_state]
             effect_acts = trial.kind in candidate.acts_on
             response, _ = problem.response(
-                number, shared, local, patch if effect_acts else no_patch, REFINEMENT
+                trial_index, shared, local, patch if effect_acts else no_patch, REFINEMENT
             )
-            earlier_trials = self.nuisances.local[:number]
+            earlier_trials = self.nuisances.local[:trial_index]
             point = Point(shared, (*earlier_trials, local), np.empty(0))
-            values = problem.prediction(number, point, response).copy()
+            values = problem.prediction(trial_index, point, response).copy()
             for column, name in enumerate(trial.channels):
                 noise = _draw_noise(data.noise[column], trial, generator)
                 values[:, column] += noise_ratios[name] * trial.noise_factor * noise

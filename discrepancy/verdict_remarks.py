@@ -88,8 +88,8 @@ def effects_not_fitted(
             if refusal is not None and not 0.0 < gain < SEARCH.least_gain_to_fit:
                 reason = f"could not be fitted: {refusal}"
             elif isnan(gain):
-                where = "along the missing force" if along_force else "at first sight"
-                reason = f"less promising than others {where}"
+                place_clause = "along the missing force" if along_force else "at first sight"
+                reason = f"less promising than others {place_clause}"
             else:
                 reason = f"screened out: {gain:.1f} nat at most beside the model as it is"
             rows.append(NotFitted(identifier, reason, gain))

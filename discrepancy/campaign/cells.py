@@ -128,7 +128,7 @@ def seconds_of_clock_times(
     """
     seconds_of_columns: dict[int, dict[int, Decimal]] = {}
     starts: dict[bool, Decimal] = {}  # first time of columns with, and without, a date
-    for number, cells in enumerate(columns):
+    for column, cells in enumerate(columns):
         if not any(map(CLOCK.fullmatch, cells)):
             continue
         seconds = {
@@ -137,16 +137,16 @@ def seconds_of_clock_times(
         is_dated = any(map(_has_date, cells))
         if not is_dated:
             seconds = dict(zip(seconds, _continue_past_midnight([*seconds.values()]), strict=True))
-        seconds_of_columns[number] = seconds
-        first = next(iter(seconds.values()))
-        starts[is_dated] = min(first, starts.get(is_dated, first))
+        seconds_of_columns[column] = seconds
+        first_seconds = next(iter(seconds.values()))
+        starts[is_dated] = min(first_seconds, starts.get(is_dated, first_seconds))
 
     cells_of_times = {}
-    for number, seconds in seconds_of_columns.items():
-        start = starts[any(map(_has_date, columns[number]))]
-        cells_of_times[number] = tuple(
+    for column, seconds in seconds_of_columns.items():
+        start = starts[any(map(_has_date, columns[column]))]
+        cells_of_times[column] = tuple(
             ExactNumber(seconds[row] - start) if row in seconds else ""
-            for row in range(len(columns[number]))
+            for row in range(len(columns[column]))
         )
     return cells_of_times
 

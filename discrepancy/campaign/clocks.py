@@ -17,7 +17,11 @@ from scipy.interpolate import CubicSpline
 from discrepancy.campaign.clock_columns import TIME, TableClock
 from discrepancy.campaign.columns import INPUT, NOISE, LaboratoryColumn
 from discrepancy.campaign.records import FloatArray, Hold, TrialKind
-from discrepancy.campaign.sampling import EVEN, decreasing_times_message, undo_rounding
+from discrepancy.campaign.sampling import (
+    EVENNESS_TOLERANCE,
+    decreasing_times_message,
+    undo_rounding,
+)
 from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.words import counted, is_or_are, listing
 
@@ -230,7 +234,7 @@ def _rest_samples_in_order(
     for own_times in times:
         duration = own_times.seconds[-1] - own_times.seconds[0]
         intervals.append(duration / max(len(own_times.seconds) - 1, 1))
-    if max(intervals) - min(intervals) > EVEN * min(intervals):
+    if max(intervals) - min(intervals) > EVENNESS_TOLERANCE * min(intervals):
         each = listing(
             f"{interval:.6g} s by {clock.times.head!r}"
             for clock, interval in zip(clocks, intervals, strict=True)
@@ -311,7 +315,7 @@ def _merged_times(times: Sequence[_ClockTimes]) -> tuple[FloatArray, list[list[i
         for own_times in times
         if len(own_times.seconds) > 1
     ]
-    tolerance = EVEN * min(steps, default=0.0)
+    tolerance = EVENNESS_TOLERANCE * min(steps, default=0.0)
     all_times = np.concatenate([own_times.seconds for own_times in times])
     counts = [len(own_times.seconds) for own_times in times]
     clock_numbers = np.repeat(np.arange(len(times)), counts)

@@ -155,9 +155,9 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
         raise CampaignFileError(
             f"--scale of {head!r} must be a number and units such as 200 N/V, and {scale!r} came."
         )
-    number, ratio_of_units = amount.groups()
+    amount_text, ratio_of_units = amount.groups()
     if not ratio_of_units:
-        return unit, unit, float(number)
+        return unit, unit, float(amount_text)
     reading_unit, slash, per = ratio_of_units.rpartition("/")
     if not slash:
         reading_unit, per = ratio_of_units, "1"
@@ -168,7 +168,7 @@ def scaled_unit(head: str, unit: str, scale: str) -> tuple[str, str, float]:
             f"--scale of {head!r} is for cells in {per}, and they are in {unit}: give one for "
             f"{unit}, or say --unit {head}={per}."
         ) from None
-    return unit or per, reading_unit, float(number) * factor
+    return unit or per, reading_unit, float(amount_text) * factor
 
 
 def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> float | str:
@@ -199,14 +199,14 @@ def zero_deviation(column: LaboratoryColumn, answer: str, largest: float) -> flo
             f"or 1%, {EXACT} or {FREE}, and {answer!r} came."
         )
     assert column.quantity is not None
-    number, unit = amount.groups()
+    amount_text, unit = amount.groups()
     if unit == "%":
         to_si = factor_to_si(column.quantity, column.read_in)
-        deviation = float(number) / 100.0 * largest / to_si
+        deviation = float(amount_text) / 100.0 * largest / to_si
         # two digits in the unit that the user reads
         return float(f"{deviation:.2g}") * to_si
     try:
-        return float(number) * factor_to_si(column.quantity, unit or column.read_in)
+        return float(amount_text) * factor_to_si(column.quantity, unit or column.read_in)
     except ValueError as cause:
         raise CampaignFileError(f"--zero of {column.head!r}: {cause}.") from None
 
@@ -229,8 +229,8 @@ def gain_deviation(head: str, answer: str) -> float | str:
             f"--gain of {head!r} must be a standard deviation such as 2%, {EXACT} or {FREE}, "
             f"and {answer!r} came."
         )
-    number, percent = amount.groups()
-    return float(number) / 100.0 if percent else float(number)
+    amount_text, percent = amount.groups()
+    return float(amount_text) / 100.0 if percent else float(amount_text)
 
 
 def degrees_celsius(answer: str) -> float:
@@ -297,10 +297,10 @@ def release_in_si(answer: str) -> dict[str, Any]:
     """
     amount = re.fullmatch(rf"\s*({_NUMBER})\s*(\S+)\s*", answer, re.ASCII)
     if amount is not None:
-        number, unit = amount.groups()
+        amount_text, unit = amount.groups()
         for quantity in (Quantity.DISPLACEMENT, Quantity.SIGNAL):
             if quantity in quantities_of(unit):
-                displacement = float(number) * factor_to_si(quantity, unit)
+                displacement = float(amount_text) * factor_to_si(quantity, unit)
                 return {"displacement": displacement, "unit": UNITS[quantity].si}
     raise CampaignFileError(
         f"--release must be a length or a voltage such as 15.5mm, and {answer!r} came."

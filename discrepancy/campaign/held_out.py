@@ -7,7 +7,7 @@ import numpy as np
 
 from discrepancy.campaign.records import Campaign, Trial, TrialKind
 
-SHARE = 0.25
+HELD_OUT_SHARE = 0.25
 """Fraction of the trials of a kind that is held out."""
 LEAST_TRIALS = 3
 """Fewest trials of a kind from which one may be held out."""
@@ -87,7 +87,7 @@ def _choose_trials(trials: Sequence[Trial], campaign: Campaign, held_out: set[st
     """
     if len(trials) < LEAST_TRIALS:
         return set()
-    count = max(1, round(SHARE * len(trials)))
+    count = max(1, round(HELD_OUT_SHARE * len(trials)))
     spared: set[str] = set()
     for index in _order_of_candidates(trials):
         if len(spared) == count:

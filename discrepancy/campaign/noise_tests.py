@@ -17,7 +17,7 @@ SHORTEST_SERIES = 32
 """Fewest samples of a series whose whiteness is tested."""
 LAGS = 20
 """Largest number of autocorrelations in the Ljung-Box test."""
-LOOKED_AT = 0.25
+LARGEST_LAG_SHARE = 0.25
 """Largest lag of an autocorrelation, as a fraction of the record."""
 LEAST_DRAWS = 8_000
 """Fewest series from which the distribution of the Ljung-Box statistic is taken."""
@@ -159,7 +159,7 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
         Variance of `rho` if the records are white.
     """
     longest = max(len(record) for record in series)
-    lags = max(int(LOOKED_AT * longest), 2)
+    lags = max(int(LARGEST_LAG_SHARE * longest), 2)
     products = np.zeros(lags + 1)
     pair_counts = np.zeros(lags + 1)
     for record in series:

@@ -282,13 +282,13 @@ class CampaignSection(Section):
 
     def _unknown_channels(self) -> Iterator[Fault]:
         """Yield the names in `channels` and `left_out` of trials that are not names of channels."""
-        known = {channel.name for channel in self.channel}
+        channel_names = {channel.name for channel in self.channel}
         for trial in self.trial:
             for name in (*(trial.channels or ()), *trial.left_out):
                 yield (
-                    name not in known,
+                    name not in channel_names,
                     f"the trial {trial.name!r} names the channel {name!r}, "
-                    f"which is not among the channels {', '.join(sorted(known))}",
+                    f"which is not among the channels {', '.join(sorted(channel_names))}",
                 )
 
     def _logger_faults(self) -> Iterator[Fault]:
@@ -306,10 +306,10 @@ class CampaignSection(Section):
                 f"`loggers` names {name!r}, but the channels and inputs are {', '.join(expected)}",
             )
         for name in expected:
-            number = "more than one" if name in logged else "none"
+            logger_count = "more than one" if name in logged else "none"
             yield (
                 logged.count(name) != 1,
-                f"{name!r} must be on one of the `loggers`, and it is on {number}",
+                f"{name!r} must be on one of the `loggers`, and it is on {logger_count}",
             )
         loggers_of_inputs = [names for names in self.loggers.values() if inputs.intersection(names)]
         yield (

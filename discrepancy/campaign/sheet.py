@@ -48,7 +48,7 @@ OTHER_FORMATS = {
     ),
 }
 """Formats that are not read, by their ending: what they are, and how a table comes out of them."""
-_LOOKED_AT = 500
+_LINES_FOR_SEPARATOR = 500
 """Number of first lines by which the separator is chosen."""
 
 
@@ -201,11 +201,11 @@ def _cell(row: Sequence[str], index: int) -> str:
     return row[index] if index < len(row) else ""
 
 
-def _remark_on_texts(title: str, numbers: int, texts: int) -> str:
+def _remark_on_texts(title: str, number_count: int, text_count: int) -> str:
     """Return the remark on a column that is left out for its texts, beside a count of numbers."""
     content = "no numbers"
-    if numbers:
-        content = f"{counted(numbers, 'number')} and {counted(texts, 'text')}"
+    if number_count:
+        content = f"{counted(number_count, 'number')} and {counted(text_count, 'text')}"
     return f"; the column {title!r} holds {content} and is left out"
 
 
@@ -250,13 +250,13 @@ def _text_rows(path: Path) -> tuple[Rows, str]:
         The entries are whether a table is found, whether its heads are words, and the number of
         cells with numbers minus that of cells with texts.
         """
-        rows = _split_rows(lines[:_LOOKED_AT], separator, path.name)
+        rows = _split_rows(lines[:_LINES_FOR_SEPARATOR], separator, path.name)
         numbers_minus_texts = 0
         for _, row in rows:
-            numbers = sum(map(is_value, row))
-            texts = sum(map(bool, row)) - numbers
-            if numbers > 1:
-                numbers_minus_texts += numbers - texts
+            number_count = sum(map(is_value, row))
+            texts = sum(map(bool, row)) - number_count
+            if number_count > 1:
+                numbers_minus_texts += number_count - texts
         try:
             layout = find_table(rows, path.name, "")
         except CampaignFileError:

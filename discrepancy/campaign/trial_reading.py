@@ -28,7 +28,7 @@ from discrepancy.errors import CampaignDataError, CampaignFileError
 from reporting.table_file import TextTable
 from reporting.words import counted, is_or_are
 
-LATE = 1.5
+LATEST_FIRST_SAMPLE = 1.5
 """Latest time of the first sample after a release from rest, in sampling intervals."""
 _REPEATED = "leave one out, or tell repeated readings apart by a column `time`"
 
@@ -154,7 +154,7 @@ def _read_times(
 
 def _check_release_time(release: Release, time: FloatArray, file: str, user: str) -> None:
     """Refuse a ring-down whose times (N,) [s] do not begin at the release."""
-    if release.at_rest and time[0] > LATE * (time[1] - time[0]):
+    if release.at_rest and time[0] > LATEST_FIRST_SAMPLE * (time[1] - time[0]):
         raise CampaignDataError(
             f"{file}: the time of {user} begins at {time[0]:g} s, and the first sample of a "
             "release from rest is at the release, at 0: count times from there, or set `at_rest = "

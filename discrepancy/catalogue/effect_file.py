@@ -133,12 +133,12 @@ def _effect(table: object, place: str) -> Effect:
 
 def _check_names(section: EffectSection, names: frozenset[str], place: str) -> None:
     """Refuse names of parameters and events that mean something else in an expression."""
-    taken = {*SCALES, *RESERVED}
+    used_names = {*SCALES, *RESERVED}
     for name in names:
-        if not name.isidentifier() or name in taken:
+        if not name.isidentifier() or name in used_names:
             raise CatalogueError(f"{place}: a parameter must not be called {name!r}.")
     for name in section.events:
-        if not name.isidentifier() or name in taken | names:
+        if not name.isidentifier() or name in used_names | names:
             raise CatalogueError(f"{place}: an event must not be called {name!r}.")
 
 
@@ -228,44 +228,44 @@ class _PrimitiveTemplate:
         Without events and windows there is one primitive. If the expression `if` is zero, there is
         none.
         """
-        numbers = dict(context.values)
+        values_by_name = dict(context.values)
         for name in self.scales:
-            numbers[name] = SCALES[name](context)
-        if "if" in self.conditions and self.conditions["if"].value(numbers) == 0.0:
+            values_by_name[name] = SCALES[name](context)
+        if "if" in self.conditions and self.conditions["if"].value(values_by_name) == 0.0:
             return
         if not self.moments and not self.acts_in_windows:
-            yield self._primitive(numbers, context.target)
+            yield self._primitive(values_by_name, context.target)
             return
         for trial in context.setting.campaign.trials:
             if not trial.is_dynamic:
                 continue
             occurrences = context.setting.campaign.event_moments(trial.name, self.moments)
             for moments in occurrences:
-                numbers_then = {**numbers, **moments}
+                numbers_then = {**values_by_name, **moments}
                 begin = self._moment("begin", numbers_then)
                 end = self._moment("end", numbers_then)
                 primitive = self._primitive(numbers_then, context.target)
                 yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
-    def _moment(self, key: str, numbers: Mapping[str, float]) -> float | None:
+    def _moment(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
         """Return the begin or the end of its window [s]; None if the window is open on that side.
 
         Parameters
         ----------
         key : str
             "begin" or "end".
-        numbers : mapping of str to float
+        values_by_name : mapping of str to float
             Values of the names in expressions.
         """
         expression = self.conditions.get(key)
-        return None if expression is None else expression.value(numbers)
+        return None if expression is None else expression.value(values_by_name)
 
-    def _primitive(self, numbers: Mapping[str, float], target: Target) -> Primitive:
+    def _primitive(self, values_by_name: Mapping[str, float], target: Target) -> Primitive:
         """Return the primitive with its expressions evaluated.
 
         Parameters
         ----------
-        numbers : mapping of str to float
+        values_by_name : mapping of str to float
             Values of the names in expressions.
         target : Target
             What the place stands for.
@@ -280,10 +280,12 @@ class _PrimitiveTemplate:
             elif not isinstance(value, Expression):
                 row[name] = value
             elif name in formulas:  # a formula in time stays a formula
-                used_numbers = {key: numbers[key] for key in value.used_names() if key in numbers}
+                used_numbers = {
+                    key: values_by_name[key] for key in value.used_names() if key in values_by_name
+                }
                 row[name] = value.with_numbers(used_numbers)
             else:
-                row[name] = value.value(numbers)
+                row[name] = value.value(values_by_name)
         return _primitive_of(self.kind, row)
 
 

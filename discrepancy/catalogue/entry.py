@@ -13,7 +13,7 @@ from discrepancy.system.interface import Model
 from discrepancy.system.scales import Scales
 from fe.runtime.patch import ModelPatch
 
-NINETY = 1.6448536269514722
+NINETY_PERCENT_QUANTILE = 1.6448536269514722
 """Standard normal quantile of 0.95."""
 Number = Annotated[float, Strict()]
 ROW = ConfigDict(extra="forbid", allow_inf_nan=False, str_min_length=1)
@@ -46,7 +46,7 @@ class Prior:
         low, high = self.low, self.high
         if self.shape == "log_normal":
             low, high = log(low), log(high)
-        return 0.5 * (low + high), 0.5 * (high - low) / NINETY
+        return 0.5 * (low + high), 0.5 * (high - low) / NINETY_PERCENT_QUANTILE
 
     def value(self, u: float) -> float:
         """Return the value at the standard normal variable `u`."""

@@ -96,12 +96,13 @@ def load_catalogue(
 
 def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
     """Return the effect with an identifier; raise `CatalogueError` if there is none."""
-    known = {effect.identifier: effect for effect in effects}
-    if identifier not in known:
+    effects_by_identifier = {effect.identifier: effect for effect in effects}
+    if identifier not in effects_by_identifier:
         raise CatalogueError(
-            f"The catalogue has no effect {identifier!r}; it has {', '.join(known)}."
+            f"The catalogue has no effect {identifier!r}; it has "
+            f"{', '.join(effects_by_identifier)}."
         )
-    return known[identifier]
+    return effects_by_identifier[identifier]
 
 
 def variants_in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:

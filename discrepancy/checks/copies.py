@@ -14,7 +14,7 @@ COPIED_SHARE = 0.01
 """A channel is a copy if another one leaves less than this fraction of its noise unexplained."""
 LEAST_COPIED = 32
 """Fewest samples in which copies are searched."""
-_LAGS = 2**14
+_MOST_SHIFTED_SAMPLES = 2**14
 """Samples in which the shift between two channels is searched."""
 
 
@@ -61,7 +61,7 @@ def _copied_pairs(trial: Trial) -> Iterator[_Copy]:
     """
     if len(trial.time) < LEAST_COPIED:
         return
-    noise = _noise_by_differences(trial.values[:_LAGS])
+    noise = _noise_by_differences(trial.values[:_MOST_SHIFTED_SAMPLES])
     power = np.sum(noise**2, axis=0)
     # Sixth differences of white noise have the lag-one correlation -6/7; those of a smooth motion
     # without noise have a correlation near 1.

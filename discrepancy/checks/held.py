@@ -1,6 +1,6 @@
 """Channels that stand still within a motion: runs of equal readings that no sensor makes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,27 +16,27 @@ from discrepancy.campaign.records import (
 from discrepancy.campaign.sampling import lattice_step, least_beyond_rounding, quantum_of
 from discrepancy.checks.fault import DataFault, FaultKind, samples_text
 
-LEAST_HELD = 8
+LEAST_RUN_LENGTH = 8
 """Fewest equal readings in a row that are examined."""
-_SURROUNDINGS = 4
+_SURROUNDINGS_LENGTH = 4
 """Length of the surroundings on either side of a run, as a multiple of the run's length."""
-_COMPARABLE = 0.25
+_COMPARABLE_LENGTH = 0.25
 """Least length of a comparable run, as a fraction of the length of the run that is judged.
 
 Comparable runs come from pauses, square waves and coarse digits."""
-_MOST_COMPARABLE = 1.0 / 3.0
+_LARGEST_COMPARABLE_SHARE = 1.0 / 3.0
 """Largest fraction of the surroundings that comparable runs may take."""
-_JUMP = 3.0
+_LEAST_JUMP = 3.0
 """Least jump of a reading from one sample to the next, in quanta; turning points change less."""
-_PACE = 0.25
+_LEAST_RELATIVE_JUMP = 0.25
 """Least jump into or out of a run, as a fraction of the mean change between samples around it.
 
 A structure that slows down gradually changes less."""
-_MOVING = 0.5
+_RANGE_OF_MOVING_RECORD = 0.5
 """Least range of another record during a run, over its usual range, if that record moves."""
-_RESTING = 0.25
+_RANGE_OF_RESTING_RECORD = 0.25
 """Largest value of the same ratio if the other record rests."""
-_NOISE_DIGITS = 2.0
+_NOISE_IN_QUANTA = 2.0
 """Standard deviation of noise, in quanta, above which equal readings in a row are unlikely."""
 _LEAST_UPDATES = 4.0
 """Fewest updates of a sensor that a faulty run must span.
@@ -162,7 +162,7 @@ def stuck_spans(
     is_equal_to_next = (np.diff(values) == 0.0) & used[1:] & used[:-1]
     bounds_of_runs = runs_of_true(is_equal_to_next) + np.array([0, 1])
     lengths = bounds_of_runs[:, 1] - bounds_of_runs[:, 0]
-    long_runs = bounds_of_runs[lengths >= LEAST_HELD].tolist()
+    long_runs = bounds_of_runs[lengths >= LEAST_RUN_LENGTH].tolist()
     distinct = np.unique(values)
     if len(distinct) < 3 or not long_runs:
         return []
@@ -170,7 +170,7 @@ def stuck_spans(
     extremes = (distinct[0], distinct[-1])
     inner_runs = [(start, stop) for start, stop in long_runs if values[start] not in extremes]
     quantum = _quantum_in_time(values)
-    if min(noise, roughness(values)) > _NOISE_DIGITS * quantum:
+    if min(noise, roughness(values)) > _NOISE_IN_QUANTA * quantum:
         least_length = _LEAST_UPDATES * update_length(values)
         return [(start, stop) for start, stop in inner_runs if stop - start >= least_length]
     changes = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))
@@ -199,14 +199,15 @@ def _is_sensor_failure(
         The other records.
     """
     length = stop - start
-    least_jump = _JUMP * runs.quantum
+    least_jump = _LEAST_JUMP * runs.quantum
     if max(runs.changes[start], runs.changes[stop]) < least_jump:
+        # the readings slow down before and after the run, as in a true standstill
         return False
 
     # no failure if runs of comparable length show a dead zone, or fill much of the surroundings
-    begin_of_surroundings = max(start - _SURROUNDINGS * length, 0)
-    end_of_surroundings = min(stop + _SURROUNDINGS * length, len(runs.values))
-    is_comparable = runs.lengths >= _COMPARABLE * length
+    begin_of_surroundings = max(start - _SURROUNDINGS_LENGTH * length, 0)
+    end_of_surroundings = min(stop + _SURROUNDINGS_LENGTH * length, len(runs.values))
+    is_comparable = runs.lengths >= _COMPARABLE_LENGTH * length
     is_in_surroundings = (
         is_comparable
         & (runs.bounds[:, 0] >= begin_of_surroundings)
@@ -222,7 +223,8 @@ def _is_sensor_failure(
     if (
         len(window_starts) < 2
         or is_dead_zone
-        or comparable_samples > _MOST_COMPARABLE * (end_of_surroundings - begin_of_surroundings)
+        or comparable_samples
+        > _LARGEST_COMPARABLE_SHARE * (end_of_surroundings - begin_of_surroundings)
     ):
         return False
 
@@ -230,23 +232,45 @@ def _is_sensor_failure(
     changes_around = np.r_[
         runs.changes[begin_of_surroundings : start + 1], runs.changes[stop:end_of_surroundings]
     ]
-    speed = max(least_jump, _PACE * float(np.mean(changes_around)))
+    speed = max(least_jump, _LEAST_RELATIVE_JUMP * float(np.mean(changes_around)))
     sides_at_speed = np.count_nonzero(runs.changes[[start, stop]] >= speed)
 
-    # do other records move meanwhile, compared with windows of the same length around?
-    ranges = [
-        np.ptp(other_records[window_start : window_start + length], axis=0)
-        for window_start in window_starts
-    ]
-    usual_range = np.median(ranges, axis=0)
-    range_meanwhile = np.ptp(other_records[start:stop], axis=0)
-    moves = (range_meanwhile > _MOVING * usual_range) & (usual_range > 0.0)
-    another_moves = bool(np.any(moves))
-    another_rests = not another_moves and bool(np.any(range_meanwhile < _RESTING * usual_range))
+    movement = _other_movement(start, stop, window_starts, other_records)
     if sides_at_speed == 2:
-        return not another_rests
+        return not movement.another_rests
     is_only_one = np.count_nonzero(is_comparable) == 1
-    return sides_at_speed == 1 and another_moves and is_only_one
+    return sides_at_speed == 1 and movement.another_moves and is_only_one
+
+
+class _OtherMovement(NamedTuple):
+    """Whether another record moves during a run, or whether one rests and none moves."""
+
+    another_moves: bool
+    another_rests: bool
+
+
+def _other_movement(
+    start: int, stop: int, window_starts: Sequence[int], other_records: FloatArray
+) -> _OtherMovement:
+    """Return whether other records move during a run, compared with windows around the run.
+
+    Parameters
+    ----------
+    start, stop : int
+        First sample of the run, and the one after its last.
+    window_starts : sequence of int
+        First samples of the windows, which are as long as the run.
+    other_records : (N, K) ndarray
+        The other records.
+    """
+    length = stop - start
+    ranges = [np.ptp(other_records[first : first + length], axis=0) for first in window_starts]
+    usual_range = np.median(ranges, axis=0)
+    range_in_run = np.ptp(other_records[start:stop], axis=0)
+    moves = (range_in_run > _RANGE_OF_MOVING_RECORD * usual_range) & (usual_range > 0.0)
+    another_moves = bool(np.any(moves))
+    rests = range_in_run < _RANGE_OF_RESTING_RECORD * usual_range
+    return _OtherMovement(another_moves, not another_moves and bool(np.any(rests)))
 
 
 def _quantum_in_time(values: FloatArray) -> float:

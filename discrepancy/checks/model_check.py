@@ -13,7 +13,12 @@ from discrepancy.catalogue.entry import Setting
 from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
 from discrepancy.checks.quality import dead_fault, is_still
 from discrepancy.checks.rest import noise_record_faults
-from discrepancy.checks.scales import ABOVE_NOISE, data_scales, swap_fault, swapped_channels
+from discrepancy.checks.scales import (
+    CLEAR_NOISE_DEVIATIONS,
+    data_scales,
+    swap_fault,
+    swapped_channels,
+)
 from discrepancy.checks.unit_slips import unit_slips
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import fit
@@ -25,7 +30,7 @@ from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
 from fe.runtime.patch import ModelPatch
 
-MOST_OF_PRIOR = 0.9
+LARGEST_DEVIATION_RATIO = 0.9
 """Fraction of its prior standard deviation above which a parameter is not observable."""
 
 
@@ -65,10 +70,12 @@ def posterior_to_prior_ratios(campaign: Campaign, model: Model) -> dict[str, flo
 def unobservable_parameter_faults(campaign: Campaign, model: Model) -> Iterator[DataFault]:
     """Yield one fault that names the calibrated parameters that the records do not determine.
 
-    Those keep more than `MOST_OF_PRIOR` of their prior standard deviation.
+    Those keep more than `LARGEST_DEVIATION_RATIO` of their prior standard deviation.
     """
     ratios = posterior_to_prior_ratios(campaign, model)
-    undetermined = {name: ratio for name, ratio in ratios.items() if ratio > MOST_OF_PRIOR}
+    undetermined = {
+        name: ratio for name, ratio in ratios.items() if ratio > LARGEST_DEVIATION_RATIO
+    }
     if undetermined:
         names = ", ".join(f"{name!r} ({ratio:.0%})" for name, ratio in undetermined.items())
         noun = "parameters" if len(undetermined) > 1 else "parameter"
@@ -84,7 +91,7 @@ LEAST_PERIODS = 3.0
 """Fewest periods of the first mode in a record in time."""
 LEAST_SAMPLES = 4.0
 """Fewest samples in a period of the first mode."""
-MATTERS = 0.3
+LEAST_REPORTED_CHANGE = 0.3
 """Least effect of an input's course between samples that is reported (rms, over the noise)."""
 
 
@@ -158,9 +165,9 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
 
     The key `hold` of a campaign states whether an input is smooth, linear or constant between its
     samples. For inputs without this key, the model's response to straight lines is compared with
-    its response to smooth curves. The fault is reported if the two differ by more than `MATTERS`
-    times the noise (rms) in any channel with a noise record. It limits the conclusions, but does
-    not make the data wrong.
+    its response to smooth curves. The fault is reported if the two differ by more than
+    `LEAST_REPORTED_CHANGE` times the noise (rms) in any channel with a noise record. It limits the
+    conclusions, but does not make the data wrong.
 
     Parameters
     ----------
@@ -193,7 +200,7 @@ def _hold_faults(campaign: Campaign, model: Model, trial: Trial) -> Iterator[Dat
     noise = [trial.noise_deviation(campaign.channels[name]) or np.inf for name in trial.channels]
     differences = np.sqrt(np.mean((response_to_lines - response_to_curves) ** 2, axis=0)) / noise
     largest = differences.max()
-    if largest > MATTERS:
+    if largest > LEAST_REPORTED_CHANGE:
         names = ", ".join(map(repr, open_inputs))
         channel = trial.channels[int(differences.argmax())]
         table = "[[trial]]" if force_is_open else "[[input]]"
@@ -286,9 +293,9 @@ def _undersampled_sentence(trial: Trial, frequency: float, samples: float) -> st
 def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> Iterator[DataFault]:
     """Yield a fault for each channel with constant readings in a static trial that should change.
 
-    By the prediction they would change by more than `ABOVE_NOISE` times the noise or the sensor's
-    quantum. `check_data` reports, without a model, the channels that are constant in a dynamic
-    trial or in all their trials.
+    By the prediction they would change by more than `CLEAR_NOISE_DEVIATIONS` times the noise or the
+    sensor's quantum. `check_data` reports, without a model, the channels that are constant in a
+    dynamic trial or in all their trials.
 
     Parameters
     ----------
@@ -305,7 +312,7 @@ def _dead_faults(campaign: Campaign, predictions: Mapping[str, FloatArray]) -> I
             quantum = quantum_of(readings)
             noise = trial.noise_deviation(campaign.channels[name])
             predicted_range = np.ptp(predictions[trial.name][:, column])
-            if quantum and predicted_range > ABOVE_NOISE * max(noise, quantum):
+            if quantum and predicted_range > CLEAR_NOISE_DEVIATIONS * max(noise, quantum):
                 yield dead_fault(trial, name)
 
 

@@ -20,7 +20,7 @@ from discrepancy.checks.held import roughness, runs_of_true, stuck_sensor_faults
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
 from discrepancy.checks.rest import noise_record_faults
 
-CLIPPED_RUN = 3
+LEAST_CLIPPED_RUN = 3
 """Fewest samples in a row at an extreme value that make a record clipped."""
 _LEVEL = 1e-3
 """Level of the F test between a noise record and repeats."""
@@ -149,7 +149,7 @@ def is_still(trial: Trial, name: str) -> bool:
     """Return whether a channel shows one value throughout a trial that excites the structure."""
     column = trial.channels.index(name)
     used = trial.used[:, column]
-    if used.sum() < CLIPPED_RUN or np.ptp(trial.values[used, column]) > 0.0:
+    if used.sum() < LEAST_CLIPPED_RUN or np.ptp(trial.values[used, column]) > 0.0:
         return False
     return trial.is_dynamic or bool(np.ptp(trial.load[used]) > 0.0)
 
@@ -159,7 +159,7 @@ def _clipped_faults(
 ) -> Iterator[DataFault]:
     """Yield a fault for each side at which a channel's readings (N,) in a trial are clipped."""
     readings = values[used]
-    if len(readings) < CLIPPED_RUN:
+    if len(readings) < LEAST_CLIPPED_RUN:
         return
     load = None
     if not trial.is_dynamic:
@@ -197,7 +197,7 @@ def clipped_run(values: FloatArray, extreme: float, load: FloatArray | None = No
         Loads of readings at rest; without them the readings are samples in time.
     """
     digit = quantum_of(values)
-    least_length = CLIPPED_RUN * (update_length(values) if load is None else 1.0)
+    least_length = LEAST_CLIPPED_RUN * (update_length(values) if load is None else 1.0)
     longest = 0
     for start, stop in runs_of_true(values == extreme).tolist():
         if stop - start < max(least_length, longest + 1):
@@ -229,7 +229,7 @@ def _is_clipped_over_load(
     """
     others = np.delete(np.arange(len(values)), np.s_[start:stop])
     loads_of_run = np.unique(load[start:stop])
-    if loads_of_run.size < CLIPPED_RUN or np.unique(load[others]).size < 2:
+    if loads_of_run.size < LEAST_CLIPPED_RUN or np.unique(load[others]).size < 2:
         return False
     line = np.polynomial.Polynomial.fit(load[others], values[others], 1)
     beyond = float(np.max(np.abs(line(load[start:stop]) - values[start])))

@@ -10,17 +10,17 @@ from discrepancy.campaign.noise_tests import autocorrelation, statistical_ineffi
 from discrepancy.campaign.records import Campaign, FloatArray, NoiseRecord
 from discrepancy.checks.fault import DataFault, FaultKind
 
-SHORTEST = 128
+SHORTEST_RECORD = 128
 """Fewest samples of a noise record that is judged."""
-LARGEST_RATIO = 2.0
+LARGEST_SCATTER_RATIO = 2.0
 """Largest scatter of the loudest quarter of a noise record over that of the quietest."""
-LARGEST_DRIFT = 0.6
+LARGEST_DRIFT_SHARE = 0.6
 """Largest fraction of the variance of a noise record that a cubic in time may take."""
-LARGEST_LINE = 0.05
+LARGEST_LINE_SHARE = 0.05
 """Largest fraction of the variance that a line at the model's frequency may take."""
 LEAST_PERIODS = 8.0
 """Fewest periods in a noise record in which a line is searched."""
-NEAR = 0.1
+RELATIVE_HALF_BAND = 0.1
 """Half width of the band around the model's frequency in which a line is searched, relative."""
 _LEVEL = 1e-5
 """Level of the F test between quarters of a noise record."""
@@ -56,9 +56,9 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
     """Return what a noise record contains besides stationary noise.
 
     Without a frequency two contents are searched. One is a drift: a cubic in time that has more
-    than `LARGEST_DRIFT` of the variance. The other is an unsteady scatter: two quarters of the
-    record whose standard deviations differ by at least a factor of two, and significantly by an F
-    test at 1e-5. With a frequency, a vibration is searched: a spectral line within 10 % of the
+    than `LARGEST_DRIFT_SHARE` of the variance. The other is an unsteady scatter: two quarters of
+    the record whose standard deviations differ by at least a factor of two, and significantly by an
+    F test at 1e-5. With a frequency, a vibration is searched: a spectral line within 10 % of the
     frequency that has more than 5 % of the variance. Lines at mains frequencies do not count.
 
     Parameters
@@ -73,7 +73,7 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
     str or None
         Verb phrase for a message, such as "drifts by ..."; None if there is only stationary noise.
     """
-    if record.samples is None or record.interval is None or len(record.samples) < SHORTEST:
+    if record.samples is None or record.interval is None or len(record.samples) < SHORTEST_RECORD:
         return None
     residual, _ = remove_lines(record.samples - record.samples.mean(), record.interval)
     if frequency is not None:
@@ -81,7 +81,7 @@ def disturbance_phrase(record: NoiseRecord, frequency: float | None = None) -> s
     time = np.linspace(-1.0, 1.0, len(residual))
     trend = np.polynomial.Chebyshev.fit(time, residual, 3)(time)
     fraction = float(trend @ trend) / float(residual @ residual)
-    if fraction > LARGEST_DRIFT:
+    if fraction > LARGEST_DRIFT_SHARE:
         return f"drifts by {np.ptp(trend):.3g} (SI) over its length, {fraction:.0%} of its variance"
     return _unsteady_scatter_phrase(residual - trend, record.interval)
 
@@ -99,13 +99,13 @@ def _vibration_phrase(residual: FloatArray, interval: float, frequency: float) -
         Frequency of the mode [Hz].
     """
     is_short = frequency * interval * len(residual) < LEAST_PERIODS
-    if is_short or any(abs(frequency / mains - 1.0) < NEAR for mains in MAINS):
+    if is_short or any(abs(frequency / mains - 1.0) < RELATIVE_HALF_BAND for mains in MAINS):
         return None
-    line = strongest_line_near(residual, interval, frequency, NEAR * frequency)
+    line = strongest_line_near(residual, interval, frequency, RELATIVE_HALF_BAND * frequency)
     if line is None:
         return None
     fraction = float(line @ line) / float(residual @ residual)
-    if fraction <= LARGEST_LINE:
+    if fraction <= LARGEST_LINE_SHARE:
         return None
     return f"holds a line near the model's {frequency:.3g} Hz with {fraction:.0%} of its variance"
 
@@ -134,7 +134,7 @@ def _unsteady_scatter_phrase(residual: FloatArray, interval: float) -> str | Non
     )
     # Bonferroni: the largest ratio among 12 ordered pairs of quarters
     p_value = 12.0 * f_distribution.sf(ratio**2, *degrees_of_freedom)
-    if ratio < LARGEST_RATIO or p_value > _LEVEL:
+    if ratio < LARGEST_SCATTER_RATIO or p_value > _LEVEL:
         return None
     first_sample = sum(map(len, quarters[:loudest]))
     begin = first_sample * interval

@@ -18,14 +18,14 @@ _DRIVES = {
     TrialKind.FLIGHT: (Quantity.ACCELERATION, "g"),
 }
 """Quantity that drives a trial, and its unit; a load factor may have been recorded in m/s2."""
-SURE_SLIP = 500.0
+CERTAIN_FACTOR = 500.0
 """Slips beyond this factor are certain from one record.
 
 Smaller ones are a doubt until several agree.
 """
-DOUBT = 7.0
+DOUBTFUL_FACTOR = 7.0
 """Slips within this factor may be physical: a doubt if several records agree, else nothing."""
-LEAST = 2.0
+LEAST_FACTOR = 2.0
 """Least factor between two units that is a slip."""
 
 
@@ -57,7 +57,7 @@ class Slip(NamedTuple):
 
         A larger slip is distinct from other slips, and allows for a larger factor.
         """
-        for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBT, 1.35)):
+        for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBTFUL_FACTOR, 1.35)):
             if self.size >= least_size:
                 return width
         return 1.1
@@ -95,7 +95,7 @@ def find_slip(
     Slip or None
         The two units; None if no pair explains the ratio.
     """
-    if abs(log(abs(scale))) < log(LEAST / 1.1):
+    if abs(log(abs(scale))) < log(LEAST_FACTOR / 1.1):
         return None
     names = {*UNITS[quantity].usual}
     if stated:
@@ -110,7 +110,7 @@ def find_slip(
                 continue
             factor = meant_in_si / assumed_in_si if drive else assumed_in_si / meant_in_si
             slip = Slip(factor, meant, assumed)
-            if slip.size > LEAST:
+            if slip.size > LEAST_FACTOR:
                 distances[slip] = slip.distance(scale)
     explaining = [slip for slip, distance in distances.items() if distance < log(slip.width)]
     return min(explaining, key=lambda slip: distances[slip], default=None)
@@ -195,7 +195,7 @@ def _slips_in_trial(
         channel, _ = key
         slip = _slip_of_channel(campaign, channel, [scales[key]])
         # a small factor in one trial may be physical, such as lift that shifts from the outer wing
-        if slip is not None and slip.size >= SURE_SLIP:
+        if slip is not None and slip.size >= CERTAIN_FACTOR:
             yield from _channel_faults(campaign, channel, slip, [trial])
 
 
@@ -282,7 +282,7 @@ def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[Data
         Number of records that show the same slip.
     """
     sentence = fault.sentence
-    if slip.size >= SURE_SLIP or (slip.size >= DOUBT and agreeing > 1):
+    if slip.size >= CERTAIN_FACTOR or (slip.size >= DOUBTFUL_FACTOR and agreeing > 1):
         yield replace(fault, sentence=f"{sentence}; no physical effect is that large.")
-    elif slip.size >= DOUBT or agreeing > 1:
+    elif slip.size >= DOUBTFUL_FACTOR or agreeing > 1:
         yield replace(fault, kind=FaultKind.UNIT_DOUBT, sentence=f"{sentence}, or mend the model.")

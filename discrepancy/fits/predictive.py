@@ -14,7 +14,7 @@ from scipy.stats import multivariate_t
 
 from calibration.static.posterior import stratified
 from discrepancy.campaign.records import FloatArray
-from discrepancy.catalogue.entry import NINETY
+from discrepancy.catalogue.entry import NINETY_PERCENT_QUANTILE
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.beginnings import (
     refit_from_first_readings,
@@ -348,8 +348,8 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     axes = directions * np.sqrt(np.maximum(variances, 0.0))
     energy_rises = []
     for axis in axes.T:
-        energy_rises.append(energy(fitted_effect - NINETY * axis))
-        energy_rises.append(energy(fitted_effect + NINETY * axis))
+        energy_rises.append(energy(fitted_effect - NINETY_PERCENT_QUANTILE * axis))
+        energy_rises.append(energy(fitted_effect + NINETY_PERCENT_QUANTILE * axis))
     if min(energy_rises) > LEAST_RISE:
         return fit
     return replace(fit, draws=importance_draws(energy, fitted_effect, axes))

@@ -136,7 +136,8 @@ class FmuSimulator(FmuAtRest):
         release_values = self._release_values_of_system(excitation)
         columns = list(readout.columns)
         is_derivative = np.array(readout.derivatives) > 0
-        # the samples themselves if they are even, else steps: many lengths of steps would take long
+        # Steps end at the samples if these are even. Otherwise steps of one length are made, since
+        # each length of step costs a matrix exponential, and splines lead to the samples.
         times = readout.times
         stamps, sample_rows = np.unique(np.append(np.maximum(times, 0.0), 0.0), return_inverse=True)
         is_even = len(stamps) > 2 and np.ptp(np.diff(stamps[1:])) <= LENGTH_TOLERANCE * stamps[-1]
@@ -163,23 +164,31 @@ class FmuSimulator(FmuAtRest):
         if excitation.releases:
             # the first sample is that of the held FMU: the holding force may act on outputs
             # directly
-            release_responses = [
-                self._response_to_release(excitation, name)[0] * amount
-                for name, amount in release_values.items()
-            ]
-            held_outputs = (undisturbed + sum(release_responses))[columns]
-            values[0] = np.where(is_derivative, values[0], held_outputs)
+            held_outputs = undisturbed + self._held_outputs(excitation, release_values)
+            values[0] = np.where(is_derivative, values[0], held_outputs[columns])
         if not is_even:
             return sample_by_splines(values, excitation.step, readout, [0] * len(columns))
         rates = (states @ system.state_matrix.T + forces @ system.input_matrix.T) @ rows.T
         if direct_rows.any():
             rates += np.gradient(forces, stamps, axis=0) @ direct_rows.T
+        # the last entry of `sample_rows` is time zero, which was added to the samples
         values = values[sample_rows[:-1]]
         rates = rates[sample_rows[:-1]]
         is_before = times < 0.0
         rates[is_before] = 0.0
         values[np.ix_(is_before, is_derivative)] = 0.0
         return SampledOutputs(values, rates)
+
+    def _held_outputs(
+        self, excitation: FmuExcitation, release_values: Mapping[str, float]
+    ) -> FloatArray:
+        """Return the outputs (C,) of a linear FMU before its release, less the undisturbed ones."""
+        return np.asarray(
+            sum(
+                self._response_to_release(excitation, name)[0] * value
+                for name, value in release_values.items()
+            )
+        )
 
     def _start_with_laws(
         self,

@@ -57,7 +57,8 @@ def sample_by_splines(
     readout : Readout
         Outputs and times. Before time zero the first value holds, at zero rate.
     remaining_derivatives : sequence of int
-        For each column, how many times the values are still to be differentiated.
+        How many times each column of `values` is differentiated here. It is zero if the values
+        are the wanted derivatives already.
     """
     grid = step * np.arange(len(values))
     curve = CubicSpline(grid, values)
@@ -67,10 +68,11 @@ def sample_by_splines(
     for column, order in enumerate(remaining_derivatives):
         if order > 0:
             # A second derivative of a spline is inaccurate. A new spline through the first
-            # derivatives is as accurate as the first one.
+            # derivatives is as accurate as the first one. It is differentiated once less.
             derivative = CubicSpline(grid, curve(grid, 1)[:, column])
             sampled[:, column] = derivative(clipped_times, order - 1)
             rates[:, column] = derivative(clipped_times, order)
+    # before time zero outputs rest, so that their derivatives are zero
     is_before = readout.times < 0.0
     rates[is_before] = 0.0
     sampled[np.ix_(is_before, np.array(readout.derivatives) > 0)] = 0.0

@@ -33,7 +33,7 @@ from .closed_share import closed_share_text
 from .conclusion import ComparedHypothesis
 from .proof import closed_share_or_reason
 
-LEAST_CONTRADICTING = -0.1
+CONTRADICTING_SHARE = -0.1
 """Share of the gap below which held-out trials in which a law has hardly any force contradict
 it."""
 
@@ -220,9 +220,11 @@ class Comparison(ABC, Generic[HypothesisT]):
             held_out_share = self.gap_share(hypothesis, held_out=True)
             remaining = self.unexplained_text(hypothesis, held_out_share)
             return f"in trials that were not fitted it leaves {remaining}"
-        strained = self._implausible_unknowns(hypothesis)
-        if strained:
-            return f"it needs {strained} far beside their priors: are these what you would bet on?"
+        implausible = self._implausible_unknowns(hypothesis)
+        if implausible:
+            return (
+                f"it needs {implausible} far beside their priors: are these what you would bet on?"
+            )
         return self.failed_check_reason(hypothesis)
 
     def _implausible_unknowns(self, hypothesis: HypothesisT) -> str:
@@ -239,8 +241,14 @@ class Comparison(ABC, Generic[HypothesisT]):
             "gains": slice(shared.count, None),
         }
         for kind, indices in indices_by_kind.items():
-            u = hypothesis.shared[indices][has_prior[indices]]
-            if u.size and chi2.sf(u @ u / SEARCH.prior_widening**2, u.size) < ABSOLUTE_LEVEL:
+            scaled_values = hypothesis.shared[indices][has_prior[indices]]
+            if (
+                scaled_values.size
+                and chi2.sf(
+                    scaled_values @ scaled_values / SEARCH.prior_widening**2, scaled_values.size
+                )
+                < ABSOLUTE_LEVEL
+            ):
                 return kind
         return ""
 
@@ -260,7 +268,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         share = self.gap_share(hypothesis, held_out=True)
         if share.tested:
             return not _is_share_too_small(share, least_low_end)
-        return share.value > LEAST_CONTRADICTING
+        return share.value > CONTRADICTING_SHARE
 
     @cached_property
     def nameable_hypotheses(self) -> list[HypothesisT]:
@@ -273,10 +281,12 @@ class Comparison(ABC, Generic[HypothesisT]):
         contenders: dict[CandidateKey, tuple[HypothesisT, float]] = {}
         for hypothesis in self.ranked_hypotheses:
             terms = hypothesis.candidate.terms
-            laws = [number for number, term in enumerate(terms) if self.acts_on_structure(term)]
+            law_indices = [
+                index for index, term in enumerate(terms) if self.acts_on_structure(term)
+            ]
             laws_only: HypothesisT | None = hypothesis
-            if 0 < len(laws) < len(terms):
-                laws_only = self._fit_subset(hypothesis, laws)
+            if 0 < len(law_indices) < len(terms):
+                laws_only = self._fit_subset(hypothesis, law_indices)
             if not terms or laws_only is None or laws_only.candidate.key in contenders:
                 continue
             if not self.objection_to_naming(laws_only):
@@ -285,16 +295,18 @@ class Comparison(ABC, Generic[HypothesisT]):
         least_score = best_score - SEARCH.contender_range
         return [hypothesis for hypothesis, score in contenders.values() if score > least_score]
 
-    def _fit_subset(self, hypothesis: HypothesisT, numbers: Sequence[int]) -> HypothesisT | None:
+    def _fit_subset(
+        self, hypothesis: HypothesisT, term_indices: Sequence[int]
+    ) -> HypothesisT | None:
         """Return the hypothesis of some terms of a hypothesis, given their indices.
 
         It is None if these terms cannot be fitted alone.
         """
-        candidate, effect = hypothesis.candidate.subset(numbers, hypothesis.effect)
+        candidate, effect = hypothesis.candidate.subset(term_indices, hypothesis.effect)
         key = candidate.key
-        for known in self.ranked_hypotheses:
-            if known.candidate.key == key:
-                return known
+        for fitted in self.ranked_hypotheses:
+            if fitted.candidate.key == key:
+                return fitted
         if key not in self._subsets:
             self._subsets[key] = self.fit_candidate(candidate, effect)
         return self._subsets[key]
@@ -309,8 +321,8 @@ class Comparison(ABC, Generic[HypothesisT]):
         for hypothesis in self.ranked_hypotheses:
             options[hypothesis.candidate.key] = hypothesis
         if count > 1:
-            for number in range(count):
-                single = self._fit_subset(best, [number])
+            for term_index in range(count):
+                single = self._fit_subset(best, [term_index])
                 if single is not None:
                     options[single.candidate.key] = single
         simpler = [option for option in options.values() if self._is_simpler(option, best)]

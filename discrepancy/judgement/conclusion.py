@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from discrepancy.campaign.records import FloatArray, TrialKind
-from discrepancy.catalogue.entry import NINETY, EffectParameter, ShapeParameter
+from discrepancy.catalogue.entry import NINETY_PERCENT_QUANTILE, EffectParameter, ShapeParameter
 from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.predictive import with_draws
@@ -315,7 +315,7 @@ def _scaled_interval(hypothesis: ComparedHypothesis) -> tuple[FloatArray, FloatA
         # the most probable value may lie outside of the quantiles, and is included
         return np.minimum(low, value), np.maximum(high, value)
     variances = np.diag(hypothesis.covariance)[len(hypothesis.shared) :]
-    half_width = NINETY * np.sqrt(variances)
+    half_width = NINETY_PERCENT_QUANTILE * np.sqrt(variances)
     return value - half_width, value + half_width
 
 

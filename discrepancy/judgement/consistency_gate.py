@@ -29,10 +29,10 @@ from reporting.words import counted
 CONSISTENCY_LEVEL = 1e-3
 """Level of the whole test, with Bonferroni's correction for its parts: the probability that a true
 hypothesis fails it."""
-IDENTIFIED = 0.5
+DETERMINED_DEVIATION_RATIO = 0.5
 """Ratio of posterior to prior deviation of an effect parameter below which its prior is left out of
 the test."""
-SEPARATE = 1e-6
+LEAST_REMAINING_LENGTH = 1e-6
 """Fraction of the squared length of a direction that must remain after the part that nuisances and
 the effect can compensate is projected out."""
 LEAST_FREEDOM = 20.0
@@ -131,7 +131,7 @@ def score_tests(
     """
     # An effect parameter that the data determine is refitted without its prior: the test is about
     # the residuals, and not about how probable the value of the parameter is.
-    is_determined = np.diag(fit.effect_covariance) < IDENTIFIED**2
+    is_determined = np.diag(fit.effect_covariance) < DETERMINED_DEVIATION_RATIO**2
     effect_precision = np.where(is_determined, 0.0, 1.0)
     screen = Screen(problem, fit, record_noise=False, effect_precision=effect_precision)
     tests = []
@@ -247,7 +247,7 @@ def _score_test(
     """
     gradient = projected.gradient
     eigenvalues, eigenvectors = np.linalg.eigh(projected.information)
-    is_separate = eigenvalues > SEPARATE
+    is_separate = eigenvalues > LEAST_REMAINING_LENGTH
     count = int(is_separate.sum())
     gradient_components = (eigenvectors.T @ gradient)[is_separate]
     statistic = float(np.sum(gradient_components**2 / eigenvalues[is_separate]))
@@ -255,7 +255,9 @@ def _score_test(
         return None
     # the strongest direction by itself
     single_information = np.diag(projected.information)
-    single_information = np.where(single_information > SEPARATE, single_information, np.inf)
+    single_information = np.where(
+        single_information > LEAST_REMAINING_LENGTH, single_information, np.inf
+    )
     z_scores = np.abs(gradient) / np.sqrt(single_information)
     strongest = int(np.argmax(z_scores))
     return ScoreTest(

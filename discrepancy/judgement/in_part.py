@@ -73,9 +73,9 @@ def verdict_in_part(search: Search, simulation_verdict: Verdict) -> VerdictOutco
 
 
 def verdict_naming_laws_only(search: Search, simulation_verdict: Verdict) -> VerdictOutcome | None:
-    """Return the verdict that names laws alone in part, without errors of readings.
+    """Return the verdict that names laws in part, and no errors of readings.
 
-    They must explain nearly all of the missing force.
+    Errors of readings are not needed if the laws explain nearly all of the missing force.
 
     Parameters
     ----------
@@ -87,7 +87,8 @@ def verdict_naming_laws_only(search: Search, simulation_verdict: Verdict) -> Ver
     Returns
     -------
     VerdictOutcome or None
-        None if there are no such laws.
+        None if no law is named, or if laws leave more than a tenth of the missing force unexplained
+        (`SEARCH.nearly_complete_share`).
     """
     assert search.force_search is not None
     comparison = ForceComparison(search, search.force_search)
@@ -270,7 +271,7 @@ def _named_in_part_outcome(
 def _group_outcome(
     comparison: Comparison[HypothesisT], members: Sequence[HypothesisT], probability: float
 ) -> VerdictOutcome:
-    """Return the verdict that one of several hypotheses is true, which cannot be told apart.
+    """Return the verdict that one of several hypotheses is true, and the data do not tell which.
 
     The sentence begins with the effects that all of them have in common.
 
@@ -284,22 +285,7 @@ def _group_outcome(
         The probability that one of them is true.
     """
     effects_by_member = [named_effects(comparison.problem, member) for member in members]
-    member_texts = []
-    for member, effects in zip(members, effects_by_member, strict=True):
-        member_share = comparison.closed_share(member).share
-        share_in_brackets = ""
-        if member_share is not None:
-            share_in_brackets = f" ({percent_with_interval(member_share)})"
-        member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
-    sentence = f"Either {listing(member_texts, 'or')} is missing; these data cannot tell which."
-    best_share = comparison.closed_share(members[0])
-    if best_share.share is None:
-        sentence += f" {capital(best_share.clause)}."
-    else:
-        sentence += (
-            " In brackets the share of the mean square error that each explains in "
-            f"{compared_trials_text(best_share.share)}."
-        )
+    sentence = _group_sentence(comparison, members, effects_by_member)
     common = frozenset.intersection(*(effect_place_pairs(member) for member in members))
     common_effects = []
     for effect in effects_by_member[0]:
@@ -317,6 +303,7 @@ def _group_outcome(
         comparison,
         VerdictKind.GROUP,
         sentence,
+        # rounding may put the sum of the members' probabilities above one
         min(probability, 1.0),
         judged_hypothesis=members[0],
         members=members,
@@ -326,13 +313,39 @@ def _group_outcome(
     )
 
 
+def _group_sentence(
+    comparison: Comparison[HypothesisT],
+    members: Sequence[HypothesisT],
+    effects_by_member: Sequence[Sequence[NamedEffect]],
+) -> str:
+    """Return the sentence that lists the members of a group, each with the share it explains."""
+    member_texts = []
+    for member, effects in zip(members, effects_by_member, strict=True):
+        member_share = comparison.closed_share(member).share
+        share_in_brackets = ""
+        if member_share is not None:
+            share_in_brackets = f" ({percent_with_interval(member_share)})"
+        member_texts.append(f"{effects_text(effects)}{share_in_brackets}")
+    sentence = f"Either {listing(member_texts, 'or')} is missing; these data cannot tell which."
+    best_share = comparison.closed_share(members[0])
+    if best_share.share is None:
+        return f"{sentence} {capital(best_share.clause)}."
+    return (
+        f"{sentence} In brackets the share of the mean square error that each explains in "
+        f"{compared_trials_text(best_share.share)}."
+    )
+
+
 def _unexplained_outcome(
     comparison: Comparison[HypothesisT],
     simulation_verdict: Verdict,
     considered: HypothesisT | None = None,
     reason: str = "",
 ) -> VerdictOutcome:
-    """Return the verdict that there is an unexplained gap, with the hypothesis that explains most.
+    """Return the verdict that there is an unexplained gap.
+
+    Its sentence mentions the best hypothesis, unless that explains hardly anything of the gap or
+    makes the error larger.
 
     Parameters
     ----------
@@ -347,54 +360,68 @@ def _unexplained_outcome(
         The reason why it is not named. If left out, it is that of `Comparison.objection_to_naming`,
         or else that its probability is too low.
     """
-    failed_gate_reason = next(
-        (gate.reason for gate in simulation_verdict.gates if gate.has_failed), ""
-    )
-    gap = f"There is a gap that no effect of the catalogue fits. {failed_gate_reason}".strip()
-    gap = f"{gap} {comparison.gap_sentence()}".strip()
-    mentioned = considered
-    if mentioned is None:
-        with_effects = [
-            hypothesis for hypothesis in comparison.ranked_hypotheses if hypothesis.candidate.terms
-        ]
-        mentioned = max(
-            with_effects,
-            key=lambda hypothesis: comparison.held_out_or_fitted_share(hypothesis).value,
-            default=None,
-        )
-    if (
-        mentioned is None
-        or comparison.held_out_or_fitted_share(mentioned).value < LEAST_MENTIONED_SHARE
-    ):
-        mentioned = None
+    gap = f"{_gap_text(simulation_verdict)} {comparison.gap_sentence()}".strip()
+    nearest = _hypothesis_explaining_most(comparison) if considered is None else considered
+    judged_hypothesis = None
+    resembles: tuple[str, ...] = ()
+    if nearest is None or not _explains_mentioned_share(comparison, nearest):
         sentence = f"{gap} No effect of the catalogue follows it."
-    elif comparison.enlarges_error(mentioned):
-        sentence = f"{gap} {_larger_error_sentence(comparison, mentioned)}"
-        mentioned = None
+    elif comparison.enlarges_error(nearest):
+        sentence = f"{gap} {_larger_error_sentence(comparison, nearest)}"
     else:
-        reason = reason or comparison.objection_to_naming(mentioned)
+        reason = reason or comparison.objection_to_naming(nearest)
         if considered is not None and not reason:
-            probability = comparison.probability(considered)
+            probability = comparison.probability(nearest)
             reason = (
                 f"its probability is {probability:.2g}: a name needs {SEARCH.name_probability:g}"
             )
-        reason_clause = f"; it is no name, as {reason}" if reason else ""
-        effects = effects_text(named_effects(comparison.problem, mentioned))
-        share_clause = comparison.closed_share(mentioned).clause
-        sentence = f"{gap} The best hypothesis is {effects}: {share_clause}{reason_clause}."
-    resembles = (
-        () if mentioned is None else names_without_free_shape(mentioned.candidate.identifiers)
-    )
+        sentence = f"{gap} {_best_hypothesis_sentence(comparison, nearest, reason)}"
+        judged_hypothesis = nearest
+        resembles = names_without_free_shape(nearest.candidate.identifiers)
     return _outcome_of_comparison(
         comparison,
         VerdictKind.UNEXPLAINED,
         sentence,
         simulation_verdict.probability,
-        judged_hypothesis=mentioned,
+        judged_hypothesis=judged_hypothesis,
         members=[],
         resembles=resembles,
         gates=simulation_verdict.gates,
     )
+
+
+def _gap_text(simulation_verdict: Verdict) -> str:
+    """Return the sentence that there is a gap, with the reason of the first failed test."""
+    reasons = [gate.reason for gate in simulation_verdict.gates if gate.has_failed]
+    first_reason = reasons[0] if reasons else ""
+    return f"There is a gap that no effect of the catalogue fits. {first_reason}".strip()
+
+
+def _explains_mentioned_share(comparison: Comparison[HypothesisT], hypothesis: HypothesisT) -> bool:
+    """Return whether a hypothesis explains enough of the gap to be mentioned in a sentence."""
+    return comparison.held_out_or_fitted_share(hypothesis).value >= LEAST_MENTIONED_SHARE
+
+
+def _hypothesis_explaining_most(comparison: Comparison[HypothesisT]) -> HypothesisT | None:
+    """Return the hypothesis that explains the largest share of the gap; None without effects."""
+    with_effects = [
+        hypothesis for hypothesis in comparison.ranked_hypotheses if hypothesis.candidate.terms
+    ]
+    return max(
+        with_effects,
+        key=lambda hypothesis: comparison.held_out_or_fitted_share(hypothesis).value,
+        default=None,
+    )
+
+
+def _best_hypothesis_sentence(
+    comparison: Comparison[HypothesisT], hypothesis: HypothesisT, reason: str
+) -> str:
+    """Return the sentence on the best hypothesis, and the reason why it is not named, if any."""
+    effects = effects_text(named_effects(comparison.problem, hypothesis))
+    share_clause = comparison.closed_share(hypothesis).clause
+    reason_clause = f"; it is no name, as {reason}" if reason else ""
+    return f"The best hypothesis is {effects}: {share_clause}{reason_clause}."
 
 
 def _larger_error_sentence(comparison: Comparison[HypothesisT], hypothesis: HypothesisT) -> str:

@@ -69,9 +69,9 @@ def _gain_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     for gain_number, channel in enumerate(shared.gain_channels):
         shared_number = shared.count + gain_number
         if shared.precision[shared_number] > 0.0:
-            u = float(fit.point.shared[shared_number])
+            scaled_value = float(fit.point.shared[shared_number])
             scale = float(shared.scale[shared_number])
-            unknowns.append(_unknown_stated_as_zero(f"gain of {channel}", u, scale, "1"))
+            unknowns.append(_unknown_stated_as_zero(f"gain of {channel}", scaled_value, scale, "1"))
     return unknowns
 
 
@@ -82,11 +82,13 @@ def _zero_and_constant_values(problem: Problem, fit: CandidateFit) -> list[Moved
         layout = data.unknowns
         names_and_units = _names_of_zeros_and_constants(problem, data)
         zeros_end, initial_end, inputs_end, _ = layout.ends
-        numbers = [*range(zeros_end), *range(initial_end, inputs_end)]
-        for (name, unit), number in zip(names_and_units, numbers, strict=True):
-            if layout.precision[number] > 0.0:
-                u = float(local[number])
-                unknowns.append(_unknown_stated_as_zero(name, u, float(layout.scale[number]), unit))
+        indices = [*range(zeros_end), *range(initial_end, inputs_end)]
+        for (name, unit), index in zip(names_and_units, indices, strict=True):
+            if layout.precision[index] > 0.0:
+                scaled_value = float(local[index])
+                unknowns.append(
+                    _unknown_stated_as_zero(name, scaled_value, float(layout.scale[index]), unit)
+                )
     return unknowns
 
 

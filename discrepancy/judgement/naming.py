@@ -192,28 +192,44 @@ def _verdict_rejecting_instruments(search: Search, verdict: Verdict) -> Verdict 
         return replace(without_name, kind=VerdictKind.NOTHING_MISSING, sentence=sentence)
     if not has_one_driven_channel(problem) or not problem.campaign.held_out:
         return None
-    primitives = [primitive for effect in verdict.effects for primitive in effect.patch]
-    has_gain = any(isinstance(primitive, LoadGain | SensorGain) for primitive in primitives)
-    if not has_gain or not all(
-        isinstance(primitive, INSTRUMENT_PRIMITIVES) for primitive in primitives
-    ):
+    if not _are_instrument_errors_with_gain(verdict):
         return None
     residuals = residual_set(problem, search.no_effect, sensitivities=False)
     if not check_held_out(residuals).passed:
         return None
-    implausible = []
-    for parameter, scaled_value in zip(
-        problem.model.parameters, search.no_effect.point.shared, strict=False
-    ):
-        if abs(scaled_value) > SEARCH.reported_prior_deviations:
-            implausible.append(f"{parameter.name!r} {abs(scaled_value):.1f}")
-    implausible_clause = f" ({', '.join(implausible)} stated deviations off)" if implausible else ""
     sentence = (
         "The model predicts held-out trials as it is, but with calibrated parameters beside their "
-        f"priors{implausible_clause}. An error of the instruments ({causes}) would do as well: "
-        "with one channel these data cannot tell them apart."
+        f"priors{_implausible_parameters_clause(search)}. An error of the instruments ({causes}) "
+        "would do as well: with one channel these data cannot tell them apart."
     )
     resembles = tuple(dict.fromkeys(effect.identifier for effect in verdict.effects))
     return replace(
         without_name, kind=VerdictKind.UNEXPLAINED, sentence=sentence, resembles=resembles
     )
+
+
+def _are_instrument_errors_with_gain(verdict: Verdict) -> bool:
+    """Return whether all effects of a verdict are errors of instruments, one of them of a gain."""
+    has_gain = False
+    for effect in verdict.effects:
+        for primitive in effect.patch:
+            if not isinstance(primitive, INSTRUMENT_PRIMITIVES):
+                return False
+            if isinstance(primitive, LoadGain | SensorGain):
+                has_gain = True
+    return has_gain
+
+
+def _implausible_parameters_clause(search: Search) -> str:
+    """Return the parameters that the fit without effect moves far from their priors, in brackets.
+
+    The clause begins with a blank; it is empty if there are no such parameters.
+    """
+    parameters = search.problem.model.parameters
+    # the scaled unknowns are the parameters, in prior deviations, and then the gains of channels
+    scaled_values = search.no_effect.point.shared[: len(parameters)]
+    texts = []
+    for parameter, scaled_value in zip(parameters, scaled_values, strict=True):
+        if abs(scaled_value) > SEARCH.reported_prior_deviations:
+            texts.append(f"{parameter.name!r} {abs(scaled_value):.1f}")
+    return f" ({', '.join(texts)} stated deviations off)" if texts else ""

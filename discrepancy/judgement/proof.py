@@ -25,7 +25,7 @@ from .closed_share import closed_share, residuals_with_noise_of, rms_by_channel
 
 PIT_BINS = 10
 """Bins of the histogram of probability integral transforms."""
-SMALLEST_GAP = 2.0
+LEAST_EXCESS_DEVIATIONS = 2.0
 """Least excess of χ² per sample over that of noise, in its standard deviations, for held-out trials
 to test a hypothesis."""
 HELD_OUT_DEVIATIONS = 3.0
@@ -33,7 +33,7 @@ HELD_OUT_DEVIATIONS = 3.0
 which a hypothesis fails."""
 COVERAGE = (0.80, 0.97)
 """Least and largest fraction of held-out samples that may lie within their 90 % intervals."""
-LEAST_COVERED = 200
+LEAST_SAMPLES_FOR_COVERAGE = 200
 """Least number of samples for that fraction to be tested."""
 ENOUGH_TRIALS = 5
 """Least number of trials for the scatter between them alone to give the error of a score."""
@@ -95,9 +95,9 @@ def log_density(fitted: FittedTrial) -> FloatArray:
     It is ln N(residual; 0, predictive_deviation^2) + ln s0. A perfect model with exact parameters
     has -(1 + ln 2 pi) / 2 = -1.419 on average.
     """
-    z = fitted.residual / fitted.predictive_deviation
+    deviations = fitted.residual / fitted.predictive_deviation
     relative_deviation = fitted.predictive_deviation / fitted.noise_deviation
-    return np.asarray(-0.5 * np.log(2.0 * np.pi) - np.log(relative_deviation) - 0.5 * z**2)
+    return np.asarray(-0.5 * np.log(2.0 * np.pi) - np.log(relative_deviation) - 0.5 * deviations**2)
 
 
 @dataclass(frozen=True)
@@ -255,7 +255,7 @@ def _variance_of_sum(series: FloatArray) -> float:
     record as the motion decays. A difference has twice the variance of a sum.
     """
     parts = np.array_split(series, min(PARTS_OF_RECORD, series.size))
-    sums = np.array([part.sum() for part in parts])
+    sums = np.array([part_of_series.sum() for part_of_series in parts])
     if sums.size < 2:
         return 0.0
     return float(0.5 * np.sum(np.diff(sums) ** 2) * sums.size / (sums.size - 1))
@@ -290,7 +290,7 @@ def check_held_out(after: ResidualSet) -> Gate:
         return _held_out_gate(False, excess, reason)
     least, largest = COVERAGE
     is_covered = least <= held_out_scores.coverage_90 <= largest
-    if held_out_scores.sample_count >= LEAST_COVERED and not is_covered:
+    if held_out_scores.sample_count >= LEAST_SAMPLES_FOR_COVERAGE and not is_covered:
         percent = 100.0 * held_out_scores.coverage_90
         reason = f"90 % intervals hold {percent:.0f} % of the samples of held-out trials."
         return _held_out_gate(False, excess, reason)
@@ -341,7 +341,7 @@ def closed_share_or_reason(
         return closed, "No trial was held out."
     chi_square_before = _chi_square_by_diagonal(before.held_out or before)
     chi_square_after = _chi_square_by_diagonal(after.held_out or after)
-    has_no_gap_before = chi_square_before.excess_over_noise < SMALLEST_GAP
+    has_no_gap_before = chi_square_before.excess_over_noise < LEAST_EXCESS_DEVIATIONS
     if has_no_gap_before and chi_square_after.excess_over_noise <= HELD_OUT_DEVIATIONS:
         chi_square = f"χ² per sample {chi_square_before.per_sample:.3g}, 1 for noise alone"
         return None, f"Held-out trials show no gap before: {chi_square}."

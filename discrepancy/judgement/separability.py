@@ -279,9 +279,9 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
     for place in effect.places(screen.problem.setting):
         term = EffectTerm(effect, place)
         start = term.start()
-        for number, parameter in enumerate(term.parameters):
+        for index, parameter in enumerate(term.parameters):
             if parameter.magnitude and parameter.prior.value(0.0) == 0.0:
-                start[number] = 1.0
+                start[index] = 1.0
         with suppress(DiscrepancyError):
             changes.append(screen.change(term, start))
     return changes
@@ -289,8 +289,8 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
 
 def _has_reference_magnitude(change: ScreenedChange) -> bool:
     """Return whether the magnitudes of a change are those of `_changes_at_prior_median`."""
-    for parameter, u in zip(change.term.parameters, change.start, strict=True):
-        if parameter.magnitude and abs(u) not in (0.0, 1.0):
+    for parameter, scaled_value in zip(change.term.parameters, change.start, strict=True):
+        if parameter.magnitude and abs(scaled_value) not in (0.0, 1.0):
             return False
     return True
 
@@ -310,9 +310,9 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     distance : float
         The squared distance of that change from the model [sigma^2].
     """
-    for number, parameter in enumerate(change.term.parameters):
+    for index, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:
-            typical = abs(parameter.prior.value(float(change.start[number])))
+            typical = abs(parameter.prior.value(float(change.start[index])))
             detectable = typical * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
             return Detectability(
                 effect=effect,
@@ -393,9 +393,9 @@ def _squared_distance(
         return target.squared_size
     # spanning changes: the nearest option, and its differences by the parameters
     changes = [nearest.vector]
-    for number in range(len(nearest.start)):
+    for index in range(len(nearest.start)):
         stepped = nearest.start.copy()
-        stepped[number] += 10.0 * PARAMETER_STEP
+        stepped[index] += 10.0 * PARAMETER_STEP
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
             change = screen.change(nearest.term, stepped)
             changes.append(change.vector - nearest.vector)
@@ -420,9 +420,9 @@ def _confusion_groups(
     _, labels = connected_components(is_confused)
     groups = []
     for label in range(labels.max(initial=-1) + 1):
-        numbers = np.flatnonzero(labels == label).tolist()
-        if len(numbers) > 1:
-            groups.append(tuple(identifiers[number] for number in numbers))
+        indices = np.flatnonzero(labels == label).tolist()
+        if len(indices) > 1:
+            groups.append(tuple(identifiers[index] for index in indices))
     return tuple(groups)
 
 

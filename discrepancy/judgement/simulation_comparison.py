@@ -70,43 +70,54 @@ class SimulationComparison(Comparison[CandidateFit]):
 
         Squared residuals are summed over blocks of the records, for the bootstrap of the share.
         """
-        blocks = []
-        trial_count = 0
         without_effect = self.residuals(self.search.no_effect).trials
         with_effect = self.residuals(hypothesis).trials
-        for before, after in zip(
-            _trials_in_role(without_effect, held_out=held_out),
-            _trials_in_role(with_effect, held_out=held_out),
-            strict=True,
-        ):
-            noise = before.noise_deviation * [
-                self._noise_scales[name] for name in before.trial.channels
-            ]
-            squares_before = np.where(before.used, before.residual / noise, 0.0) ** 2
-            squares_after = np.where(after.used, after.residual / noise, 0.0) ** 2
-            sample_count = len(before.used)
-            block_count = 1
-            if before.trial.is_dynamic:
-                block_count = min(WINDOWS, max(1, sample_count // SHORTEST))
-            for block in np.array_split(np.arange(sample_count), block_count):
-                sums = [
-                    float(squares[block].sum())
-                    for squares in (squares_before, squares_after, before.used)
-                ]
-                blocks.append(sums)
-            trial_count += 1
+        trials_before = _trials_in_role(without_effect, held_out=held_out)
+        trials_after = _trials_in_role(with_effect, held_out=held_out)
+        blocks: list[list[float]] = []
+        for before, after in zip(trials_before, trials_after, strict=True):
+            blocks += self._block_sums(before, after)
         sums_before, sums_after, noise_sums = np.array(blocks).T
         return GapShare(
             before=sums_before,
             after=sums_after,
             noise=noise_sums,
             held_out=held_out,
-            trial_count=trial_count,
+            trial_count=len(trials_before),
             remaining_rms=_rms_beyond_noise(sums_after, noise_sums),
             total_rms=_rms_beyond_noise(sums_before, noise_sums),
             kind=OF_READINGS,
             tested=True,
         )
+
+    def _block_sums(self, before: FittedTrial, after: FittedTrial) -> list[list[float]]:
+        """Return sums over each block of a trial without and with a hypothesis.
+
+        Returns
+        -------
+        list of list of float
+            For each block the sums of squared residuals over the noise variance, without and with
+            the hypothesis, and the number of used samples, which is the expected sum of the noise.
+        """
+        noise = before.noise_deviation * [
+            self._noise_scales[name] for name in before.trial.channels
+        ]
+        squares_before = np.where(before.used, before.residual / noise, 0.0) ** 2
+        squares_after = np.where(after.used, after.residual / noise, 0.0) ** 2
+        sample_count = len(before.used)
+        block_count = 1
+        if before.trial.is_dynamic:
+            block_count = min(WINDOWS, max(1, sample_count // SHORTEST))
+        sums_of_blocks = []
+        for block in np.array_split(np.arange(sample_count), block_count):
+            sums_of_blocks.append(
+                [
+                    float(squares_before[block].sum()),
+                    float(squares_after[block].sum()),
+                    float(before.used[block].sum()),
+                ]
+            )
+        return sums_of_blocks
 
     def fit_candidate(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).

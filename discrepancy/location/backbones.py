@@ -11,11 +11,11 @@ from calibration.dynamics.damped_cosine import DampedCosineFit, DampedCosines
 from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError
 
-SMALLEST_SIGNAL = 4.0
+LEAST_AMPLITUDE = 4.0
 """Least amplitude of a mode that still rings in a window, in standard errors."""
-_GREATEST_CHANGE = 0.3
+_LARGEST_FREQUENCY_CHANGE = 0.3
 """Largest relative change of a frequency from its start value."""
-_FEWEST_PER_UNKNOWN = 2.0
+_LEAST_SAMPLES_PER_UNKNOWN = 2.0
 """Fewest samples of a window per unknown of the fit."""
 
 
@@ -86,7 +86,7 @@ def backbones(
     start = 2.0 * np.pi * np.sort(np.asarray(frequencies, dtype=float))
     width = round(periods * 2.0 * np.pi / (start[0] * interval)) + 1
     unknown_count = 4 * start.size + 2
-    least_width = _FEWEST_PER_UNKNOWN * unknown_count
+    least_width = _LEAST_SAMPLES_PER_UNKNOWN * unknown_count
     if width < least_width or width > time.size:
         raise FitError(
             f"A window of {periods:g} periods has {width} samples, but at least {least_width:.0f} "
@@ -142,11 +142,13 @@ class BackbonePoint(NamedTuple):
     def is_credible(self, start: float) -> bool:
         """Return whether the mode still rings, at a frequency close to its start value [rad/s].
 
-        Its amplitude must exceed `SMALLEST_SIGNAL` standard errors.
+        Its amplitude must exceed `LEAST_AMPLITUDE` standard errors.
         """
         change = abs(2.0 * np.pi * self.frequency / start - 1.0)
-        is_above_error = self.amplitude > SMALLEST_SIGNAL * self.amplitude_error
-        return is_above_error and change < _GREATEST_CHANGE and abs(self.damping_ratio) < 0.5
+        is_above_error = self.amplitude > LEAST_AMPLITUDE * self.amplitude_error
+        return (
+            is_above_error and change < _LARGEST_FREQUENCY_CHANGE and abs(self.damping_ratio) < 0.5
+        )
 
 
 def _backbone_of_points(mode: int, points: Sequence[BackbonePoint]) -> Backbone:

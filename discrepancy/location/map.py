@@ -250,6 +250,10 @@ _LEAST_SAMPLES_OF_CELL = 4
 """Fewest samples of a cell whose size is tested."""
 
 
+_LEAST_FREEDOM_OF_CELL = 0.5
+"""Least effective degrees of freedom of a cell: with fewer, the fit has absorbed the residuals."""
+
+
 @dataclass(frozen=True)
 class Cell:
     """One entry of the map: a statistic of the residuals of a channel in a bin of a trial.
@@ -473,7 +477,10 @@ def _dependence_cells(
 def _variance_cells(
     fitted: FittedTrial, column: int, used: BoolArray, cell: Cell, noise_freedom: float
 ) -> Iterator[Cell]:
-    """Yield the cell of the residuals' mean square over its expectation, if the noise is recorded.
+    """Yield a cell with the sum of squared residuals over its expectation.
+
+    Nothing is yielded without a noise record, with too few samples, or if the fit has absorbed the
+    residuals.
 
     Parameters
     ----------
@@ -488,6 +495,7 @@ def _variance_cells(
     noise_freedom : float
         Degrees of freedom of the channel's noise record; 0 without one.
     """
+    # a bin of few samples is not tested; a whole record is, however short
     least_count = 1 if cell.axis == "whole" else _LEAST_SAMPLES_OF_CELL
     if noise_freedom <= 0.0 or cell.count < least_count:
         return
@@ -495,7 +503,7 @@ def _variance_cells(
     expected_sum, freedom = sum_of_squares_moments(
         [(fitted.expected_variance[used, column], sensitivity)]
     )
-    if freedom >= 0.5:
+    if freedom >= _LEAST_FREEDOM_OF_CELL:
         value = float(np.sum(fitted.standardised[used, column] ** 2)) / expected_sum
         p_value = variance_p_value(value, freedom, noise_freedom)
         yield replace(cell, statistic="variance", value=value, p_value=p_value)

@@ -18,7 +18,7 @@ from calibration.result.record import (
 )
 from discrepancy.campaign.records import Campaign, FloatArray
 from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.model_check import MOST_OF_PRIOR
+from discrepancy.checks.model_check import LARGEST_DEVIATION_RATIO
 from discrepancy.errors import CampaignDataError, ModelError
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
@@ -260,7 +260,7 @@ def _range_findings(
     deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.free]), 1e-12)
     probability_below = ndtr((marginal.low - fitted_parameters) / deviation)
     probability_above = ndtr((fitted_parameters - marginal.high) / deviation)
-    is_determined = remaining_deviations(posterior) <= MOST_OF_PRIOR
+    is_determined = remaining_deviations(posterior) <= LARGEST_DEVIATION_RATIO
     is_cut_off = is_determined & (probability_below + probability_above > EDGE)
     for prior, cut_off in zip(priors, is_cut_off.tolist(), strict=True):
         if cut_off:
@@ -314,7 +314,7 @@ def _undetermined_findings(
 ) -> Iterator[str]:
     """Yield findings on parameters that the campaign does not determine, or not separately."""
     for prior, ratio in zip(priors, remaining_deviations(posterior).tolist(), strict=True):
-        if ratio > MOST_OF_PRIOR:
+        if ratio > LARGEST_DEVIATION_RATIO:
             remaining = "all" if ratio > 0.995 else f"{100.0 * ratio:.0f} %"
             yield (
                 f"The campaign does not tell {prior.name}: {remaining} of its prior deviation is "

@@ -152,22 +152,24 @@ def _sentence_on_hidden_effects(separability: Separability) -> list[str]:
     Empty without any.
     """
     hidden = [
-        item
-        for item in separability.detectability
-        if not item.reason
-        and item.parameter
-        and isfinite(item.detectable)
-        and item.distance < DETECTION_DISTANCE
+        detectability
+        for detectability in separability.detectability
+        if not detectability.reason
+        and detectability.parameter
+        and isfinite(detectability.detectable)
+        and detectability.distance < DETECTION_DISTANCE
     ]
     if not hidden:
         return []
-    nearest = max(hidden, key=lambda item: item.distance)
+    nearest = max(hidden, key=lambda detectability: detectability.distance)
     factor = inf
     if nearest.distance > 0.0:
         factor = (DETECTION_DISTANCE / nearest.distance) ** 0.5
     sentence = WORDS.say(
         "unseen" if len(hidden) > 1 else "unseen_one",
-        unseen=listing(item.effect.identifier.replace("_", " ") for item in hidden),
+        unseen=listing(
+            detectability.effect.identifier.replace("_", " ") for detectability in hidden
+        ),
         first=nearest.effect.identifier.replace("_", " "),
         factor=factor,
         trials=factor**2,

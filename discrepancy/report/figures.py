@@ -59,9 +59,9 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
     all_axes = style.keep_first_panels(grid, len(scores))
     highest = max(max(score.pit) for score in scores.values())
     has_two_panels = len(scores) > 1
-    for number, (axes, (title, score)) in enumerate(zip(all_axes, scores.items(), strict=True)):
+    for panel, (axes, (title, score)) in enumerate(zip(all_axes, scores.items(), strict=True)):
         bin_count = len(score.pit)
-        is_before = number == 0 and has_two_panels
+        is_before = panel == 0 and has_two_panels
         axes.bar(
             (np.arange(bin_count) + 0.5) / bin_count,
             score.pit,
@@ -76,8 +76,8 @@ def pit_figure(scores: Mapping[str, Scores]) -> Figure | None:
             ylim=(0.0, 1.1 * max(highest, 0.16)),
             xlabel="probability integral transform",
         )
-        axes.set_ylabel("share of samples" if number == 0 else "")
-        axes.set_title(f"{'ab'[number]}  {title}" if has_two_panels else title)
+        axes.set_ylabel("share of samples" if panel == 0 else "")
+        axes.set_title(f"{'ab'[panel]}  {title}" if has_two_panels else title)
     return figure
 
 
@@ -160,7 +160,7 @@ def confusion_figure(self_calibration: SelfCalibration) -> Figure:
 
 MOST_DOTS = 3000
 """Most dots of a panel; longer records are thinned evenly."""
-MOST_TURNS = 400
+MOST_FORCE_SAMPLES = 400
 """Most samples of the force in a panel over time, centred on its largest value."""
 
 
@@ -218,9 +218,9 @@ def _draw_over_time(axes: Axes, missing: MissingForce, series: str, *, has_law: 
         True to draw the law as well.
     """
     strongest = max(missing.courses, key=lambda course: float(np.max(np.abs(course.force))))
-    first = int(np.argmax(np.abs(strongest.force))) - MOST_TURNS // 2
-    first = max(min(first, len(strongest.time) - MOST_TURNS), 0)
-    drawn = slice(first, first + MOST_TURNS)
+    first = int(np.argmax(np.abs(strongest.force))) - MOST_FORCE_SAMPLES // 2
+    first = max(min(first, len(strongest.time) - MOST_FORCE_SAMPLES), 0)
+    drawn = slice(first, first + MOST_FORCE_SAMPLES)
     time = strongest.time[drawn]
     values = getattr(strongest, series)[drawn]
     two_deviations = 2.0 * strongest.deviation[drawn]

@@ -175,7 +175,7 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     figure, ((axes,),) = new_panels(1, 1, max(0.34 * len(trials), 1.1) + 0.9)
     for row, name in enumerate(trials):
         windows_of_trial = [window for window in windows if window.trial == name]
-        _draw_record(axes, row, windows_of_trial, norm, both=has_two_rows)
+        _draw_record(axes, row, windows_of_trial, norm, has_two_rows=has_two_rows)
     axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
     axes.set_ylim(len(trials) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
@@ -186,7 +186,7 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
 
 
 def _draw_record(
-    axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, both: bool
+    axes: Axes, row: int, windows: Sequence[GapWindow], norm: Normalize, *, has_two_rows: bool
 ) -> None:
     """Draw the windows of a record as bars, with the uncertainty of their ends.
 
@@ -200,11 +200,11 @@ def _draw_record(
         Windows of the record.
     norm : Normalize
         Scale from the size of a gap to the colour of its bar.
-    both : bool
+    has_two_rows : bool
         True if the windows that remain with the effect have a line of their own below the others.
     """
     first, last = windows[0].first, windows[0].last
-    lines = (row - 0.14, row + 0.2) if both else row
+    lines = (row - 0.14, row + 0.2) if has_two_rows else row
     axes.hlines(lines, first, last, color=style.REFERENCE, lw=1.0, zorder=1)
     for window in windows:
         # a window without a begin or an end extends to that end of the record
@@ -213,7 +213,7 @@ def _draw_record(
         if window.with_effect:
             bottom, height = row + 0.1, 0.2
         else:
-            bottom, height = row - 0.34, 0.4 if both else 0.68
+            bottom, height = row - 0.34, 0.4 if has_two_rows else 0.68
         axes.broken_barh(
             [(begin, end - begin)],
             (bottom, height),

@@ -25,7 +25,7 @@ from reporting.page import Page, ReportFigure
 from reporting.templates import fill_template
 from reporting.words import listing, plus_minus
 
-SHOWN_HYPOTHESES = 8
+MOST_SHOWN_HYPOTHESES = 8
 """Most hypotheses in the table of evidence."""
 NINETY = 1.6449
 """Normal quantile at 95 %: half of a 90 % interval in standard deviations."""
@@ -34,8 +34,8 @@ NINETY = 1.6449
 def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
     """Return the rows of the table of evidence: hypotheses with their roles.
 
-    Those of the verdict come first, then the most probable others, at most `SHOWN_HYPOTHESES` in
-    all. The hypothesis without effects is always included.
+    Those of the verdict come first, then the most probable others, at most `MOST_SHOWN_HYPOTHESES`
+    in all. The hypothesis without effects is always included.
     """
     if verdict.group:
         members = [*verdict.group]
@@ -54,8 +54,8 @@ def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
         else:
             others.append((hypothesis, ""))
     ranked = chosen + others
-    without_effects = [row for row in ranked[SHOWN_HYPOTHESES:] if not row[0].effects]
-    return ranked[:SHOWN_HYPOTHESES] + without_effects
+    without_effects = [row for row in ranked[MOST_SHOWN_HYPOTHESES:] if not row[0].effects]
+    return ranked[:MOST_SHOWN_HYPOTHESES] + without_effects
 
 
 def not_compared_rows(verdict: Verdict) -> list[tuple[str, str]]:

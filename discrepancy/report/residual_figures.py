@@ -20,7 +20,7 @@ from fe.wing.design import WingDesign
 from reporting import figures as style
 
 AFTER = "with the effect"
-EMPTY = "#f0f1f2"
+EMPTY_CELL_COLOUR = "#f0f1f2"
 """Colour of cells of a map that hold nothing."""
 
 
@@ -134,7 +134,7 @@ def draw_heat_map(
     axes.set_yticks(range(len(row_names)), row_names)
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
-    axes.set_facecolor(EMPTY)
+    axes.set_facecolor(EMPTY_CELL_COLOUR)
     if texts is None:
         return image
     for (row, column), text in np.ndenumerate(texts):
@@ -316,8 +316,8 @@ def heat_figure(before: ResidualSet, after: ResidualSet | None) -> Figure:
     height = max(0.22 * len(channels), 0.9) + below + 0.35
     figure, (row,) = new_panels(1, len(tables), height)
     has_texts = len(channels) <= MOST_CELLS and len(trials) <= MOST_CELLS
-    for number, (axes, sizes, drawn) in enumerate(zip(row, tables, drawn_models, strict=True)):
-        row_names = channels if number == 0 else [""] * len(channels)
+    for panel, (axes, sizes, drawn) in enumerate(zip(row, tables, drawn_models, strict=True)):
+        row_names = channels if panel == 0 else [""] * len(channels)
         texts = _cell_texts(sizes) if has_texts else None
         draw_heat_map(axes, sizes, (row_names, trials), norm, 40, texts)
         axes.set_title(drawn.title)

@@ -33,7 +33,7 @@ BEYOND_DOUBT = 1e6
 NAMING = (VerdictKind.NAMED, VerdictKind.NAMED_IN_PART)
 """Verdicts that name what is missing, or part of it."""
 
-LARGEST_PLAIN = 1e6
+LARGEST_PLAIN_NUMBER = 1e6
 """Numbers below this are written without a power of ten."""
 
 SHORT_UNITS = {"1": "", "m/s2": "m/s²"}
@@ -48,11 +48,11 @@ def estimate_text(estimate: Estimate) -> tuple[str, str]:
     return rounded(estimate.value, half_width), interval
 
 
-def p_value_text(p: float) -> str:
+def p_value_text(p_value: float) -> str:
     """Return a p-value."""
-    if isnan(p):
+    if isnan(p_value):
         return "not known"
-    return "< 1e-6" if p < 1e-6 else f"{p:.2g}"
+    return "< 1e-6" if p_value < 1e-6 else f"{p_value:.2g}"
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -60,7 +60,7 @@ def number(value: float, digits: int = 3) -> str:
     if isnan(value):
         return "\N{EN DASH}"
     text = f"{value:.{digits}g}"
-    if "e+0" in text and abs(value) < LARGEST_PLAIN:
+    if "e+0" in text and abs(value) < LARGEST_PLAIN_NUMBER:
         text = f"{float(text):,.0f}"
     return text.replace("-", "\N{MINUS SIGN}")
 

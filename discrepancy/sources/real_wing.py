@@ -42,14 +42,14 @@ READING_ERROR = 33e-6 / 3.0**0.5
 The plots show the same motion on the same grid, so that the error is common to the trials, and
 averaging does not reduce it.
 """
-TREND = 67
+TREND_COLUMNS = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
-BEGIN = 0.8
+WINDOW_BEGIN = 0.8
 """Begin of the window after the release [s].
 
 Before it higher modes ring, which the model does not have.
 """
-COLUMNS = 4
+AVERAGED_COLUMNS = 4
 """Columns of the plot that are averaged into one sample.
 
 Four columns (32 ms) have a zero of their frequency response at 30.8 Hz, where the second bending
@@ -64,7 +64,11 @@ HELD_OUT = (3, 5)
 
 
 def real_wing(
-    data: Path, *, begin: float = BEGIN, columns: int = COLUMNS, detrended: bool = True
+    data: Path,
+    *,
+    begin: float = WINDOW_BEGIN,
+    columns: int = AVERAGED_COLUMNS,
+    detrended: bool = True,
 ) -> RigFiles:
     """Return the ring-downs of the wing of Kapteyn et al., and its loading runs.
 
@@ -200,10 +204,10 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
     It is the weighted moving average of the mean record; nan at the ends, where the average is
     incomplete.
     """
-    weights = np.hanning(TREND + 2)[1:-1]
+    weights = np.hanning(TREND_COLUMNS + 2)[1:-1]
     mean = np.mean([record.signal for record in records], axis=0)
     zero = np.full(len(mean), np.nan)
-    half = TREND // 2
+    half = TREND_COLUMNS // 2
     zero[half : len(mean) - half] = np.convolve(mean, weights / weights.sum(), "valid")
     return zero
 

@@ -4,8 +4,8 @@ Displacements u and states x, M u'' + C u' + K u = F x + b(t), T x' + R x = G u'
 state is the speed of a coordinate that has no stiffness, x = s', so that both are one equation in z
 = (u, s). A prescribed motion (a drive) takes its direction out of u; what remains moves in its
 modes. For the laws at ports the drive is a coordinate of its own, so heavy that the laws do not
-move it (`HEAVY`), and it is corrected at every step. The wing, a structure on springs and a lumped
-rig are such systems.
+move it (`HEAVY_RATIO`), and it is corrected at every step. The wing, a structure on springs and a
+lumped rig are such systems.
 """
 
 from collections.abc import Mapping
@@ -24,7 +24,7 @@ from fe.runtime.modal_system import ModalSystem
 from fe.runtime.motion import static_solution
 from fe.runtime.port_laws import NO_LAWS, PortLaws
 
-HEAVY = 1e12
+HEAVY_RATIO = 1e12
 """Mass of a prescribed coordinate, relative to the largest entry of the mass matrix."""
 LEAST_PIVOT = 1e-9
 """Relative singular value below which nothing restores a motion (`rcond` of the least squares)."""
@@ -236,7 +236,7 @@ class LinearSystem:
     @cached_property
     def root_drive_mass(self) -> float:
         """Square root of the mass of the drives, which normalises their shapes."""
-        return float(np.sqrt(HEAVY * np.max(np.abs(self.mass))))
+        return float(np.sqrt(HEAVY_RATIO * np.max(np.abs(self.mass))))
 
     @cached_property
     def shapes_with_drives(self) -> FloatArray:

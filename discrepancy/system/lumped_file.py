@@ -392,14 +392,14 @@ class LumpedDescription(ModelDescription):
             yield from self._reference_faults(kind, key, verb, known)
 
     def _reference_faults(
-        self, kind: str, key: str, verb: str, known: Sequence[str]
+        self, kind: str, key: str, verb: str, known_names: Sequence[str]
     ) -> Iterator[Fault]:
         """Yield what sections of a kind name by a key and what is not known."""
-        listed = ", ".join(known) or "none"
+        listed = ", ".join(known_names) or "none"
         for section in getattr(self, kind):
             for name in as_list(getattr(section, key)):
                 yield (
-                    name is not None and name not in known,
+                    name is not None and name not in known_names,
                     f"{kind} {section.name!r} {verb} {name!r}, but there are {listed}",
                 )
 

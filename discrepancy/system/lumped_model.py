@@ -132,29 +132,13 @@ class LumpedModel(DescribedModel, SystemModel):
         return self._input_direction(self.rig_in_state(state), self._input_at(place), load_change)
 
     def loads_and_motions(self, case: PatchedTrial) -> LoadsAndMotions:
-        """Return the loads and the prescribed motions in a trial.
-
-        An input may prescribe a motion that the trial does not record. That motion is held at zero
-        if an output measures its reaction force; otherwise it is free.
-        """
+        """Return the loads and the prescribed motions in a trial."""
         trial = case.trial
         rig = self.rig_in_state(case.state)
-        description = self.description
-        zero_motion = RecordedHistory(
-            trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0
-        )
-        motions = {
-            item.reaction: zero_motion for item in description.output if item.reaction is not None
-        }
-        # constant loads and references of controllers
-        constant_history = RecordedHistory(trial.time, np.ones(len(trial.time)))
-        constant_loads = [
-            Load(rig.load_direction(item, item.vector), constant_history)
-            for item in description.load
-        ]
         inputs = self._offset_inputs(case)
-        loads = constant_loads + rig.loads_of_references(trial, inputs)
-        # recorded loads and motions
+        loads = self._constant_loads(rig, trial) + rig.loads_of_references(trial, inputs)
+        motions = self._motions_held_at_zero(trial)
+        # recorded loads and motions, without the references of controllers
         references = {loop.section.reference for loop in rig.loops.values()}
         load_change = LoadChange.from_patch(case.patch)
         for name, offset_input in inputs.items():
@@ -172,8 +156,37 @@ class LumpedModel(DescribedModel, SystemModel):
                 loads.append(self._port_load(primitive))
         return LoadsAndMotions(loads, motions)
 
+    def _constant_loads(self, rig: Rig, trial: Trial) -> list[Load]:
+        """Return the loads of the tables `[[load]]`, which act throughout a trial."""
+        history = RecordedHistory(trial.time, np.ones(len(trial.time)))
+        return [
+            Load(rig.load_direction(section, section.vector), history)
+            for section in self.description.load
+        ]
+
+    def _motions_held_at_zero(self, trial: Trial) -> dict[str, RecordedHistory]:
+        """Return motions of zero for all inputs whose reaction force an output measures.
+
+        A motion that the trial records replaces the zero. A motion that it does not record is held
+        at zero, since the reaction of a free motion would be zero and nothing to measure.
+        """
+        zero_motion = RecordedHistory(
+            trial.time, np.zeros(len(trial.time)), Hold.SMOOTH, motion_order=0
+        )
+        motions = {}
+        for section in self.description.output:
+            if section.reaction is not None:
+                motions[section.reaction] = zero_motion
+        return motions
+
     def _port_load(self, primitive: PortLoad) -> Load:
-        """Return the load of a force by a formula; raises `ModelError` if there is no such port."""
+        """Return the load of a force by a formula in time.
+
+        Raises
+        ------
+        ModelError
+            If the model does not have the port at which the force acts.
+        """
         if primitive.port not in self.law_directions:
             raise ModelError(
                 f"A force acts at the port {primitive.port!r}, which {self.name!r} does not have; "
@@ -190,10 +203,13 @@ class LumpedModel(DescribedModel, SystemModel):
         if trial.kind is not TrialKind.DRIVEN:
             section = self._input_at(trial.load_place)
             recorded = (RecordedInput(section.name, section.quantity, trial.force, trial.hold),)
+        # the conditions may state no offsets: those that are missing are zero
         missing_offsets = (0.0,) * len(recorded)
         offsets = (*case.conditions.offset, *missing_offsets)
-        pairs = zip(recorded, offsets, strict=False)
-        return {item.name: OffsetInput(item, offset) for item, offset in pairs}
+        offset_inputs = {}
+        for recorded_input, offset in zip(recorded, offsets, strict=False):
+            offset_inputs[recorded_input.name] = OffsetInput(recorded_input, offset)
+        return offset_inputs
 
     def _section_of(self, trial: Trial, recorded: RecordedInput) -> InputSection:
         """Return the input of the model that a trial records.
@@ -210,13 +226,13 @@ class LumpedModel(DescribedModel, SystemModel):
                 f"The trial {trial.name!r} records the input {recorded.name!r}, which "
                 f"{self.quoted_name} does not have; it has {comma_list(self._inputs)}."
             )
-        moving = section.quantity.motion_chain
-        if recorded.quantity is not section.quantity and recorded.quantity not in moving:
+        motion_chain = section.quantity.motion_chain
+        if recorded.quantity is not section.quantity and recorded.quantity not in motion_chain:
             raise ModelError(
                 f"The input {recorded.name!r} of {self.quoted_name} is {section.quantity.value}, "
                 f"but the trial {trial.name!r} records {recorded.quantity.value}."
             )
-        if moving and recorded.hold not in (None, Hold.SMOOTH):
+        if motion_chain and recorded.hold not in (None, Hold.SMOOTH):
             raise ModelError(
                 f"The input {recorded.name!r} of the trial {trial.name!r} is a motion that "
                 f"{self.name!r} prescribes, which no drive makes in steps or corners: leave "

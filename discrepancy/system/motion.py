@@ -290,9 +290,9 @@ def _motion_from_release(
 
 
 def _with_held_samples(
-    motion: ModalMotion, begin: InitialMotion, held: int, count: int
+    motion: ModalMotion, begin: InitialMotion, held_count: int, count: int
 ) -> ModalMotion:
-    """Return a motion of `count` samples, with the held shape in the first `held` of them.
+    """Return a motion of `count` samples, with the held shape in the first `held_count` of them.
 
     Parameters
     ----------
@@ -300,14 +300,14 @@ def _with_held_samples(
         The motion at the samples after the release.
     begin : InitialMotion
         The state at the release, which is that of the held shape.
-    held, count : int
+    held_count, count : int
         Number of samples before the release, and of all samples.
     """
     laws = motion.port_forces.shape[1]
     forces = np.zeros(laws) if begin.memory is None else begin.memory[:, LAGGED_FORCE]
 
     def prepend(before: FloatArray, after: FloatArray) -> FloatArray:
-        return np.vstack((np.tile(before, (held, 1)), after))[:count]
+        return np.vstack((np.tile(before, (held_count, 1)), after))[:count]
 
     return ModalMotion(
         q=prepend(begin.q, motion.q),

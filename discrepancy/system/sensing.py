@@ -75,10 +75,10 @@ def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial,
     return replace(trial, time=trial.time - first_stamp), ModelPatch(tuple(primitives))
 
 
-def _shift_window(window: Window, first: float) -> Window:
-    """Return a window in a clock that is zero at a time `first` [s]."""
-    begin = None if window.begin is None else window.begin - first
-    end = None if window.end is None else window.end - first
+def _shift_window(window: Window, first_stamp: float) -> Window:
+    """Return a window in a clock that is zero at a time `first_stamp` [s]."""
+    begin = None if window.begin is None else window.begin - first_stamp
+    end = None if window.end is None else window.end - first_stamp
     return window._replace(begin=begin, end=end)
 
 

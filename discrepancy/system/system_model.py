@@ -19,6 +19,7 @@ from discrepancy.system.natural_state import natural_state
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.port_scales import (
     GlobalScales,
+    LargestMotion,
     PortScaleEstimator,
     larger_magnitude,
     largest_measured_force,
@@ -383,27 +384,8 @@ class SystemModel(Model):
         uncontrolled = self.system_in_state(state._replace(controlled=False))
         port_rows = self._rows_of_ports(self.ports).reshape(len(self.ports), uncontrolled.size)
         is_held = system.mode_count is not None and all(_begins_at_rest(trial) for trial in trials)
-        # loads and motions of the trials
         estimator = PortScaleEstimator(uncontrolled, port_rows)
-        largest_displacement = 0.0
-        largest_speed = 0.0
-        largest_load = 0.0
-        only_driven = True
-        for trial in trials:
-            is_fitted = trial.is_dynamic and not trial.held_out
-            if trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN:
-                motion = self._motion_under_inputs(campaign, trial)
-                measured_force = largest_measured_force(campaign, trial)
-                loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
-                shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
-                largest_displacement = larger_magnitude(largest_displacement, motion.q @ shapes)
-                largest_speed = larger_magnitude(largest_speed, motion.velocity @ shapes)
-                largest_load = larger_magnitude(largest_load, loads)
-            else:
-                only_driven = False
-                if is_held:
-                    case = self.patched_trial(trial, Conditions(parameters))
-                    estimator.add_displacements(self._static_displacements(case), fitted=is_fitted)
+        largest = self._add_trials(estimator, campaign, is_held=is_held)
         # scales of the whole structure
         campaign_sizes = campaign.sizes
         if is_held:
@@ -413,15 +395,10 @@ class SystemModel(Model):
                 1.0 / float(row @ system.equilibrium_under(row[None])[0]) for row in port_rows
             ]
         else:
-            global_scales = scales_of_moving_structure(
-                system,
-                largest_displacement,
-                largest_speed,
-                largest_load,
-                campaign_sizes["duration"],
-            )
+            global_scales = scales_of_moving_structure(system, largest, campaign_sizes["duration"])
             first_shape = np.zeros(0)
             static_stiffness = [0.0] * len(self.ports)
+        only_driven = all(_is_moved_by_inputs(trial) for trial in trials)
         port_scales = estimator.port_scales(static_stiffness, only_driven=only_driven)
         ports = dict(zip(self.ports, port_scales, strict=True))
         farthest_station = max(map(abs, self.stations or (0.0,)))
@@ -430,12 +407,45 @@ class SystemModel(Model):
             tip_stiffness=global_scales.stiffness,
             modal_mass=global_scales.mass,
             angular_frequency=global_scales.angular_frequency,
-            force=campaign_sizes["force"] or largest_load,
+            force=campaign_sizes["force"] or largest.load,
             load_factor=campaign_sizes["load_factor"],
             duration=campaign_sizes["duration"],
             campaign_time=campaign_sizes["campaign_time"],
             ports=ports | self.distributed_scales(ports, first_shape),
         )
+
+    def _add_trials(
+        self, estimator: PortScaleEstimator, campaign: Campaign, *, is_held: bool
+    ) -> LargestMotion:
+        """Add the motions of all trials to an estimator, and return the largest of them.
+
+        Parameters
+        ----------
+        estimator : PortScaleEstimator
+            What collects the motions of the ports.
+        campaign : Campaign
+            The campaign.
+        is_held : bool
+            Whether springs hold the structure, so that it has displacements at rest.
+        """
+        parameters = self.prior_mean(campaign)
+        largest = LargestMotion(0.0, 0.0, 0.0)
+        for trial in campaign.trials:
+            is_fitted = trial.is_dynamic and not trial.held_out
+            if _is_moved_by_inputs(trial):
+                motion = self._motion_under_inputs(campaign, trial)
+                measured_force = largest_measured_force(campaign, trial)
+                loads = estimator.add_motion(motion, measured_force, fitted=is_fitted)
+                shapes = motion.system.shapes_with_drives[: motion.system.displacement_count].T
+                largest = LargestMotion(
+                    displacement=larger_magnitude(largest.displacement, motion.q @ shapes),
+                    speed=larger_magnitude(largest.speed, motion.velocity @ shapes),
+                    load=larger_magnitude(largest.load, loads),
+                )
+            elif is_held:
+                case = self.patched_trial(trial, Conditions(parameters))
+                estimator.add_displacements(self._static_displacements(case), fitted=is_fitted)
+        return largest
 
     def _scales_of_held_structure(
         self, system: LinearSystem, state: SystemState, campaign: Campaign
@@ -455,18 +465,19 @@ class SystemModel(Model):
     def _motion_under_inputs(self, campaign: Campaign, trial: Trial) -> Motion:
         """Return the motion of a trial under its recorded inputs, at the prior mean.
 
-        The trial begins at rest if its own begin has no equilibrium. If the inputs cause no motion
-        at all, it begins with the typical magnitudes of an unknown initial state.
+        If the inputs cause no motion at all, the structure was released, and the motion begins with
+        the typical magnitudes of an unknown initial state.
         """
         conditions = Conditions(self.prior_mean(campaign))
         laws = self.laws(conditions.parameters)
         try:
             motion = self.motion(self.patched_trial(trial, conditions), laws)
         except ModelError:
+            # the trial cannot begin as it states, such as in an equilibrium of a free structure:
+            # its scales are then those of a motion from rest
             trial_from_rest = replace(trial, begins=Start.STILL)
             motion = self.motion(self.patched_trial(trial_from_rest, conditions), laws)
         if not np.any(motion.q) and not np.any(motion.velocity):
-            # no input moves it: the structure was released
             magnitudes = self.initial_state_magnitudes(campaign, trial)
             released_trial = self.patched_trial(trial, replace(conditions, initial=magnitudes))
             motion = self.motion(released_trial, laws)
@@ -488,6 +499,11 @@ class SystemModel(Model):
 def _depends_on_temperature(patch: ModelPatch) -> bool:
     """Return whether a patch makes the structure depend on temperature."""
     return len(patch.of(changes.ModulusTemperature)) > 0
+
+
+def _is_moved_by_inputs(trial: Trial) -> bool:
+    """Return whether a trial is a motion under recorded inputs, and no release or rest."""
+    return trial.is_dynamic and trial.kind is not TrialKind.RINGDOWN
 
 
 def _begins_at_rest(trial: Trial) -> bool:

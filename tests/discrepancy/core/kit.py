@@ -302,7 +302,7 @@ class Bench:
 
     def problem(self, *measured, **how) -> Problem:
         """Return the problem of what is measured."""
-        return problem_of(self.channel_names(*measured, **how), self.model)
+        return problem_of(self.measured(*measured, **how), self.model)
 
 
 def chain_bench(

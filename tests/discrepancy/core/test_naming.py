@@ -198,7 +198,7 @@ def test_without_a_noise_record_the_sentence_says_so():
         problem = kit.closed_problem(seed=3, effect=effect, noise=noise, offset_deviation=0.0)
         verdict, found, fit = reach_verdict(problem, (kit.offset_effect(),))
         assert verdict.kind is kind, verdict.sentence
-        share = SimulationComparison(found).share(fit, held_out=False)
+        share = SimulationComparison(found).gap_share(fit, held_out=False)
         assert share.value == pytest.approx(float(effect > 0.0), abs=0.01)
         assert ("No noise record" in verdict.sentence) is (noise is None)
     assert "record" not in verdict.sentence
