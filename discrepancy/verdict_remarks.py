@@ -20,9 +20,9 @@ IMPLAUSIBLE_DEVIATIONS = 4.0
 def implausible_value_remarks(problem: Problem, fit: CandidateFit) -> list[str]:
     """Return a remark on each calibrated parameter and gain that a fit moves far from its prior.
 
-    A gap that an implausible value of such a nuisance explains leaves no residual, so that only
-    this remark shows it. The gate of absolute fit judges all gains together and all parameters
-    together, not each of them.
+    An implausible value of a parameter or gain can explain what the model lacks. Nothing then
+    remains in the residuals, so that only this remark shows it: the test of absolute fit judges all
+    gains together and all parameters together, and not each of them.
     """
     names = [f"The parameter {parameter.name!r}" for parameter in problem.model.parameters]
     names += [f"The gain of the channel {name!r}" for name in problem.shared.gain_channels]

@@ -161,8 +161,7 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
             if name in PLACES:
                 raise CatalogueError(
                     f"{place}: 'places' is a list that holds {name!r}, which would be the name of "
-                    "a "
-                    f'single place; for all {name} write places = "{name}", without brackets.'
+                    f'a single place; for all {name} write places = "{name}", without brackets.'
                 )
     if not section.primitives:
         raise CatalogueError(f"{place} has no [[primitives]].")
@@ -171,19 +170,25 @@ def _check_places_and_needs(section: EffectSection, place: str) -> None:
 def _check_acts_on_dynamic_trials(
     section: EffectSection, templates: Sequence["_PrimitiveTemplate"]
 ) -> None:
-    """Refuse an effect on static or flight trials that has primitives which depend on time."""
-    timed = [
+    """Refuse an effect that depends on time, but is declared to act on static trials or flights.
+
+    The rows of these trials are not samples of a motion in time. A primitive depends on time if it
+    acts in windows or has a value that is a formula in time.
+    """
+    time_dependent = [
         template
         for template in templates
         if template.acts_in_windows or PRIMITIVES[template.kind].formula_fields
     ]
-    if not timed:
+    if not time_dependent:
         return
+    kinds_without_time = section.acts_on - DYNAMIC
+    # in the order of the enumeration, so that the message is always the same
     for kind in TrialKind:
-        if kind in section.acts_on - DYNAMIC:
+        if kind in kinds_without_time:
             raise CatalogueError(
-                f"{timed[0].place} asks for the time of trials, but 'acts_on' has {kind.value!r}, "
-                "whose rows are no course in time."
+                f"{time_dependent[0].place} asks for the time of trials, but 'acts_on' has "
+                f"{kind.value!r}, whose rows are no course in time."
             )
 
 
@@ -241,14 +246,14 @@ class _PrimitiveTemplate:
                 continue
             occurrences = context.setting.campaign.event_moments(trial.name, self.moments)
             for moments in occurrences:
-                numbers_then = {**values_by_name, **moments}
-                begin = self._moment("begin", numbers_then)
-                end = self._moment("end", numbers_then)
-                primitive = self._primitive(numbers_then, context.target)
+                values_and_moments = {**values_by_name, **moments}
+                begin = self._moment("begin", values_and_moments)
+                end = self._moment("end", values_and_moments)
+                primitive = self._primitive(values_and_moments, context.target)
                 yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
     def _moment(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
-        """Return the begin or the end of its window [s]; None if the window is open on that side.
+        """Return the begin or end of the primitive's window [s]; None if it is open on that side.
 
         Parameters
         ----------

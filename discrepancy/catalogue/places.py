@@ -54,21 +54,29 @@ def _calibrated_channels(effect: EffectInSetting) -> Names:
 
 
 def _gauges_read_repeatedly(effect: EffectInSetting) -> Names:
-    """Return the strain gauges (without gauges, all channels) that were read at several times."""
-    places = []
-    for name in effect.strain_channels or effect.channels_of():
-        times = [
-            trial.time + (trial.start if trial.is_dynamic else 0.0)
-            for trial in effect.setting.campaign.fitted
-            if name in trial.channels and trial.time.size
-        ]
-        if not times:
-            continue
-        last = max(np.max(trial_times) for trial_times in times)
-        first = min(np.min(trial_times) for trial_times in times)
-        if last > max(first, 0.0):
-            places.append(name)
-    return tuple(places)
+    """Return the strain gauges that were read at several times, for effects that grow with time.
+
+    Without strain gauges all channels are considered.
+    """
+    names = effect.strain_channels or effect.channels_of()
+    return tuple(name for name in names if _is_read_repeatedly(effect, name))
+
+
+def _is_read_repeatedly(effect: EffectInSetting, name: str) -> bool:
+    """Return whether fitted trials have readings of a channel at more than one time.
+
+    Times count from the start of the campaign. The time of a static trial does so already, and
+    that of a dynamic trial counts from the trial's own start.
+    """
+    first_time = np.inf
+    last_time = -np.inf
+    for trial in effect.setting.campaign.fitted:
+        if name in trial.channels and trial.time.size:
+            start = trial.start if trial.is_dynamic else 0.0
+            first_time = min(first_time, np.min(trial.time + start))
+            last_time = max(last_time, np.max(trial.time + start))
+    # an effect that grows from time zero is seen only in readings after it
+    return bool(last_time > max(first_time, 0.0))
 
 
 def _zeroed_runs(effect: EffectInSetting) -> Names:

@@ -197,7 +197,7 @@ def let_go(beta: float, *items: Primitive, time: Any = TIME, row: Any = TIP, **h
 
 
 def values(motion: Motion, rows: FloatArray = TIP[None]) -> FloatArray:
-    return motion.response([OutputEquation.of_row(row) for row in rows]).values
+    return motion.response([OutputEquation.from_row(row) for row in rows]).values
 
 
 LAWS = laws("joint", HOLD, A, 15.0 * A)
