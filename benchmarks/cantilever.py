@@ -192,12 +192,12 @@ class Cantilever(Model):
                 largest,
                 float(w**2 / (row @ system.shapes[:, 0]) ** 2),
                 w,
-                float(1.0 / (row @ system.flexibility(row))),
+                float(1.0 / (row @ system.apply_flexibility(row))),
             )
         dynamic = [trial for trial in campaign.fitted if trial.is_dynamic]
         return Scales(
             length=LENGTH,
-            tip_stiffness=float(1.0 / (TIP @ system.flexibility(TIP))),
+            tip_stiffness=float(1.0 / (TIP @ system.apply_flexibility(TIP))),
             modal_mass=float(1.0 / (TIP @ system.shapes[:, 0]) ** 2),
             angular_frequency=w,
             force=max(float(np.max(np.abs(trial.force))) for trial in campaign.fitted),

@@ -99,7 +99,7 @@ def apply_verdict(
     stored = files.read_verdict_file(verdict_file)
     applied_patch = _patch_to_apply(stored, verdict_file, member)
     choice = model_of(stored.origin, verdict_file, progress)
-    patch = changed(applied_patch, origin=stored.origin).upon(choice.built_in)
+    patch = changed(applied_patch, origin=stored.origin).combine_with(choice.built_in)
     has_laws_only = choice.kind is ModelKind.LUMPED and all(
         isinstance(primitive, PortForce) and not primitive.windows for primitive in patch.patch
     )
@@ -182,7 +182,7 @@ def has_applicable_effects(verdict: Verdict, proof: Proof | None) -> bool:
 
     Effects that increase the error are never applied.
     """
-    if proof is not None and proof.grew:
+    if proof is not None and proof.has_grown:
         return False
     if verdict.kind is VerdictKind.UNEXPLAINED:
         return _proved_hypothesis(verdict, proof) is not None
@@ -215,7 +215,7 @@ def _patch_to_apply(
         raise DiscrepancyError(
             f"--member {member!r} is none of {file}, which has {members}: leave it out."
         )
-    if stored.proof is not None and stored.proof.grew:
+    if stored.proof is not None and stored.proof.has_grown:
         raise DiscrepancyError(
             f"{file} gives nothing to apply: its proof says that the error grows with what was "
             "found."
@@ -397,7 +397,9 @@ def pack_beside_verdict(choice: ModelChoice, patch_file: Path, path: Path) -> st
     Its effects are switched off.
     """
     try:
-        switches = pack_patched(choice, files.read_patch(patch_file).upon(choice.built_in), path)
+        switches = pack_patched(
+            choice, files.read_patch(patch_file).combine_with(choice.built_in), path
+        )
     except PatchFileError as cause:
         return f"There is no patched FMU: {cause}"
     return f"{path.name} carries it, off until {', '.join(switches)} is set to 1."

@@ -236,7 +236,7 @@ def _choose_patched(path: Path, progress: Progress | None) -> ModelChoice:
         model=base.model.with_patch(stored.patch, calibrated),
         label=path.name,
         source_hash=hash_record({"model": base.source_hash, "patch": hash_file(path)}),
-        built_in=stored.upon(base.built_in),
+        built_in=stored.combine_with(base.built_in),
         beneath=(*base.beneath, base.file),
     )
 

@@ -2,9 +2,10 @@
 
 Campaigns are simulated with the model, the inputs, the channels and the noise of a real one. A
 third of them contains no effect. The others contain a hidden effect that is drawn from its prior,
-at a size that this campaign can detect (d^2 >= 25, see `discrepancy.judgement.separability`).
-Each campaign is investigated like the real one, and its verdict is compared with the hidden effect.
-Motion is simulated with half the time step of the fits.
+at a size that this campaign can detect (d^2 >= 25, see
+`discrepancy.judgement.separability`). Each campaign is investigated like the real one, and
+its verdict is compared with the hidden effect. Motion is simulated with half the time step of the
+fits.
 """
 
 import json
@@ -52,7 +53,7 @@ class ParameterCoverage:
     high: float
 
     @property
-    def inside(self) -> bool:
+    def contains_true_value(self) -> bool:
         """Whether the interval holds the true value."""
         return self.low <= self.true <= self.high
 
@@ -134,12 +135,14 @@ class SelfCalibration:
             True for campaigns in which nothing was hidden.
         """
         cases = [case for case in self.cases if (case.hidden == NOTHING) is null]
-        return wilson(sum(case.outcome == outcome for case in cases), len(cases))
+        return wilson_interval(sum(case.outcome == outcome for case in cases), len(cases))
 
     def coverage(self) -> Proportion:
         """Return the fraction of 90 % intervals of named effects that contain the true value."""
-        are_inside = [covered.inside for case in self.cases for covered in case.covered]
-        return wilson(sum(are_inside), len(are_inside))
+        are_inside = [
+            covered.contains_true_value for case in self.cases for covered in case.covered
+        ]
+        return wilson_interval(sum(are_inside), len(are_inside))
 
     def confusion(self) -> tuple[list[str], list[str], IntArray]:
         """Return the confusion matrix.
@@ -175,7 +178,7 @@ def _confusion_column(case: CalibrationCase) -> str:
     return " + ".join(case.named) if case.kind is VerdictKind.NAMED else OTHER[case.kind]
 
 
-def wilson(count: int, total: int) -> Proportion:
+def wilson_interval(count: int, total: int) -> Proportion:
     """Return a fraction with its 90 % interval (Wilson 1927); from 0 to 1 without cases."""
     if total == 0:
         return Proportion(0, 0, 0.0, 1.0)
@@ -409,7 +412,7 @@ def _outcome_table(self_calibration: SelfCalibration, *, null: bool) -> dict[str
         True for campaigns without an effect, False for those with one.
     """
     table = {}
-    for outcome in outcomes(self_calibration, null=null):
+    for outcome in ordered_outcomes(self_calibration, null=null):
         table[outcome] = _proportion_table(self_calibration.share(outcome, null=null))
     return table
 
@@ -419,7 +422,7 @@ def _proportion_table(proportion: Proportion) -> dict[str, Any]:
     return {**plain_data(proportion), "share": plain_data(proportion.value)}
 
 
-def outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[str]:
+def ordered_outcomes(self_calibration: SelfCalibration, *, null: bool) -> list[str]:
     """Return the outcomes that occurred, and "right" and "wrong" always, in a fixed order.
 
     Parameters

@@ -30,7 +30,7 @@ from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
 from discrepancy.judgement.naming import reach_verdict
 from discrepancy.judgement.next_experiment import next_experiments
-from discrepancy.judgement.proof import prove
+from discrepancy.judgement.proof import prove_effects
 from discrepancy.judgement.remarks import (
     KINDS_WITHOUT_GAP,
     look_alike_remark,
@@ -206,7 +206,7 @@ def investigate(
             missing = seen_force(problem, search.force_search, search.force_hypotheses, fit)
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
-            proof = prove(before, after, effects=effect_labels(fit), seed=seed)
+            proof = prove_effects(before, after, effects=effect_labels(fit), seed=seed)
     experiments: tuple[Experiment, ...] = ()
     if thorough and verdict.kind not in CLOSED_KINDS:
         with stage("Looking for the next experiment", "next"):

@@ -66,7 +66,7 @@ def run(
     in_progress = parts.SearchInProgress()
     with terminal.interruptible(lambda: _keep_so_far(folder, in_progress, origin)):
         investigation = parts.investigate(
-            data, choice.model, catalogue, seed=seed, on_search=in_progress.begin
+            data, choice.model, catalogue, seed=seed, on_search=in_progress.remember_search
         )
     separability, self_calibration = _decidability(
         investigation, choice, catalogue, calibrate, seed
@@ -120,7 +120,7 @@ def _decidability(
         return None, None
     tested_campaign = investigation.campaign
     with stage("What this campaign can decide"):
-        separability = parts.separability(
+        separability = parts.compute_separability(
             tested_campaign, choice.model, investigation.problem.setting, catalogue
         )
     if calibrate is None:
@@ -285,7 +285,7 @@ def check(
     if not any(fault.fatal for fault in faults):
         with stage("What this campaign can decide"):
             setting = parts.Setting(data, chosen, chosen.scales(data))
-            separability = parts.separability(data, chosen, setting, catalogue)
+            separability = parts.compute_separability(data, chosen, setting, catalogue)
     if json:
         terminal.print_json(_record(data, chosen.name, faults, separability))
     else:

@@ -46,7 +46,7 @@ from discrepancy.files.verdict import PATCH_NAME as PATCH_NAME
 from discrepancy.files.verdict import VERDICT_NAME as VERDICT_NAME
 from discrepancy.files.verdict import read_patch as read_patch
 from discrepancy.judgement.separability import Separability as Separability
-from discrepancy.judgement.separability import separability as separability
+from discrepancy.judgement.separability import compute_separability as compute_separability
 from discrepancy.model_choice import ModelChoice as ModelChoice
 from discrepancy.model_choice import ModelKind as ModelKind
 from discrepancy.model_choice import choice_of_run as choice_of_run

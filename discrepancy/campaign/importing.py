@@ -80,29 +80,29 @@ class LaboratoryImport:
         heads = dict.fromkeys(head for sheet in sheets for head in sheet.heads)
         check_subjects(answers, [*heads], names)
 
-        self.kinds = {name: self._kind(name) for name in names}
+        self.kinds = {name: self._kind_of_file(name) for name in names}
         self._noise_file = self._only_noise_file()
-        self.decimals = {sheet.name: self._decimal(sheet) for sheet in sheets}
+        self.decimals = {sheet.name: self._decimal_mark(sheet) for sheet in sheets}
         reader = ColumnReader(self._questionnaire, self.kinds, quantity_of)
         self.columns: list[LaboratoryColumn] = []
         for sheet in sheets:
             for head, unit in zip(sheet.heads, sheet.units, strict=True):
                 self.columns.append(reader.read_column(sheet, head, unit))
         self.releases = {
-            name: self._release(name)
+            name: self._release_table(name)
             for name, kind in self.kinds.items()
             if kind == TrialKind.RINGDOWN
         }
-        self.intervals = {sheet.name: self._interval(sheet) for sheet in sheets}
+        self.intervals = {sheet.name: self._sampling_interval(sheet) for sheet in sheets}
         self._deviations = SensorDeviations(
             self._questionnaire, self.columns, self.kinds, self.decimals
         )
         self.holds = {
-            column.head: self._hold(column)
+            column.head: self._hold_of_load(column)
             for column in self.columns
             if self._is_sampled_load(column)
         }
-        self.begins = {name: self._begin(name) for name in names}
+        self.begins = {name: self._begin_of_trial(name) for name in names}
         self.held_out = {name: self._is_held_out(name) for name in names}
         self.reference_temperature = self._reference_temperature()
 
@@ -138,7 +138,7 @@ class LaboratoryImport:
 
     # ---------------------------------------------------------------- files
 
-    def _kind(self, file: str) -> str:
+    def _kind_of_file(self, file: str) -> str:
         """Return the kind of a file: that of its trial, or `NOISE`."""
         return self._questionnaire.ask("kind", file, listing(KINDS, "or"), KINDS)
 
@@ -151,14 +151,14 @@ class LaboratoryImport:
             )
         return files[0] if files else None
 
-    def _decimal(self, sheet: Sheet) -> str:
+    def _decimal_mark(self, sheet: Sheet) -> str:
         """Return the decimal mark of a file; ask if its numbers can be read in two ways."""
         if sheet.decimal:
             return sheet.decimal
         expected = f". or ,: {sheet.unclear} can be read as both"
         return self._questionnaire.ask("decimal", sheet.name, expected, (".", ","))
 
-    def _interval(self, sheet: Sheet) -> float | None:
+    def _sampling_interval(self, sheet: Sheet) -> float | None:
         """Return the sampling interval [s] of a table without times; None if it needs none."""
         columns = [column for column in self.columns if column.sheet is sheet]
         if any(column.role == "time" for column in columns):
@@ -176,7 +176,7 @@ class LaboratoryImport:
         answer = self._questionnaire.ask("interval", sheet.name, expected)
         return sampling_interval(answer) if answer else None
 
-    def _begin(self, file: str) -> str | None:
+    def _begin_of_trial(self, file: str) -> str | None:
         """Return how a forced or driven trial begins; None if nobody stated it."""
         kind = self.kinds[file]
         if kind not in (TrialKind.FORCED, TrialKind.DRIVEN):
@@ -210,7 +210,7 @@ class LaboratoryImport:
         answer = self._questionnaire.ask_or_assume("no", "held-out", file, expected, ("yes", "no"))
         return answer == "yes"
 
-    def _release(self, file: str) -> dict[str, Any]:
+    def _release_table(self, file: str) -> dict[str, Any]:
         """Return the table `release` of a ring-down; one of 1 m while the question is open."""
         expected = "how far the point was held that was let go, such as 15.5mm"
         answer = self._questionnaire.ask("release", file, expected)
@@ -236,7 +236,7 @@ class LaboratoryImport:
         is_input = INPUT in column.role and column.quantity is not None
         return is_input and not (column.quantity is not None and column.quantity.motion_chain)
 
-    def _hold(self, column: LaboratoryColumn) -> str | None:
+    def _hold_of_load(self, column: LaboratoryColumn) -> str | None:
         """Return the course of a load between its samples; None if nobody stated it."""
         choices = [*map(str, Hold)]
         expected = f"what it does between its samples, {listing(choices, 'or')}"
@@ -265,7 +265,7 @@ class LaboratoryImport:
             "channel": self._column_tables(are_inputs=False),
             "input": self._column_tables(are_inputs=True),
             "trial": [self._trial_table(file) for file in trial_files],
-            "remarks": [self._origin(sheet) for sheet in self.sheets],
+            "remarks": [self._origin_remark(sheet) for sheet in self.sheets],
         }
         if self.assumed:
             content["remarks"].append(self.assumed)
@@ -402,7 +402,7 @@ class LaboratoryImport:
             columns[column.title] = column.cells_in_si(self.decimals[sheet.name])
         return TextTable(sheet.name, columns, sheet.lines, TABLE_ERRORS)
 
-    def _origin(self, sheet: Sheet) -> str:
+    def _origin_remark(self, sheet: Sheet) -> str:
         """Return the remark on the file of a table, its columns, and its clocks."""
         used = [
             column for column in self.columns if column.sheet is sheet and column.role != LEFT_OUT

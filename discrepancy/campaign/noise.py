@@ -214,7 +214,7 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
     )
     if ljung_box(residual)[1] > WHITE_LEVEL:  # the second value is the p-value of whiteness
         return white
-    coefficients, innovation_variance = autoregression(residual)
+    coefficients, innovation_variance = fit_autoregression(residual)
     return replace(
         white,
         standard_deviation=np.sqrt(innovation_variance),
@@ -335,7 +335,7 @@ def _strongest_line(samples: FloatArray, interval: float, low: float, high: floa
     return np.asarray(waves @ amplitudes)
 
 
-def autoregression(series: FloatArray) -> tuple[FloatArray, float]:
+def fit_autoregression(series: FloatArray) -> tuple[FloatArray, float]:
     """Fit an autoregression to a series, with the order of the least BIC.
 
     The coefficients solve the Yule-Walker equations of each order. BIC is the Bayesian information

@@ -385,7 +385,7 @@ class Campaign:
         return tuple(trial for trial in self.trials if trial.held_out)
 
     @property
-    def sizes(self) -> dict[str, float]:
+    def largest_magnitudes(self) -> dict[str, float]:
         """Largest loads and times of the campaign, by which parameters of effects are scaled.
 
         ``force`` is the largest force [N], ``load_factor`` the largest load factor [1],

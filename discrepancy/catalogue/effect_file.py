@@ -91,11 +91,12 @@ def effects_of_file(path: Path) -> tuple[Effect, ...]:
     if not isinstance(tables, list) or not tables:
         raise CatalogueError(f"The file of effects {path} has no table [[effect]].")
     return tuple(
-        _effect(table, f"{path}, effect {number}") for number, table in enumerate(tables, start=1)
+        _parse_effect(table, f"{path}, effect {number}")
+        for number, table in enumerate(tables, start=1)
     )
 
 
-def _effect(table: object, place: str) -> Effect:
+def _parse_effect(table: object, place: str) -> Effect:
     """Return the effect that a table describes.
 
     Parameters
@@ -118,7 +119,7 @@ def _effect(table: object, place: str) -> Effect:
     _check_names(section, names, place)
     _check_places_and_needs(section, place)
     templates = tuple(
-        _primitive_template(row, names, moments, f"{place}, primitives {number}")
+        _parse_primitive(row, names, moments, f"{place}, primitives {number}")
         for number, row in enumerate(section.primitives, start=1)
     )
     _check_acts_on_dynamic_trials(section, templates)
@@ -239,7 +240,7 @@ class _PrimitiveTemplate:
         if "if" in self.conditions and self.conditions["if"].value(values_by_name) == 0.0:
             return
         if not self.moments and not self.acts_in_windows:
-            yield self._primitive(values_by_name, context.target)
+            yield self._evaluate_primitive(values_by_name, context.target)
             return
         for trial in context.setting.campaign.trials:
             if not trial.is_dynamic:
@@ -247,12 +248,12 @@ class _PrimitiveTemplate:
             occurrences = context.setting.campaign.event_moments(trial.name, self.moments)
             for moments in occurrences:
                 values_and_moments = {**values_by_name, **moments}
-                begin = self._moment("begin", values_and_moments)
-                end = self._moment("end", values_and_moments)
-                primitive = self._primitive(values_and_moments, context.target)
+                begin = self._evaluate_moment("begin", values_and_moments)
+                end = self._evaluate_moment("end", values_and_moments)
+                primitive = self._evaluate_primitive(values_and_moments, context.target)
                 yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
-    def _moment(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
+    def _evaluate_moment(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
         """Return the begin or end of the primitive's window [s]; None if it is open on that side.
 
         Parameters
@@ -265,7 +266,7 @@ class _PrimitiveTemplate:
         expression = self.conditions.get(key)
         return None if expression is None else expression.value(values_by_name)
 
-    def _primitive(self, values_by_name: Mapping[str, float], target: Target) -> Primitive:
+    def _evaluate_primitive(self, values_by_name: Mapping[str, float], target: Target) -> Primitive:
         """Return the primitive with its expressions evaluated.
 
         Parameters
@@ -291,10 +292,10 @@ class _PrimitiveTemplate:
                 row[name] = value.with_numbers(used_numbers)
             else:
                 row[name] = value.value(values_by_name)
-        return _primitive_of(self.kind, row)
+        return _build_primitive(self.kind, row)
 
 
-def _primitive_template(
+def _parse_primitive(
     row: Mapping[str, str | float],
     parameters: frozenset[str],
     moments: frozenset[str],
@@ -372,7 +373,7 @@ def _check_values(kind: str, values: Mapping[str, str | float | Expression]) -> 
             row[key] = value
         else:
             row[key] = "1" if key in PRIMITIVES[kind].formula_fields else 1.0
-    _primitive_of(kind, row)
+    _build_primitive(kind, row)
 
 
 @dataclass(frozen=True)
@@ -428,7 +429,7 @@ class _EffectFunctions:
         return ModelPatch(tuple(primitives))
 
 
-def _primitive_of(kind: str, row: Mapping[str, str | float]) -> Primitive:
+def _build_primitive(kind: str, row: Mapping[str, str | float]) -> Primitive:
     """Build a primitive from its values; floats become integers for fields that are integers."""
     types = PRIMITIVES[kind].value_types()
     integers: dict[str, int] = {}

@@ -8,7 +8,7 @@ import numpy as np
 
 from discrepancy.campaign.records import BoolArray, Campaign, FloatArray, Trial
 from discrepancy.checks.fault import DataFault, FaultKind, samples_text
-from discrepancy.checks.held import roughness
+from discrepancy.checks.held import estimate_roughness
 
 COPIED_SHARE = 0.01
 """A channel is a copy if another one leaves less than this fraction of its noise unexplained."""
@@ -137,8 +137,8 @@ def _describe_copy(
     y = copy[in_copy][used]
     if len(y) < LEAST_COPIED or len(np.unique(x)) < LEAST_COPIED // 2:
         return ""
-    # the robust estimate is zero if most readings repeat; 924 is explained in `roughness`
-    noise = roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
+    # the robust estimate is zero if most readings repeat; 924 is explained in `estimate_roughness`
+    noise = estimate_roughness(y) or float(np.std(np.diff(y, 6)) / np.sqrt(924.0))
     if noise == 0.0:
         return ""
     delay = ""

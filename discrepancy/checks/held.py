@@ -44,7 +44,7 @@ _LEAST_UPDATES = 4.0
 A logger that is faster than its sensor records each update several times."""
 
 
-def roughness(values: FloatArray) -> float:
+def estimate_roughness(values: FloatArray) -> float:
     """Estimate the standard deviation of the white noise in a record by its sixth differences.
 
     Sixth differences remove motions with more than about eight samples in a period. The estimate is
@@ -170,7 +170,7 @@ def stuck_spans(
     extremes = (distinct[0], distinct[-1])
     inner_runs = [(start, stop) for start, stop in long_runs if values[start] not in extremes]
     quantum = _quantum_in_time(values)
-    if min(noise, roughness(values)) > _NOISE_IN_QUANTA * quantum:
+    if min(noise, estimate_roughness(values)) > _NOISE_IN_QUANTA * quantum:
         least_length = _LEAST_UPDATES * update_length(values)
         return [(start, stop) for start, stop in inner_runs if stop - start >= least_length]
     changes = np.abs(np.diff(values, prepend=values[:1], append=values[-1:]))

@@ -181,7 +181,7 @@ def _best_polynomial(record: FloatArray, weights: Weights) -> LocalPolynomial:
         has_weights = weights is even_weights or degree == LOW_DEGREE
         if has_weights and 4 * width + 4 <= len(record):
             polynomials.append(LocalPolynomial(weights, width, degree))
-    return min(polynomials, key=lambda polynomial: _scatter(polynomial.residual(record)))
+    return min(polynomials, key=lambda polynomial: _robust_scatter(polynomial.residual(record)))
 
 
 def _find_suspects(
@@ -334,7 +334,7 @@ def _is_event(residual: FloatArray, index: int, polynomial: LocalPolynomial) -> 
     return int(np.argmax(explained)) > 0
 
 
-def _scatter(residual: FloatArray) -> float:
+def _robust_scatter(residual: FloatArray) -> float:
     """Return the robust standard deviation of residuals (N,), without the unjudged edges."""
     return NORMAL_OVER_MAD * float(np.median(np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])))
 
@@ -345,7 +345,7 @@ def _comparison_deviation(residual: FloatArray, least: float) -> FloatArray:
     It is that of the whole record or that of the samples around it, whichever is larger, and at
     least `least`.
     """
-    scatter_of_record = max(_scatter(residual), least, 1e-300)
+    scatter_of_record = max(_robust_scatter(residual), least, 1e-300)
     inner_magnitudes = np.abs(residual[_EDGE_SAMPLES:-_EDGE_SAMPLES])
     if len(inner_magnitudes) <= 2 * _HALF_WINDOW:
         return np.full(len(residual), scatter_of_record)

@@ -16,7 +16,12 @@ from discrepancy.campaign.records import BoolArray, Campaign, Channel, FloatArra
 from discrepancy.campaign.sampling import quantum_of
 from discrepancy.checks.copies import copy_faults
 from discrepancy.checks.fault import DataFault, FaultKind, mark_accepted
-from discrepancy.checks.held import roughness, runs_of_true, stuck_sensor_faults, update_length
+from discrepancy.checks.held import (
+    estimate_roughness,
+    runs_of_true,
+    stuck_sensor_faults,
+    update_length,
+)
 from discrepancy.checks.outliers import LARGEST_SHARE, find_outliers
 from discrepancy.checks.rest import noise_record_faults
 
@@ -88,7 +93,7 @@ def _noise_faults(campaign: Campaign, channel: Channel) -> Iterator[DataFault]:
     least_roughness = _least_roughness(campaign, channel.name)
     recorded_roughness = stated
     if record.samples is not None and len(record.samples) >= LEAST_FOR_COLOUR:
-        recorded_roughness = roughness(record.samples)
+        recorded_roughness = estimate_roughness(record.samples)
     if 0.0 < least_roughness < recorded_roughness / _NOISE_FACTOR:
         contradiction = f"neighbouring samples scatter by {least_roughness:.3g}"
 
@@ -119,7 +124,7 @@ def _least_roughness(campaign: Campaign, name: str) -> float:
     least = np.inf
     for trial, values, _ in campaign.records(name):
         if trial.is_dynamic and len(values) >= LEAST_FOR_COLOUR:
-            least = min(least, roughness(values) / trial.noise_factor)
+            least = min(least, estimate_roughness(values) / trial.noise_factor)
     return least
 
 
@@ -258,5 +263,5 @@ def _is_clipped_in_time(values: FloatArray, start: int, stop: int, digit: float)
     places = neighbours - 0.5 * (start + stop - 1)
     _, _, weights_at_middle = np.linalg.pinv(np.vander(places, 3))
     beyond = abs(weights_at_middle @ values[neighbours] - values[start])
-    error = 3.0 * digit + 6.0 * roughness(values)
+    error = 3.0 * digit + 6.0 * estimate_roughness(values)
     return bool(beyond > 0.5 * np.abs(weights_at_middle).sum() * error)

@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from discrepancy.campaign.records import Campaign, Channel, FloatArray, Quantity, Trial
 from discrepancy.checks.fault import DataFault, FaultKind
-from discrepancy.checks.held import roughness
+from discrepancy.checks.held import estimate_roughness
 
 CLEAR_NOISE_DEVIATIONS = 5.0
 """Least size of a clear reading, in standard deviations of the noise."""
@@ -159,7 +159,7 @@ def _dynamic_scale(data: FloatArray, model: FloatArray, trial: Trial, channel: C
     # record stands out of its own scatter, and the prediction out of the stated noise.
     predicted = _amplitude(model, trial)
     measured = abs(scale) * predicted
-    scatter = roughness(data) if len(data) > 6 else 0.0
+    scatter = estimate_roughness(data) if len(data) > 6 else 0.0
     noise = trial.noise_deviation(channel) or scatter
     is_above_noise = measured > CLEAR_NOISE_DEVIATIONS * noise
     noise_may_be_in_another_unit = (

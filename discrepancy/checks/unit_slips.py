@@ -47,22 +47,22 @@ class Slip(NamedTuple):
     stated: str
 
     @property
-    def size(self) -> float:
+    def ratio(self) -> float:
         """The factor or its reciprocal, whichever is larger."""
         return max(self.factor, 1.0 / self.factor)
 
     @property
-    def width(self) -> float:
+    def tolerance_factor(self) -> float:
         """Factor by which the ratio may differ from the slip because of physical effects.
 
         A larger slip is distinct from other slips, and allows for a larger factor.
         """
         for least_size, width in ((200.0, 3.0), (20.0, 2.0), (DOUBTFUL_FACTOR, 1.35)):
-            if self.size >= least_size:
+            if self.ratio >= least_size:
                 return width
         return 1.1
 
-    def distance(self, scale: float) -> float:
+    def log_distance(self, scale: float) -> float:
         """Return |log(scale / factor)|: how far a ratio of data to model is from this slip."""
         return abs(log(abs(scale) / self.factor))
 
@@ -110,9 +110,11 @@ def find_slip(
                 continue
             factor = meant_in_si / assumed_in_si if drive else assumed_in_si / meant_in_si
             slip = Slip(factor, meant, assumed)
-            if slip.size > LEAST_FACTOR:
-                distances[slip] = slip.distance(scale)
-    explaining = [slip for slip, distance in distances.items() if distance < log(slip.width)]
+            if slip.ratio > LEAST_FACTOR:
+                distances[slip] = slip.log_distance(scale)
+    explaining = [
+        slip for slip, distance in distances.items() if distance < log(slip.tolerance_factor)
+    ]
     return min(explaining, key=lambda slip: distances[slip], default=None)
 
 
@@ -195,7 +197,7 @@ def _slips_in_trial(
         channel, _ = key
         slip = _slip_of_channel(campaign, channel, [scales[key]])
         # a small factor in one trial may be physical, such as lift that shifts from the outer wing
-        if slip is not None and slip.size >= CERTAIN_FACTOR:
+        if slip is not None and slip.ratio >= CERTAIN_FACTOR:
             yield from _channel_faults(campaign, channel, slip, [trial])
 
 
@@ -212,7 +214,7 @@ def _slip_of_channel(campaign: Campaign, name: str, scales: Sequence[float]) -> 
     slip = find_slip(median(map(abs, scales)), channel.quantity, channel.unit)
     if slip is None:
         return None
-    if any(slip.distance(scale) > 2.0 * log(slip.width) for scale in scales):
+    if any(slip.log_distance(scale) > 2.0 * log(slip.tolerance_factor) for scale in scales):
         return None
     return slip
 
@@ -282,7 +284,7 @@ def _grade_slip(fault: DataFault, slip: Slip, *, agreeing: int) -> Iterator[Data
         Number of records that show the same slip.
     """
     sentence = fault.sentence
-    if slip.size >= CERTAIN_FACTOR or (slip.size >= DOUBTFUL_FACTOR and agreeing > 1):
+    if slip.ratio >= CERTAIN_FACTOR or (slip.ratio >= DOUBTFUL_FACTOR and agreeing > 1):
         yield replace(fault, sentence=f"{sentence}; no physical effect is that large.")
-    elif slip.size >= DOUBTFUL_FACTOR or agreeing > 1:
+    elif slip.ratio >= DOUBTFUL_FACTOR or agreeing > 1:
         yield replace(fault, kind=FaultKind.UNIT_DOUBT, sentence=f"{sentence}, or mend the model.")

@@ -44,7 +44,7 @@ class FmuSimulator(FmuAtRest):
         super().__init__(description, folder)
         self._refinements: dict[Hashable, Refinement] = {}
 
-    def motion(
+    def simulate_motion(
         self,
         excitation: FmuExcitation,
         trial: Trial,

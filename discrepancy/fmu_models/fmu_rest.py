@@ -131,7 +131,7 @@ class FmuAtRest(IdentifiedFmu):
         step = self.description.static.step
         return self.cached(key, lambda: self.outputs_at_rest([state], loads, step, settle=True)[0])
 
-    def flexibility(self, state: OperatingPoint) -> FloatArray:
+    def port_flexibility(self, state: OperatingPoint) -> FloatArray:
         """Return the flexibility (P, P): displacements of ports (rows) per force (columns)."""
         if not self.ports:
             # without ports nothing is wanted, and the FMU may not accept loads of zero
@@ -252,7 +252,7 @@ class FmuAtRest(IdentifiedFmu):
         """
         ports = [self.ports.index(name) for name in laws.ports]
         columns = [self.displacement_columns[port] for port in ports]
-        compliance = self.flexibility(state)[np.ix_(ports, ports)]
+        compliance = self.port_flexibility(state)[np.ix_(ports, ports)]
         positions_without_laws = outputs[:, columns]
         for _ in range(STATIC_ITERATIONS):
             solution = static_solution(

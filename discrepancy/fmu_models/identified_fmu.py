@@ -149,7 +149,7 @@ class IdentifiedFmu(FmuRuns):
         """Return the context that adds the model's name to what the FMU refuses."""
         return ModelError.instead_of(FmuError, before=f"The FMU model {self.description.name!r}: ")
 
-    def excitation(
+    def excitation_of(
         self,
         trial: Trial,
         state: OperatingPoint,

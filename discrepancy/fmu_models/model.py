@@ -141,7 +141,7 @@ class FmuModel(DescribedModel):
                 static_stiffness=stiffness.static,
             )
         file_scales = self.description.scales
-        campaign_sizes = campaign.sizes
+        campaign_sizes = campaign.largest_magnitudes
         return Scales(
             length=file_scales.length or 1.0,
             tip_stiffness=file_scales.tip_stiffness or load_point.static,
@@ -177,11 +177,15 @@ class FmuModel(DescribedModel):
         static_trial = first_trial(campaign, is_dynamic=False) or trial_without_readings(
             TrialKind.STATIC, 1.0
         )
-        compliance = np.diag(self.fmu.flexibility(self._operating_point(static_trial, conditions)))
+        compliance = np.diag(
+            self.fmu.port_flexibility(self._operating_point(static_trial, conditions))
+        )
         dynamic_trial = first_trial(campaign, is_dynamic=True)
         if dynamic_trial is not None:
             state = self._operating_point(dynamic_trial, conditions)
-            system = self.fmu.linear_system(self.fmu.excitation(dynamic_trial, state, self.ports))
+            system = self.fmu.linear_system(
+                self.fmu.excitation_of(dynamic_trial, state, self.ports)
+            )
             if system is not None:
                 return self._stiffnesses_of_system(system)
         return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]
@@ -285,9 +289,9 @@ class FmuModel(DescribedModel):
         if trial.kind is not TrialKind.RINGDOWN and not begins_near_zero:
             trial = replace(trial, time=trial.time - first_stamp)
             times = times - first_stamp
-        excitation = self._excitation(trial, conditions, patch, laws)
+        excitation = self._excitation_of_trial(trial, conditions, patch, laws)
         readout = Readout(columns.columns, columns.derivatives, times)
-        return self.fmu.motion(excitation, trial, laws, readout, conditions.refinement)
+        return self.fmu.simulate_motion(excitation, trial, laws, readout, conditions.refinement)
 
     def _outputs_at_rest(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch
@@ -371,7 +375,7 @@ class FmuModel(DescribedModel):
         """Return the linear system at values of the parameters; None if the FMU is not linear."""
         conditions = Conditions(parameters, health=trial.health[:1])
         state = self._operating_point(trial, conditions, self.patch)
-        return self.fmu.linear_system(self.fmu.excitation(trial, state, self.ports))
+        return self.fmu.linear_system(self.fmu.excitation_of(trial, state, self.ports))
 
     def port_motion(
         self, trial: Trial, conditions: Conditions, parts: int = 1
@@ -393,16 +397,16 @@ class FmuModel(DescribedModel):
             primitive for primitive in patch if primitive.kind not in effects
         )
 
-    def _excitation(
+    def _excitation_of_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch, laws: PortLaws
     ) -> FmuExcitation:
         """Return what moves the FMU in a dynamic trial."""
         state = self._operating_point(trial, conditions, patch)
         if trial.kind is TrialKind.RINGDOWN:
-            excitation = self.fmu.excitation(trial, state, laws.ports)
+            excitation = self.fmu.excitation_of(trial, state, laws.ports)
             return excitation._replace(releases=release_values(self.fmu, trial, conditions))
         force_factors = self._force_factors(trial, patch)
-        excitation = self.fmu.excitation(trial, state, laws.ports, force_factors)
+        excitation = self.fmu.excitation_of(trial, state, laws.ports, force_factors)
         force = self._load_change(patch).apply_to(trial.force, trial.force)
         return excitation._replace(force=RecordedHistory(trial.time, force, trial.hold))
 

@@ -235,7 +235,7 @@ def closed_share_text(before: ResidualSet, after: ResidualSet, closed: ClosedSha
     rms_before = rms_by_channel(compared_before)
     errors = rms_errors_text(before.channels, rms_before, rms_by_channel(compared_after))
     trials = compared_trials_text(closed)
-    if closed.grew:
+    if closed.has_grown:
         return f"it makes the error in {trials} larger (rms of {errors})"
     return (
         f"it explains {percent_with_interval(closed)} of the mean square error in {trials} "

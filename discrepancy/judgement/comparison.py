@@ -185,7 +185,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             # the simulation without effect stands for a hypothesis that cannot be simulated
             return True
         share = self.closed_share(hypothesis).share
-        return share is not None and share.grew
+        return share is not None and share.has_grown
 
     # ---------------------------------------------------------------- which may be named
 

@@ -204,12 +204,12 @@ class _NoiseFreedom(NamedTuple):
     freedom : float
         The degrees of freedom of noise records and residuals together; infinite if the noise of one
         of the channels is known.
-    share : float
+    remaining_share : float
         The fraction of the degrees of freedom of records and readings that the fit did not absorb.
     """
 
     freedom: float
-    share: float
+    remaining_share: float
 
 
 def _noise_freedom(
@@ -283,7 +283,7 @@ def _p_value(statistic: float, count: int, noise: _NoiseFreedom) -> float:
     """
     if isinf(noise.freedom):
         return float(chi2.sf(statistic, count))
-    scaled_statistic = statistic * noise.share
+    scaled_statistic = statistic * noise.remaining_share
     if scaled_statistic >= noise.freedom:
         return 0.0
     remaining_freedom = noise.freedom - count
@@ -300,7 +300,7 @@ class _DirectionGroups:
     def __init__(self) -> None:
         self.groups: dict[str, dict[str, dict[int, FloatArray]]] = {}
 
-    def add(self, group: str, label: str, trial_index: int, change: FloatArray) -> None:
+    def add_change(self, group: str, label: str, trial_index: int, change: FloatArray) -> None:
         """Add the change of the prediction of a trial to a direction.
 
         Parameters
@@ -361,16 +361,16 @@ def _add_load_directions(
     is_static = data.trial.kind is TrialKind.STATIC
     group = "static loads" if is_static else "loads of flight"
     place_text = _load_place_text(data) if is_static else "in flight"
-    collected.add(group, f"the size {place_text}", trial_index, response)
+    collected.add_change(group, f"the size {place_text}", trial_index, response)
     if is_static:
         zero = response[np.argmax(np.abs(data.trial.force))]
-        collected.add(
+        collected.add_change(
             group, f"the zero {place_text}", trial_index, np.broadcast_to(zero, response.shape)
         )
     positions = _positions_along_span(problem, data)
     if positions is not None:
         label = f"the slope over the span {place_text}"
-        collected.add(group, label, trial_index, response * positions)
+        collected.add_change(group, label, trial_index, response * positions)
 
 
 def _add_run_zeros(collected: _DirectionGroups, problem: Problem, trial_index: int) -> None:
@@ -383,7 +383,7 @@ def _add_run_zeros(collected: _DirectionGroups, problem: Problem, trial_index: i
         is_quantity = np.array([other is quantity for other in quantities])
         zero = is_quantity * _zero_scale(problem, quantity)
         label = f"the zero of {quantity.value} {run_text}"
-        collected.add(
+        collected.add_change(
             "zeros of the static runs", label, trial_index, np.broadcast_to(zero, data.weight.shape)
         )
 
@@ -421,9 +421,9 @@ def _add_channel_directions(
     if kind is TrialKind.STATIC:
         trials_text = _load_place_text(data)
     group = f"channel {channel}"
-    collected.add(group, f"the size {trials_text}", trial_index, response * is_channel)
+    collected.add_change(group, f"the size {trials_text}", trial_index, response * is_channel)
     drift = zero * data.trial.start / last_start * np.ones(response.shape) * is_channel
-    collected.add(group, "the zero over time", trial_index, drift)
+    collected.add_change(group, "the zero over time", trial_index, drift)
 
 
 def _predicted_response(problem: Problem, fit: CandidateFit, trial_index: int) -> FloatArray:

@@ -46,7 +46,7 @@ REMAINING_LEVEL = 0.01
 # ---------------------------------------------------------------- scores
 
 
-def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
+def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     """Return the scores of trials that are all fitted, or all held out.
 
     Parameters
@@ -71,7 +71,7 @@ def scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         raise FitError("Scores need at least one used sample, but there is none.")
     densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
     chi_square = chi_square_of(residuals)
-    white = residuals.white(np.random.default_rng(seed))
+    white = residuals.whitened_residuals(np.random.default_rng(seed))
     p_values = [ljung_box(series)[1] for _, _, series in residuals.dynamic_series(white)]
     counts, _ = np.histogram(stats.norm.cdf(used_transforms), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
@@ -281,7 +281,7 @@ def check_held_out(after: ResidualSet) -> Gate:
     """
     if after.held_out is None:
         return _held_out_gate(None, nan, "No trial was held out.")
-    held_out_scores = scores(after.held_out)
+    held_out_scores = compute_scores(after.held_out)
     excess = chi_square_of(after.held_out).excess
     if not isfinite(excess):
         return _held_out_gate(None, nan, "No noise record to judge them by.")
@@ -357,7 +357,7 @@ def _chi_square_by_diagonal(residuals: ResidualSet) -> ChiSquare:
     return chi_square_of(replace(residuals, trials=trials))
 
 
-def prove(
+def prove_effects(
     before: ResidualSet, after: ResidualSet, *, effects: tuple[str, ...] = (), seed: int = 0
 ) -> Proof:
     """Return the proof of an effect: errors and scores without and with it.
@@ -369,7 +369,7 @@ def prove(
     effects : tuple of str
         The labels of the effects that are added, see `discrepancy.verdict.effect_label`.
     seed : int
-        The seed of the draw for the test of whiteness, see `scores`.
+        The seed of the draw for the test of whiteness, see `compute_scores`.
 
     Raises
     ------
@@ -379,8 +379,8 @@ def prove(
     after = residuals_with_noise_of(after, before)
     held_out_before = _held_out_scores(before, seed)
     held_out_after = _held_out_scores(after, seed)
-    fitted_before = scores(before.fitted or before, seed=seed)
-    fitted_after = scores(after.fitted or after, seed=seed)
+    fitted_before = compute_scores(before.fitted or before, seed=seed)
+    fitted_after = compute_scores(after.fitted or after, seed=seed)
     closed, reason = closed_share_or_reason(before, after)
     gain = nan
     gain_error = nan
@@ -403,7 +403,7 @@ def prove(
 
 def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
     """Return the scores of the held-out trials; None without any."""
-    return None if residuals.held_out is None else scores(residuals.held_out, seed=seed)
+    return None if residuals.held_out is None else compute_scores(residuals.held_out, seed=seed)
 
 
 def _remaining_sentence(residuals: ResidualSet, after: Scores) -> str:

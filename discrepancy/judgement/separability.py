@@ -165,7 +165,7 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
 # ---------------------------------------------------------------- detection and separation
 
 
-def separability(
+def compute_separability(
     campaign: Campaign, model: Model, setting: Setting, effects: Sequence[Effect]
 ) -> Separability:
     """Return which effects a campaign can detect, and which it can tell apart.

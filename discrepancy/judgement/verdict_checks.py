@@ -52,7 +52,7 @@ def check_against_trials(outcome: VerdictOutcome) -> VerdictOutcome:
         return VerdictOutcome(_unfitted_verdict(verdict, unfitted), search, no_effect)
     if fit.candidate.terms:
         closed, _ = closed_share_or_reason(before, after)
-        if closed is not None and closed.grew:
+        if closed is not None and closed.has_grown:
             sentence = _larger_error_sentence(verdict, closed_share_text(before, after, closed))
             return VerdictOutcome(_verdict_without_name(verdict, sentence), search, no_effect)
     far_records = far_held_out_records(before) if verdict.kind in KINDS_WITHOUT_GAP else []
@@ -106,13 +106,13 @@ class FarRecord:
     ----------
     trial, channel : str
         The names of the trial and the channel.
-    noises : float
+    noise_deviations : float
         The rms residual over the noise deviation.
     """
 
     trial: str
     channel: str
-    noises: float
+    noise_deviations: float
 
 
 def far_held_out_records(residuals: ResidualSet) -> list[FarRecord]:
@@ -134,7 +134,7 @@ def far_held_out_records(residuals: ResidualSet) -> list[FarRecord]:
             expected = float(np.mean(fitted.expected_variance[used, column]))
             if square > max(VETO_NOISE_DEVIATIONS**2, VETO_PREDICTIVE_DEVIATIONS**2 * expected):
                 far_records.append(FarRecord(fitted.trial.name, channel, float(np.sqrt(square))))
-    return sorted(far_records, key=lambda record: -record.noises)
+    return sorted(far_records, key=lambda record: -record.noise_deviations)
 
 
 def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarRecord]) -> str:
@@ -144,7 +144,7 @@ def _held_out_gap_sentence(residuals: ResidualSet, far_records: Sequence[FarReco
         trials = [fitted for fitted in residuals.trials if fitted.trial.name == record.trial]
         rms = rms_by_channel(replace(residuals, trials=tuple(trials)))[record.channel]
         size = _value_with_unit(residuals, record.channel, rms)
-        noises = f"{record.noises:.1f} times the noise"
+        noises = f"{record.noise_deviations:.1f} times the noise"
         parts.append(f"{record.channel} in {record.trial!r} by {size} (rms, {noises})")
     remaining = len(far_records) - MOST_MENTIONED
     if remaining > 0:

@@ -349,12 +349,12 @@ def dependence_bases(
     """
     samples = _UsedSamples(trials, column)
     bases = {
-        ("", "zero shift"): samples.features("mean"),
+        ("", "zero shift"): samples.prediction_features("mean"),
         ("", "zero shift of each trial"): samples.split_by_trial(np.ones((samples.count, 1))),
     }
     temperature = samples.stack_used_samples(lambda fitted: fitted.trial.temperature)
     if np.ptp(temperature) > 0.0:
-        proportional = temperature * samples.features("x")[:, 0]
+        proportional = temperature * samples.prediction_features("x")[:, 0]
         bases["", "temperature"] = np.column_stack([temperature, proportional])
     if trials[0].trial.is_dynamic:
         return bases | _dynamic_bases(samples, modes)
@@ -415,7 +415,7 @@ class _UsedSamples:
         ends = np.cumsum([int(rows.sum()) for rows in self.rows])
         return np.asarray(block_diag(*np.split(functions, ends[:-1])))
 
-    def features(self, *names: str) -> FloatArray:
+    def prediction_features(self, *names: str) -> FloatArray:
         """Return features of the prediction by name (n, k); zeros in a trial that lacks one.
 
         The features are those of `discrepancy.location.map.dependence_functions`.
@@ -442,7 +442,7 @@ def _static_bases(samples: _UsedSamples) -> dict[tuple[str, str], FloatArray]:
         bases["", "time"] = np.column_stack([np.ones_like(time), time - time.mean()])
     load = samples.stack_used_samples(lambda fitted: fitted.trial.load)
     if np.ptp(load) > 0.0:
-        x = samples.features("x")[:, 0]
+        x = samples.prediction_features("x")[:, 0]
         bases["", "load (proportional)"] = np.column_stack([x, load])
         not_proportional = [load, np.abs(load) * load, load**2]
         bases["", "load (not proportional)"] = np.column_stack(not_proportional)
@@ -464,8 +464,8 @@ def _dynamic_bases(
     drift = np.asarray(np.polynomial.legendre.legvander(relative_time, 4), dtype=np.float64)
     bases["", "a drift of zero in each trial"] = samples.split_by_trial(drift)
     if all(fitted.rates is not None for fitted in samples.trials):
-        bases["", "x and v"] = samples.features("x", "v")
-        bases["", "higher harmonics"] = samples.features("2nd harmonic", "3rd harmonic")
+        bases["", "x and v"] = samples.prediction_features("x", "v")
+        bases["", "higher harmonics"] = samples.prediction_features("2nd harmonic", "3rd harmonic")
     if not modes:
         return bases
     column = samples.column

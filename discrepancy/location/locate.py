@@ -112,7 +112,7 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
             "Nothing can be located: every trial is held out, and at least one fitted is needed."
         )
     fitted = without_coloured_records(fitted)
-    white = fitted.white(np.random.default_rng(seed))
+    white = fitted.whitened_residuals(np.random.default_rng(seed))
     coloured = coloured_noise_remarks(fitted)
     tests = (variance_test(fitted), *serial_tests(fitted, white, tuple(coloured)))
     rejected = holm_rejections([test.p_value for test in tests], GLOBAL_LEVEL)

@@ -184,7 +184,7 @@ class ResidualSet:
         noise = self.channels[channel].noise
         return 0.0 if noise is None else noise.degrees_of_freedom
 
-    def white(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
+    def whitened_residuals(self, generator: np.random.Generator) -> tuple[FloatArray, ...]:
         """Return residuals that are white with unit variance if the model is right.
 
         A fit absorbs part of the noise: its residuals r have the covariance I - S S^T. The sum

@@ -147,7 +147,7 @@ def residual_windows(
         The kinds of trials that are examined.
     """
     windows: tuple[GapWindow, ...] = ()
-    white = residuals.white(np.random.default_rng((seed, 1)))
+    white = residuals.whitened_residuals(np.random.default_rng((seed, 1)))
     for fitted, white_residuals in zip(residuals.trials, white, strict=True):
         trial = fitted.trial
         extends_in_time = fitted.used.any() and np.ptp(trial.time) > 0.0

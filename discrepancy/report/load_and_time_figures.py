@@ -176,7 +176,7 @@ def time_line_figure(windows: Sequence[GapWindow]) -> Figure | None:
     for row, name in enumerate(trials):
         windows_of_trial = [window for window in windows if window.trial == name]
         _draw_record(axes, row, windows_of_trial, norm, has_two_rows=has_two_rows)
-    axes.set_yticks(range(len(trials)), [_short(name) for name in trials])
+    axes.set_yticks(range(len(trials)), [_shorten_name(name) for name in trials])
     axes.set_ylim(len(trials) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
@@ -239,7 +239,7 @@ def _draw_record(
             )
 
 
-def _short(name: str) -> str:
+def _shorten_name(name: str) -> str:
     """Return a name, cut off with an ellipsis if it is long."""
     if len(name) <= LONGEST_NAME:
         return name

@@ -108,7 +108,7 @@ def spectrum_figure(before: ResidualSet, after: ResidualSet | None, worst: Worst
     """
     spectra = []
     for drawn in models_to_draw(before, after):
-        spectrum = _spectrum(drawn.residuals, worst.channel)
+        spectrum = _mean_spectrum(drawn.residuals, worst.channel)
         if spectrum is not None:
             spectra.append((spectrum, drawn))
     if not spectra:
@@ -167,7 +167,7 @@ class _Spectrum(NamedTuple):
     power: FloatArray
 
 
-def _spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
+def _mean_spectrum(residuals: ResidualSet, channel: str) -> _Spectrum | None:
     """Return the mean spectrum of a channel's residuals over the dynamic trials.
 
     Trials of different lengths have spectra at different frequencies; only the largest group of
@@ -219,10 +219,10 @@ def backbone_figure(before: ResidualSet, after: ResidualSet | None) -> tuple[Fig
     if worst is None or not frequencies:
         return None
     channel = worst.channel
-    measured = _backbones(before, channel, frequencies, measured=True)
+    measured = _backbones_by_mode(before, channel, frequencies, measured=True)
     curves = []
     for drawn in models_to_draw(before, after):
-        curves.append((drawn, _backbones(drawn.residuals, channel, frequencies)))
+        curves.append((drawn, _backbones_by_mode(drawn.residuals, channel, frequencies)))
     modes = [
         mode for mode in sorted(measured) if np.isfinite(measured[mode].time).sum() >= LEAST_POINTS
     ][:2]
@@ -310,7 +310,7 @@ def _limit_to_measured(axes: Axes, values: FloatArray) -> None:
     axes.set_ylim(max(bottom, low - margin), min(top, high + margin))
 
 
-def _backbones(
+def _backbones_by_mode(
     residuals: ResidualSet, channel: str, frequencies: Sequence[float], *, measured: bool = False
 ) -> dict[int, Backbone]:
     """Return the backbones of the ring-downs by mode, of the predictions or of the readings.
@@ -346,7 +346,7 @@ def _backbones(
                 clear_points = _clear_points(curve)
                 if clear_points is not None:
                     backbones_of_modes.setdefault(curve.mode, []).append(clear_points)
-    return {mode: _joined(mode, parts) for mode, parts in backbones_of_modes.items()}
+    return {mode: _join_backbones(mode, parts) for mode, parts in backbones_of_modes.items()}
 
 
 def _clear_points(curve: Backbone) -> Backbone | None:
@@ -359,7 +359,7 @@ def _clear_points(curve: Backbone) -> Backbone | None:
     return Backbone(mode=curve.mode, **arrays)
 
 
-def _joined(mode: int, parts: Sequence[Backbone]) -> Backbone:
+def _join_backbones(mode: int, parts: Sequence[Backbone]) -> Backbone:
     """Return the backbones of several ring-downs as one."""
     arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _ARRAYS}
     return Backbone(mode=mode, **arrays)

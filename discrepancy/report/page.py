@@ -18,7 +18,7 @@ from discrepancy.report.decidability_text import (
 )
 from discrepancy.report.figures import ReportInput
 from discrepancy.report.text import WORDS
-from discrepancy.self_calibration import Proportion, SelfCalibration, outcomes
+from discrepancy.self_calibration import Proportion, SelfCalibration, ordered_outcomes
 from discrepancy.verdict import Gate, Hypothesis, Verdict, VerdictKind
 from discrepancy.workflow import Investigation
 from reporting.page import Page, ReportFigure
@@ -205,7 +205,7 @@ def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Proportion]
     """Return the rows of the self-calibration: hidden or not, the outcome, and its fraction."""
     rows = []
     for title, null in (("an effect was hidden", False), ("nothing was hidden", True)):
-        for outcome in outcomes(tried, null=null):
+        for outcome in ordered_outcomes(tried, null=null):
             rows.append((title, outcome, tried.share(outcome, null=null)))
     rows.append(("named rightly", "90 % intervals that hold the true value", tried.coverage()))
     return rows

@@ -238,7 +238,7 @@ def planform_figure(
         _draw_planform(axes, design)
         for (name, place), value in zip(places.items(), sizes, strict=True):
             if np.isfinite(value):
-                position = _position(design, *place)
+                position = _planform_position(design, *place)
                 is_strain = before.channels[name].quantity is Quantity.STRAIN
                 marker = "o" if is_strain else "s"
                 axes.scatter(*position, c=[value], norm=norm, marker=marker, **GAUGE)
@@ -249,7 +249,7 @@ def planform_figure(
     return figure
 
 
-def _position(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
+def _planform_position(design: WingDesign, station: float, fraction: float) -> tuple[float, float]:
     """Return the coordinates of a place in the planform [m]: along the span, and along the chord.
 
     The chordwise coordinate is measured from the leading edge at the root. The wing is straight at
@@ -295,7 +295,7 @@ def _draw_panel(
     root, tip = span
     front, rear = chord
     corners = ((root, front), (tip, front), (tip, rear), (root, rear))
-    positions = [_position(design, station, fraction) for station, fraction in corners]
+    positions = [_planform_position(design, station, fraction) for station, fraction in corners]
     axes.fill(*np.transpose(positions), **look)
 
 

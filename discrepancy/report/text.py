@@ -176,7 +176,7 @@ def error_sentence(investigation: Investigation) -> str:
         return proof.closed_reason
     is_named = investigation.verdict.kind in NAMING
     predicate = closed_share_text(before, after, proof.closed).removeprefix("it ")
-    if proof.closed.grew:
+    if proof.closed.has_grown:
         subject = "With it" if is_named else "With the best hypothesis, which is no name,"
     else:
         subject = "It" if is_named else "The best hypothesis, which is no name,"
@@ -196,7 +196,7 @@ def remainders_sentence(verdict: Verdict) -> str:
     return WORDS.say("left", remainders=verdict.remainders)
 
 
-def _labels(effects: Iterable[tuple[str, str, bool]]) -> str:
+def _effects_label(effects: Iterable[tuple[str, str, bool]]) -> str:
     """Return effects joined by plus signs: their names, places and whether a shape is free."""
     labels = []
     for name, place, has_free_shape in effects:
@@ -210,7 +210,7 @@ def _labels(effects: Iterable[tuple[str, str, bool]]) -> str:
 def hypothesis_name(hypothesis: Hypothesis) -> str:
     """Return the effects of a hypothesis in words."""
     effects = [(effect.name, effect.place, bool(effect.shape)) for effect in hypothesis.effects]
-    return _labels(effects) or "nothing missing"
+    return _effects_label(effects) or "nothing missing"
 
 
 def added_label(investigation: Investigation) -> str:
@@ -218,7 +218,7 @@ def added_label(investigation: Investigation) -> str:
     if investigation.fit is None:
         return ""
     terms = investigation.fit.candidate.terms
-    return _labels((term.effect.name, term.place, term.free_shape) for term in terms)
+    return _effects_label((term.effect.name, term.place, term.free_shape) for term in terms)
 
 
 _WORD = re.compile(r"\b([a-z]+)(?=\b|_)")
@@ -297,7 +297,7 @@ def si_sizes(
             half_width = 0.5 * (size.high - size.low)
             interval = f" ({between(size.low, size.high, half_width)})"
         name = _size_name(size.parameter, primitive, unit)
-        where = _where(primitive, size, model, campaign)
+        where = _location_text(primitive, size, model, campaign)
         sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{where}"] = None
     return ", ".join(sizes)
 
@@ -349,7 +349,9 @@ def _size_name(parameter: str, primitive: Primitive, unit: str) -> str:
     return name.replace("force", "moment") if is_at_turning_port else name
 
 
-def _where(primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign) -> str:
+def _location_text(
+    primitive: Primitive, size: PrimitiveInterval, model: Model, campaign: Campaign
+) -> str:
     """Return the reference speed or displacement of a force, or the station of a mass.
 
     It is a phrase such as " at 0.3 m/s"; empty for other sizes.

@@ -179,7 +179,7 @@ def plan_from_scales(
         load_place=load_place,
     )
     # noise from the readings under the largest force; a channel that shows nothing gets the largest
-    trial = _static_trial("", plan, np.array([force]), start=0.0)
+    trial = _planned_static_trial("", plan, np.array([force]), start=0.0)
     conditions = prior_conditions(campaign, model, trial)
     readings = np.abs(observe(model, campaign, trial, ModelPatch(), conditions).values[0])
     noises = 1e-3 * np.where(readings > 0.0, readings, readings.max() or 1.0)
@@ -310,15 +310,17 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     if kind is TrialKind.STATIC:
         levels = plan.force * np.arange(6, dtype=np.float64) / 5.0
         return [
-            _static_trial("loading", plan, levels, start=0.0, run="A"),
-            _static_trial("unloading", plan, levels[::-1], start=600.0, run="A"),
-            _static_trial("loading again", plan, levels, start=3600.0, run="B", held_out=True),
+            _planned_static_trial("loading", plan, levels, start=0.0, run="A"),
+            _planned_static_trial("unloading", plan, levels[::-1], start=600.0, run="A"),
+            _planned_static_trial(
+                "loading again", plan, levels, start=3600.0, run="B", held_out=True
+            ),
         ]
     if kind is TrialKind.FLIGHT:
         factors = np.array(plan.load_factors)
         return [
-            _flight("turns", plan, factors, start=10000.0),
-            _flight("turns again", plan, factors[1:], start=11000.0, held_out=True),
+            _planned_flight("turns", plan, factors, start=10000.0),
+            _planned_flight("turns again", plan, factors[1:], start=11000.0, held_out=True),
         ]
     samples = np.arange(round(plan.duration / plan.interval) + 1, dtype=np.float64)
     time = plan.interval * samples
@@ -340,7 +342,7 @@ def _planned_trials(kind: TrialKind, plan: ExamplePlan) -> list[Trial]:
     return releases
 
 
-def _static_trial(
+def _planned_static_trial(
     name: str, plan: ExamplePlan, forces: FloatArray, start: float, **fields: Any
 ) -> Trial:
     """Return a static trial without readings, with a row for each force [N]."""
@@ -356,7 +358,7 @@ def _static_trial(
     )
 
 
-def _flight(
+def _planned_flight(
     name: str, plan: ExamplePlan, load_factors: FloatArray, start: float, **fields: Any
 ) -> Trial:
     """Return a flight without readings, with a row for each load factor [1]."""

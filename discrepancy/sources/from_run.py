@@ -93,7 +93,7 @@ def run_campaign(
         _check_scenario(folder, scenario)
         run = _read_run(folder)
         steps = _steps_with_last_patch(run, first_step, last_step)
-        return _campaign(folder, run, scenario, steps, held_out_share)
+        return _build_campaign(folder, run, scenario, steps, held_out_share)
     except DiscrepancyError:
         raise
     except (KeyError, ValueError, TypeError, IndexError, AttributeError, OverflowError) as cause:
@@ -132,7 +132,7 @@ def _steps_with_last_patch(
     return slice(max(firsts, default=None), last_step)
 
 
-def _campaign(
+def _build_campaign(
     folder: Path,
     run: xr.DataTree,
     scenario: dict[str, Any],
@@ -192,7 +192,7 @@ def _campaign(
     trials = [flight.rows(~is_held_out)]
     if is_held_out.any():
         trials.append(flight.rows(is_held_out, name="steps held out", held_out=True))
-    remarks = _remarks(used, noise, source_of_noise)
+    remarks = _flight_remarks(used, noise, source_of_noise)
     return records.Campaign(
         name=str(run.attrs.get("title", folder.name)),
         channels=channels,
@@ -204,7 +204,7 @@ def _campaign(
     )
 
 
-def _remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
+def _flight_remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:
     """Return the remarks on a flight.
 
     Parameters

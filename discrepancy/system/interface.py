@@ -294,7 +294,7 @@ class Model(ABC):
     # ------------------------------------------------------------ response
 
     @property
-    def sensors(self) -> ModelPatch:
+    def built_in_sensors(self) -> ModelPatch:
         """Sensors that are built in, for channels or for outputs of those names.
 
         They are no part of the model's responses: `discrepancy.system.sensing.observe` applies
@@ -370,7 +370,7 @@ class Model(ABC):
             If the model has sensors built in, whose effect on a missing force is not modelled.
         """
         self.check_outputs(outputs)
-        if len(self.sensors):
+        if len(self.built_in_sensors):
             raise ModelError(
                 f"{self.name} has sensors built in, which hide a missing force; leave them out."
             )

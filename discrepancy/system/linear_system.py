@@ -88,7 +88,7 @@ class StaticPath(NamedTuple):
     memory: FloatArray | None
 
 
-def _differs(matrix: FloatArray, other: FloatArray) -> bool:
+def _differ_beyond_rounding(matrix: FloatArray, other: FloatArray) -> bool:
     """Return whether two matrices differ by more than rounding."""
     largest = np.abs(matrix).max(initial=1e-300)
     return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * largest)
@@ -138,14 +138,14 @@ class LinearSystem:
     solved: SolvedStructure | None = None
 
     @property
-    def size(self) -> int:
+    def unknown_count(self) -> int:
         """Number N of unknowns."""
         return len(self.mass)
 
     @property
     def displacement_count(self) -> int:
         """Number n of displacements."""
-        return self.size - self.state_count
+        return self.unknown_count - self.state_count
 
     @property
     def law_directions(self) -> Mapping[str, FloatArray]:
@@ -157,7 +157,7 @@ class LinearSystem:
     @cached_property
     def drive_shapes(self) -> FloatArray:
         """Displacements (N, P) under a unit motion of each drive."""
-        shapes = np.zeros((self.size, len(self.drives)))
+        shapes = np.zeros((self.unknown_count, len(self.drives)))
         if len(self.drives):
             n = self.displacement_count
             shapes[:n] = np.linalg.pinv(self.drives[:, :n])
@@ -172,7 +172,7 @@ class LinearSystem:
         squares, displacement_shapes = self._displacement_modes()
         n = self.displacement_count
         count = len(squares)
-        shapes = np.zeros((self.size, count + self.state_count))
+        shapes = np.zeros((self.unknown_count, count + self.state_count))
         shapes[:n, :count] = displacement_shapes
         if self.state_count:
             capacity, axes = np.linalg.eigh(self.mass[n:, n:])
@@ -231,7 +231,7 @@ class LinearSystem:
     @property
     def is_truncated(self) -> bool:
         """Whether some modes have no inertia."""
-        return self.mode_count is not None and self.mode_count < self.size
+        return self.mode_count is not None and self.mode_count < self.unknown_count
 
     @cached_property
     def root_drive_mass(self) -> float:
@@ -246,7 +246,7 @@ class LinearSystem:
         return np.hstack((self.shapes, self.drive_shapes / self.root_drive_mass))
 
     @cached_property
-    def modal(self) -> ModalSystem:
+    def modal_system(self) -> ModalSystem:
         """Modes and drives as a modal system with ports; coupling that is rounding is left out."""
         mode_count = len(self.angular_frequency)
         drive_count = len(self.drives)
@@ -259,9 +259,9 @@ class LinearSystem:
         stiffness[mode_count:] = 0.0
         # an exact diagonal if only rounding errors couple the modes
         diagonal = np.diag(np.diag(damping))
-        if not drive_count and not _differs(damping, diagonal):
+        if not drive_count and not _differ_beyond_rounding(damping, diagonal):
             damping = diagonal
-        is_coupled = drive_count > 0 or _differs(stiffness, np.diag(frequency**2))
+        is_coupled = drive_count > 0 or _differ_beyond_rounding(stiffness, np.diag(frequency**2))
         return ModalSystem(
             frequency,
             damping,
@@ -278,7 +278,7 @@ class LinearSystem:
             return None
         rows = np.array(list(self.ports.values()))
         residual_compliance = np.einsum("pn,np->p", rows, self.residual_displacements(rows.T))
-        compliance = np.einsum("pn,np->p", rows, self.flexibility(rows.T))
+        compliance = np.einsum("pn,np->p", rows, self.apply_flexibility(rows.T))
         is_flexible = [name not in self.on_modes for name in self.ports]
         is_above_rounding = residual_compliance > 1e-9 * compliance
         return np.where(is_above_rounding & is_flexible, residual_compliance, 0.0)
@@ -302,7 +302,7 @@ class LinearSystem:
 
     def rows_of_laws(self, laws: PortLaws, time: float | None = None) -> FloatArray:
         """Return the rows (J, N) of the laws' ports; see `Laws.rows`."""
-        return laws.port_rows(self.ports, self.size, time)
+        return laws.port_rows(self.ports, self.unknown_count, time)
 
     # ------------------------------------------------------------ equilibrium
 
@@ -316,7 +316,7 @@ class LinearSystem:
                 f"The structure has no stiffness left in some direction ({cause})."
             ) from cause
 
-    def flexibility(self, loads: FloatArray) -> FloatArray:
+    def apply_flexibility(self, loads: FloatArray) -> FloatArray:
         """Return K^-1 loads, for loads (N,) or (N, k) on a structure that springs hold.
 
         Raises
@@ -336,7 +336,7 @@ class LinearSystem:
         of the M modes with inertia, shapes / omega^2 (shapes^T loads).
         """
         in_modes = (self.shapes / self.angular_frequency**2) @ (self.shapes.T @ loads)
-        return self.flexibility(loads) - in_modes
+        return self.apply_flexibility(loads) - in_modes
 
     def equilibrium_under(self, loads: FloatArray) -> FloatArray:
         """Return displacements and states (L, N) in equilibrium under constant loads (L, N).
@@ -347,7 +347,7 @@ class LinearSystem:
             If nothing holds the system against a load.
         """
         if self.mode_count is not None:
-            return self.flexibility(loads.T).T
+            return self.apply_flexibility(loads.T).T
         # In equilibrium displacements q and states v are constant, so K q + D v = modal loads.
         # Least squares: rigid motions may be unrestored, if no load acts along them.
         mode_count = len(self.angular_frequency)
@@ -355,8 +355,8 @@ class LinearSystem:
         modal_loads = loads @ self.shapes
         restoring = np.hstack(
             (
-                self.modal.full_stiffness[:mode_count, :displacement_mode_count],
-                self.modal.damping[:mode_count, displacement_mode_count:mode_count],
+                self.modal_system.full_stiffness[:mode_count, :displacement_mode_count],
+                self.modal_system.damping[:mode_count, displacement_mode_count:mode_count],
             )
         )
         amplitudes = np.linalg.lstsq(restoring, modal_loads.T, rcond=LEAST_PIVOT)[0]

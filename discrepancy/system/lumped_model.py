@@ -117,7 +117,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """Return the laws that the model itself has at ports, each times its factor."""
         if self.linear:
             return NO_PATCH
-        factors = self._factors(parameters.tolist())
+        factors = self._term_factors(parameters.tolist())
         return ModelPatch(
             tuple(law.scaled_force(factors.get(law.name, 1.0)) for law in self.description.law)
         )
@@ -146,7 +146,7 @@ class LumpedModel(DescribedModel, SystemModel):
                 continue
             section = self._section_of(trial, offset_input.recorded)
             if section.quantity.motion_chain:
-                motions[name] = _prescribed_motion(trial, offset_input, rig.factor(name))
+                motions[name] = _prescribed_motion(trial, offset_input, rig.term_factor(name))
             else:
                 direction = self._input_direction(rig, section, load_change)
                 loads.append(Load(direction, _load_history(trial, offset_input, load_change)))
@@ -388,7 +388,7 @@ class LumpedModel(DescribedModel, SystemModel):
 
     # ------------------------------------------------------------ matrices
 
-    def _factors(self, parameters: Sequence[float]) -> dict[str, float]:
+    def _term_factors(self, parameters: Sequence[float]) -> dict[str, float]:
         """Return the factors of the terms at values of the parameters."""
         factors: dict[str, float] = {}
         for section, value in zip(self.description.parameter, parameters, strict=True):
@@ -401,7 +401,7 @@ class LumpedModel(DescribedModel, SystemModel):
         """The function that returns the matrices and controllers in a state, with a cache."""
 
         def build(state: SystemState) -> Rig:
-            factors = self._factors(state.parameters)
+            factors = self._term_factors(state.parameters)
             return build_rig(self.description, factors, state, self._places)
 
         return lru_cache(self.cache_size)(build)
@@ -442,7 +442,7 @@ class LumpedModel(DescribedModel, SystemModel):
             stiffness,
             self.port_rows,
             mode_count=MOST_MODES if description.is_structure_on_springs else None,
-            relaxation=rig.factor("damping") * (beta or 0.0),
+            relaxation=rig.term_factor("damping") * (beta or 0.0),
             state_count=count - description.displacement_count,
             drives=np.array(drives),
             actions=self.law_directions,

@@ -74,7 +74,7 @@ class Motion:
     @cached_property
     def acceleration(self) -> FloatArray:
         """Second derivatives (N, M + P) of the modal coordinates, from the equation of motion."""
-        modal = self.system.modal
+        modal = self.system.modal_system
         restoring = self.q @ modal.full_stiffness.T
         if self.laws.stiffness_rate != 0.0:
             restoring *= 1.0 + self.laws.stiffness_rate * (
@@ -217,7 +217,7 @@ def _motion_from_record(
         # A speed-dependent law at a port that only drives move has no force at the begin if the
         # drives begin at rest. The kernel instead computes the force that would hold the drive's
         # coordinate like a free mass, which no reading contains.
-        rows = laws.port_rows(system.modal.ports, len(begin.v))
+        rows = laws.port_rows(system.modal_system.ports, len(begin.v))
         is_driven = ~np.any(rows[:, : len(system.angular_frequency)], axis=1)
         is_still = rows @ begin.v == 0.0
         motion.port_forces[0, is_driven & is_still & (laws.depends_on_speed == 1)] = 0.0
@@ -270,7 +270,7 @@ def _motion_from_release(
         stamps = np.append(stamps, abs(times[-1]) + 1.0)
     if stamps[0] < 0.0:
         # the transition matrix of the linear system over a negative time step
-        transition_back = system.modal.exact_steps(stamps[:1])[0][0]
+        transition_back = system.modal_system.exact_steps(stamps[:1])[0][0]
         begin = InitialMotion(*np.split(transition_back @ np.concatenate((begin.q, begin.v)), 2))
     motion = _integrate_from(system, excitation, laws, 0.0, stamps, begin, refinement)
     if held_count:
@@ -351,7 +351,7 @@ def _integrate_from(
     # a free linear motion has a closed form, without steps
     if not is_excited and laws.linear:
         since_begin = stamps - (first if is_late else stamps[0])
-        free_motion = system.modal.free_motion(begin.q, begin.v, since_begin)
+        free_motion = system.modal_system.free_motion(begin.q, begin.v, since_begin)
         if free_motion is not None:
             q, v = free_motion
             no_forces = np.zeros((len(stamps), 0))
@@ -378,7 +378,7 @@ def _integrate_in_steps(
     refinement: int,
 ) -> ModalMotion:
     """Return the motion at stamps (N,) [s] from a state at the first of them, step by step."""
-    modal = system.modal
+    modal = system.modal_system
     follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
     least_parts = SMOOTH_PARTS if follows_curve else 1
     edges = (*laws.switching_times, *excitation.jump_times)
@@ -416,7 +416,9 @@ def _linear_steps(
     begin_force, end_force = equivalent_ramps(
         lambda times: system.modal_forces(excitation, times), time
     )
-    steps = loaded_steps(system.modal, boundaries, begin_force, end_force, port_displacements)
+    steps = loaded_steps(
+        system.modal_system, boundaries, begin_force, end_force, port_displacements
+    )
     motions = list(excitation.prescribed_motions.values())
     if not motions:
         return steps

@@ -12,7 +12,9 @@ SMALLEST_SIZE = 1e-9
 """Magnitude [SI] of all states if nothing moves and all readings are zero."""
 
 
-def natural_state(motion: Motion, equations: Sequence[OutputEquation], trial: Trial) -> FloatArray:
+def natural_state_magnitudes(
+    motion: Motion, equations: Sequence[OutputEquation], trial: Trial
+) -> FloatArray:
     """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
 
     The magnitude of an amplitude is the larger of its largest value in the motion from rest, and

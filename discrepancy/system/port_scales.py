@@ -56,7 +56,7 @@ def scales_of_moving_structure(
         frequency = largest.speed / largest.displacement
     else:
         frequency = 1.0 / duration
-    mass = float(np.trace(system.mass)) / max(system.size, 1)
+    mass = float(np.trace(system.mass)) / max(system.unknown_count, 1)
     if moves and largest.load > 0.0:
         stiffness = largest.load / largest.displacement
     else:
@@ -149,7 +149,7 @@ class PortScaleEstimator:
         system = motion.system
         shapes = system.shapes
         modes = shapes.shape[1]
-        loads = motion.excitation.loads_at(motion.time, np.eye(system.size))
+        loads = motion.excitation.loads_at(motion.time, np.eye(system.unknown_count))
         forces = (
             motion.acceleration[:, :modes] @ (system.mass @ shapes).T,
             motion.velocity[:, :modes] @ (self.system.damping @ shapes).T,

@@ -34,9 +34,11 @@ def ported_system(
         Its matrices; see there for signs.
     """
     names = tuple(system.ports)
-    port_rows = np.array([system.ports[name] for name in names]).reshape(len(names), system.size)
+    port_rows = np.array([system.ports[name] for name in names]).reshape(
+        len(names), system.unknown_count
+    )
     law_directions = np.array([system.law_directions[name] for name in names])
-    law_directions = law_directions.reshape(len(names), system.size)
+    law_directions = law_directions.reshape(len(names), system.unknown_count)
     direct_outputs = _direct_forces(system, equations, law_directions)
     # the system in the coordinates q
     mass = shapes.T @ system.mass @ shapes

@@ -110,7 +110,7 @@ def observe(
         If a sensor primitive names a channel that does not exist or has values that no sensor can
         have.
     """
-    patch = (_sensors_by_channel(model.sensors, campaign) + patch).in_trial(trial.name)
+    patch = (_sensors_by_channel(model.built_in_sensors, campaign) + patch).in_trial(trial.name)
     trial, patch = shift_clock_to_first_sample(trial, patch)
     if not len(patch.of(*SENSORS)):
         return model.respond(trial, campaign.outputs(trial), patch, conditions)

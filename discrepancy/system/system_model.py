@@ -15,7 +15,7 @@ from discrepancy.system.interface import NO_PATCH, Model
 from discrepancy.system.linear_system import LinearSystem
 from discrepancy.system.load_change import LoadChange, require_release
 from discrepancy.system.motion import Motion, simulate_motion
-from discrepancy.system.natural_state import natural_state
+from discrepancy.system.natural_state import natural_state_magnitudes
 from discrepancy.system.output_equation import OutputEquation
 from discrepancy.system.port_scales import (
     GlobalScales,
@@ -157,7 +157,7 @@ class SystemModel(Model):
 
     # ------------------------------------------------------------ trials
 
-    def laws(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
+    def laws_at_ports(self, parameters: FloatArray, patch: ModelPatch = NO_PATCH) -> PortLaws:
         """Return the laws at the ports, those of the model and those of a patch."""
         forces = self.forces_at_ports(self.built_in_laws(parameters) + patch.of(*INTERNAL_FORCES))
         return port_laws(forces, self.port_rows, in_windows=self.follows_windows)
@@ -216,7 +216,7 @@ class SystemModel(Model):
         drives = tuple(excitation.prescribed_motions)
         return ExcitedSystem(self.system_in_state(case.state._replace(drives=drives)), excitation)
 
-    def motion(self, case: PatchedTrial, laws: PortLaws = NO_LAWS) -> Motion:
+    def simulate_motion(self, case: PatchedTrial, laws: PortLaws = NO_LAWS) -> Motion:
         """Return the motion in a dynamic trial.
 
         Raises
@@ -240,11 +240,11 @@ class SystemModel(Model):
         recorded force is not zero. In a dynamic trial the structure has the temperature of the
         first sample throughout.
         """
-        laws = self.laws(conditions.parameters, patch)
+        laws = self.laws_at_ports(conditions.parameters, patch)
         case = self.patched_trial(trial, conditions, patch)
         if not trial.is_dynamic:
             return Response(self._outputs_at_rest(case, outputs, laws))
-        motion = self.motion(case, laws)
+        motion = self.simulate_motion(case, laws)
         return motion.response(self.output_equations(case, outputs, motion.excitation))
 
     def _outputs_at_rest(self, case: PatchedTrial, outputs: Outputs, laws: PortLaws) -> FloatArray:
@@ -361,15 +361,15 @@ class SystemModel(Model):
     def initial_state_magnitudes(self, campaign: Campaign, trial: Trial) -> FloatArray:
         """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
 
-        See `natural_state`; the motion from rest is that of the prior mean.
+        See `natural_state_magnitudes`; the motion from rest is that of the prior mean.
         """
         parameters = self.prior_mean(campaign)
         case = self.patched_trial(replace(trial, begins=Start.STILL), Conditions(parameters))
-        motion = self.motion(case, self.laws(parameters))
+        motion = self.simulate_motion(case, self.laws_at_ports(parameters))
         outputs = campaign.outputs(trial)
         self.check_outputs(outputs)
         equations = self.output_equations(case, outputs, motion.excitation)
-        return natural_state(motion, equations, trial)
+        return natural_state_magnitudes(motion, equations, trial)
 
     def scales(self, campaign: Campaign) -> Scales:
         """Return the natural scales under a campaign, at the prior mean and without a patch.
@@ -382,12 +382,14 @@ class SystemModel(Model):
         state = SystemState(tuple(parameters.tolist()), losses=(0.0,) * len(self.regions))
         system = self.system_in_state(state)
         uncontrolled = self.system_in_state(state._replace(controlled=False))
-        port_rows = self._rows_of_ports(self.ports).reshape(len(self.ports), uncontrolled.size)
+        port_rows = self._rows_of_ports(self.ports).reshape(
+            len(self.ports), uncontrolled.unknown_count
+        )
         is_held = system.mode_count is not None and all(_begins_at_rest(trial) for trial in trials)
         estimator = PortScaleEstimator(uncontrolled, port_rows)
         largest = self._add_trials(estimator, campaign, is_held=is_held)
         # scales of the whole structure
-        campaign_sizes = campaign.sizes
+        campaign_sizes = campaign.largest_magnitudes
         if is_held:
             global_scales = self._scales_of_held_structure(system, state, campaign)
             first_shape = system.shapes[:, 0]
@@ -469,18 +471,18 @@ class SystemModel(Model):
         the typical magnitudes of an unknown initial state.
         """
         conditions = Conditions(self.prior_mean(campaign))
-        laws = self.laws(conditions.parameters)
+        laws = self.laws_at_ports(conditions.parameters)
         try:
-            motion = self.motion(self.patched_trial(trial, conditions), laws)
+            motion = self.simulate_motion(self.patched_trial(trial, conditions), laws)
         except ModelError:
             # the trial cannot begin as it states, such as in an equilibrium of a free structure:
             # its scales are then those of a motion from rest
             trial_from_rest = replace(trial, begins=Start.STILL)
-            motion = self.motion(self.patched_trial(trial_from_rest, conditions), laws)
+            motion = self.simulate_motion(self.patched_trial(trial_from_rest, conditions), laws)
         if not np.any(motion.q) and not np.any(motion.velocity):
             magnitudes = self.initial_state_magnitudes(campaign, trial)
             released_trial = self.patched_trial(trial, replace(conditions, initial=magnitudes))
-            motion = self.motion(released_trial, laws)
+            motion = self.simulate_motion(released_trial, laws)
         return motion
 
     def _static_displacements(self, case: PatchedTrial) -> FloatArray:

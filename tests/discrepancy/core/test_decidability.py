@@ -20,9 +20,9 @@ from discrepancy.judgement.next_experiment import (
     next_experiments,
     oscillates,
 )
-from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, separability
+from discrepancy.judgement.separability import CONFUSION_DISTANCE, campaign_as_predicted, compute_separability
 from discrepancy.report.decidability_text import group_lines
-from discrepancy.self_calibration import outcome_of, self_calibrate, wilson, write_self_calibration
+from discrepancy.self_calibration import outcome_of, self_calibrate, wilson_interval, write_self_calibration
 from discrepancy.simulation import Simulator
 from discrepancy.verdict import VerdictKind
 from discrepancy.workflow import investigate
@@ -38,7 +38,7 @@ def group_of(found, identifier):
 
 
 def decided(model, given, *effects):
-    return separability(given, model, kit.problem_of(given, model).setting, kit.chosen(*effects))
+    return compute_separability(given, model, kit.problem_of(given, model).setting, kit.chosen(*effects))
 
 
 def test_ringdown_of_one_mode_cannot_tell_mass_root_and_clock():
@@ -121,7 +121,7 @@ def test_a_whole_laboratory_test_separates():
     (gain,) = gauge.parameters
     small = replace(gain.prior, low=1e-4 * gain.prior.low, high=1e-4 * gain.prior.high)
     effects = [*others, replace(gauge, parameters=(replace(gain, prior=small),))]
-    unseen = separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, effects)
+    unseen = compute_separability(kit.BENCH.campaign, kit.BENCH.model, kit.BENCH.setting, effects)
     assert 1e-6 < unseen.detectability[-1].distance < 0.1 * CONFUSION_DISTANCE
     assert "gauge_gain" in unseen.identifiers
     assert unseen.groups == ()
@@ -292,9 +292,9 @@ def test_the_workflow_tried_on_its_own_geometry(tmp_path):
     assert all(case.distance >= 25.0 for case in found.cases if case.hidden != "nothing")
     assert sum(found.confusion()[2].ravel()) == 6
     assert found.share("right", null=True).total == 2
-    none, square = wilson(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)
+    none, square = wilson_interval(0, 9), norm.ppf(0.95) ** 2  # in closed form (Wilson 1927)
     assert (none.value, none.low, none.high) == pytest.approx((0.0, 0.0, square / (9.0 + square)))
-    assert wilson(0, 0).total == 0
+    assert wilson_interval(0, 0).total == 0
     again = self_calibrate(campaign, model, FEW, 6, seed=2, workers=2)
     assert again == found
     path = write_self_calibration(tmp_path / "self_calibration.json", found, ORIGIN)

@@ -220,7 +220,7 @@ def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_o
     for shares in ({Candidate((cell, gain)).identifiers: 0.6, ("load_cell",): 0.4}, {right: 0.8, (): 0.2}):
         assert VerdictCase(found, shares).common_effects_verdict() is None
     # patch and proof are those of a member that fits, the probability is that of those together
-    verdict, _, nearest = VerdictCase(found, {("load_cell",): 0.6, right: 0.38, (): 0.02}).open()
+    verdict, _, nearest = VerdictCase(found, {("load_cell",): 0.6, right: 0.38, (): 0.02}).undecided_verdict()
     assert verdict.kind is VerdictKind.GROUP
     assert verdict.group == nearest.candidate.identifiers == right
     assert "cannot tell which" not in verdict.sentence

@@ -8,7 +8,13 @@ from scipy import stats
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from discrepancy.campaign.noise import MAINS_DEVIATION, NoiseModel, autoregression, noise_model, remove_lines
+from discrepancy.campaign.noise import (
+    MAINS_DEVIATION,
+    NoiseModel,
+    fit_autoregression,
+    noise_model,
+    remove_lines,
+)
 from discrepancy.campaign.noise_tests import (
     cumulative_periodogram,
     fisher_g,
@@ -32,7 +38,7 @@ def channel(samples, interval=INTERVAL):
 def test_autoregression_is_recovered(coefficients):
     """Yule-Walker estimates have standard errors of about 1/sqrt(N)."""
     series = coloured(np.random.default_rng(1), coefficients, 8000)
-    found, innovation = autoregression(series)
+    found, innovation = fit_autoregression(series)
     padded = np.zeros(max(len(found), len(coefficients)))
     padded[: len(found)] = found
     padded[: len(coefficients)] -= coefficients

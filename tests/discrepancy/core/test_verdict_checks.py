@@ -234,7 +234,7 @@ def test_the_record_of_proof_is_what_the_residuals_show(case, tmp_path):
         for residuals in (before, after)
     ]
     assert proof.closed.value == pytest.approx(1.0 - total[1] / total[0])
-    assert not proof.grew
+    assert not proof.has_grown
     if stored.verdict.kind in (VerdictKind.NAMED_IN_PART, VerdictKind.UNEXPLAINED):
         assert percent_with_interval(proof.closed) in stored.verdict.sentence
         old = proof.held_out_before or proof.fitted_before

@@ -25,9 +25,11 @@ def test_the_map_is_silent_under_the_null_and_honest_beside_a_bad_channel():
     silent, proportion = [], []
     for _ in range(20):
         fitted = bench.fit(generator)
-        silent.append(not any(cell.significant for cell in residual_map(fitted, fitted.white(generator))))
+        silent.append(
+            not any(cell.significant for cell in residual_map(fitted, fitted.whitened_residuals(generator)))
+        )
         fitted = bench.fit(generator, extra={0: np.array([0.0, 0.0, 4.0, 0.0])})
-        cells = residual_map(fitted, fitted.white(generator))
+        cells = residual_map(fitted, fitted.whitened_residuals(generator))
         found = [(cell.channel, cell.trial) for cell in cells if cell.significant]
         assert ("g3", "release 1") in found
         proportion.append(np.mean([place != ("g3", "release 1") for place in found]))
@@ -42,7 +44,8 @@ def test_a_short_noise_record_makes_no_pattern_over_the_channels():
     for _ in range(40):
         fitted = bench.fit(generator)
         told += sum(
-            bool(singular_patterns(fitted, kind)) for kind in group_by_kind(fitted, fitted.white(generator))
+            bool(singular_patterns(fitted, kind))
+            for kind in group_by_kind(fitted, fitted.whitened_residuals(generator))
         )
     assert told <= binom.isf(1e-3, 80, 0.01)
 
@@ -260,7 +263,7 @@ def test_restored_residuals_are_white_with_unit_variance(held_out):
     bench = Bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
-        np.concatenate([part.ravel() for part in bench.fit(generator).white(generator)]) for _ in range(500)
+        np.concatenate([part.ravel() for part in bench.fit(generator).whitened_residuals(generator)]) for _ in range(500)
     ])  # fmt: skip
     covariance = draws.T @ draws / len(draws)
     plain = np.abs(covariance - np.eye(len(covariance)))

@@ -24,7 +24,7 @@ from discrepancy.judgement.separability import (
     DETECTION_DISTANCE,
     Detectability,
     Separability,
-    separability,
+    compute_separability,
 )
 from discrepancy.report.decidability_text import (
     campaign_needs,
@@ -67,7 +67,7 @@ def drag():
 
 @pytest.fixture(scope="module")
 def able(drag):
-    return separability(drag.campaign, drag.model, drag.problem.setting, FEW)
+    return compute_separability(drag.campaign, drag.model, drag.problem.setting, FEW)
 
 
 def page_of(investigation, **verdict):
@@ -183,7 +183,7 @@ def test_what_can_be_decided(drag, able):
     told = {"data": drag.campaign, "model": drag.model, "faults": (), "catalogue": FEW, **words}
     said = list(
         WORDS.rendered_blocks(
-            WORDS.content["printed"]["check"], group_lines=group_lines, needs=campaign_needs, **told
+            WORDS.content["printed"]["check"], group_lines=group_lines, campaign_needs=campaign_needs, **told
         )
     )
     assert ("say", "Not testable: washout. The campaign has no flight trial to fit.") in said
