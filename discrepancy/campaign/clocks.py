@@ -96,13 +96,6 @@ def merge_clocks(
             f"{_file_name(clocks)}: the times {heads} differ, and a row of a {kind} trial is one "
             "state at rest: leave all but one out with --column NAME=-."
         )
-    sentence = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
-    if not clocks_are_equal:
-        sentence = (
-            f"{_stamped_columns_text(clocks)}: one clock has the {count} stamps of all, and a "
-            "channel has no reading where its own clock has no stamp"
-        )
-
     cells: dict[str, list[str]] = {TIME: _time_cells(seconds)}
     loads_are_known = np.ones(count, dtype=bool)
     filled_loads = []
@@ -126,6 +119,12 @@ def merge_clocks(
         raise CampaignFileError(
             f"{_file_name(clocks)}: there is no time at which both {listing(filled_loads)} and "
             f"{unread[0]!r} are known, and a load must be known while a channel is read."
+        )
+    sentence = f"{_stamped_columns_text(clocks)}: the clocks are equal and become one"
+    if not clocks_are_equal:
+        sentence = (
+            f"{_stamped_columns_text(clocks)}: one clock has the {count} stamps of all, and a "
+            "channel has no reading where its own clock has no stamp"
         )
     sentence += _remark_on_loads(filled_loads, outside=count - len(rows))
     lines = _line_numbers(clocks, times, positions, count)

@@ -55,7 +55,7 @@ def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
         One or more trials with their predictions.
     seed : int
         The seed of the random numbers that are added to residuals of a fit to make them white, see
-        `ResidualSet.white`.
+        `ResidualSet.whitened_residuals`.
 
     Raises
     ------

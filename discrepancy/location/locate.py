@@ -94,7 +94,8 @@ def locate(residuals: ResidualSet, *, seed: int = 0) -> Location:
     residuals : ResidualSet
         Residuals of one hypothesis; held-out trials are left out.
     seed : int
-        Seed of the random draw that makes the residuals white; see `ResidualSet.white`.
+        Seed of the random draw that makes the residuals white; see
+        `ResidualSet.whitened_residuals`.
 
     Returns
     -------

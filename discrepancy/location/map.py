@@ -82,7 +82,22 @@ def normal_equations_of(
     return NormalEquations(gram, basis.T @ residual, np.zeros((0, function_count)))
 
 
-def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> tuple[float, int]:
+class ExplainedSquares(NamedTuple):
+    """What functions explain in the residuals.
+
+    Attributes
+    ----------
+    sum_of_squares : float
+        Explained sum of squares, in units of the noise variance.
+    degrees_of_freedom : int
+        Number of directions that remain after the fit of the model; chi-squared has as many.
+    """
+
+    sum_of_squares: float
+    degrees_of_freedom: int
+
+
+def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> ExplainedSquares:
     """Return the sum of squares that functions explain in the residuals of several channels.
 
     If the model is right, the projection B^T r has the covariance G = B^T (I - S S^T) B, so that
@@ -92,13 +107,6 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> tuple[floa
     ----------
     equations : sequence of NormalEquations
         Normal equations of each channel; every channel has its own coefficients.
-
-    Returns
-    -------
-    sum_of_squares : float
-        Explained sum of squares, in units of the noise variance.
-    count : int
-        Its degrees of freedom: the number of directions that remain.
     """
     covariance = block_diag(*(channel_equations.gram for channel_equations in equations))
     if all(channel_equations.absorbed_by_fit.shape[0] for channel_equations in equations):
@@ -108,7 +116,7 @@ def explained_sum_of_squares(equations: Sequence[NormalEquations]) -> tuple[floa
     eigenvalues, eigenvectors = np.linalg.eigh(covariance)
     is_remaining = eigenvalues > _LEAST_REMAINING_VARIANCE
     squares = (eigenvectors[:, is_remaining].T @ projection) ** 2 / eigenvalues[is_remaining]
-    return float(np.sum(squares)), int(is_remaining.sum())
+    return ExplainedSquares(float(np.sum(squares)), int(is_remaining.sum()))
 
 
 def motion_envelope(fitted: FittedTrial, column: int) -> FloatArray:
@@ -306,7 +314,8 @@ def residual_map(
     residuals : ResidualSet
         Fitted trials.
     white : tuple of (N, C) ndarray
-        White residuals of each trial, from its method `white`, for the bins of frequency.
+        White residuals of each trial, from its method `whitened_residuals`, for the bins of
+        frequency.
     rate : float
         False discovery rate.
     """

@@ -155,7 +155,7 @@ def serial_tests(
     residuals : ResidualSet
         The set.
     white : sequence of (N, C) ndarray
-        White residuals of each trial, from its method `white`.
+        White residuals of each trial, from its method `whitened_residuals`.
     coloured : sequence of str
         Channels whose noise record is not white itself, and which are therefore left out.
     """

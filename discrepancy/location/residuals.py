@@ -239,7 +239,7 @@ class ResidualSet:
         Parameters
         ----------
         white : sequence of (N, C) ndarray
-            White residuals of each trial, from the method `white`.
+            White residuals of each trial, from the method `whitened_residuals`.
 
         Yields
         ------
@@ -296,9 +296,24 @@ def without_coloured_records(residuals: ResidualSet) -> ResidualSet:
     return replace(residuals, trials=tuple(trials))
 
 
+class SumOfSquaresMoments(NamedTuple):
+    """Moments of a sum of squares of residuals, if the model is right.
+
+    Attributes
+    ----------
+    expected_sum : float
+        Expected sum of squares, in units of the noise variance.
+    degrees_of_freedom : float
+        Effective degrees of freedom; 0 if the fit has absorbed all residuals.
+    """
+
+    expected_sum: float
+    degrees_of_freedom: float
+
+
 def sum_of_squares_moments(
     records: Iterable[tuple[FloatArray, FloatArray | None]], *, held_out: bool = False
-) -> tuple[float, float]:
+) -> SumOfSquaresMoments:
     """Return mean and effective degrees of freedom of a sum of squares of residuals.
 
     If the residuals have the covariance A, the sum has the mean tr A and the variance 2 tr A^2. A
@@ -313,13 +328,6 @@ def sum_of_squares_moments(
         their sensitivities S, for each trial and channel.
     held_out : bool
         True for residuals of held-out trials, where A = I + S S^T.
-
-    Returns
-    -------
-    mean : float
-        Expected sum of squares tr A, in units of the noise variance.
-    degrees_of_freedom : float
-        Effective degrees of freedom; 0 if the fit has absorbed all residuals.
     """
     trace = 0.0
     trace_of_square = 0.0
@@ -331,7 +339,7 @@ def sum_of_squares_moments(
             trace_of_square += float(expected_variance.sum())
             continue
         # A^2 = I -+ 2 S S^T + (S S^T)^2, thus tr A^2 = n -+ 2 tr S S^T + tr (S^T S)^2. The last
-        # term does not split into items: S^T S is summed over them first.
+        # term does not split into records: S^T S is summed over them first.
         leverage = np.einsum("np,np->n", sensitivity, sensitivity)
         trace_of_square += float(np.sum(1.0 + (2.0 if held_out else -2.0) * leverage))
         gram_of_record = sensitivity.T @ sensitivity
@@ -342,15 +350,29 @@ def sum_of_squares_moments(
         )
     if gram_of_sensitivities is not None:
         trace_of_square += float(np.sum(gram_of_sensitivities**2))
+    # traces below these limits are rounding errors: the fit has absorbed all residuals
     if trace <= 1e-9 or trace_of_square <= 1e-12:
-        return max(trace, 0.0), 0.0
-    return trace, trace**2 / trace_of_square
+        return SumOfSquaresMoments(max(trace, 0.0), 0.0)
+    return SumOfSquaresMoments(trace, trace**2 / trace_of_square)
 
 
-def mean_square_ratio(residuals: ResidualSet, channels: Sequence[str]) -> tuple[float, float]:
+class MeanSquareRatio(NamedTuple):
+    """A sum of squares of residuals over its expectation.
+
+    Attributes
+    ----------
+    ratio : float
+        The ratio; 1 on average if the model is right, nan if the expectation is zero.
+    degrees_of_freedom : float
+        Effective degrees of freedom of the sum; see `sum_of_squares_moments`.
+    """
+
+    ratio: float
+    degrees_of_freedom: float
+
+
+def mean_square_ratio(residuals: ResidualSet, channels: Sequence[str]) -> MeanSquareRatio:
     """Return the sum of squares of channels' residuals divided by its expectation.
-
-    It is 1 on average if the model is right.
 
     Parameters
     ----------
@@ -358,22 +380,18 @@ def mean_square_ratio(residuals: ResidualSet, channels: Sequence[str]) -> tuple[
         Trials that are all fitted, or all held out.
     channels : sequence of str
         Names of the channels.
-
-    Returns
-    -------
-    ratio : float
-        Sum of squares over its expectation; nan if that is zero.
-    degrees_of_freedom : float
-        Effective degrees of freedom of the sum; see `sum_of_squares_moments`.
     """
     sum_of_squares = 0.0
-    moments = []
+    records = []
     for name in channels:
         for fitted, column, used in channel_fits(residuals.trials, name):
             sum_of_squares += float(np.sum(fitted.standardised[used, column] ** 2))
             sensitivity = None
             if fitted.sensitivity is not None:
                 sensitivity = fitted.sensitivity[used, column]
-            moments.append((fitted.expected_variance[used, column], sensitivity))
-    mean, freedom = sum_of_squares_moments(moments, held_out=residuals.trials[0].trial.held_out)
-    return (sum_of_squares / mean if mean > 0.0 else np.nan), freedom
+            records.append((fitted.expected_variance[used, column], sensitivity))
+    expected_sum, freedom = sum_of_squares_moments(
+        records, held_out=residuals.trials[0].trial.held_out
+    )
+    ratio = sum_of_squares / expected_sum if expected_sum > 0.0 else np.nan
+    return MeanSquareRatio(ratio, freedom)

@@ -56,8 +56,8 @@ def gap_windows(
         The residuals of the unchanged model. They alone are examined if missing forces cannot be
         estimated, or if the model has laws of its own, which are exact only in a simulation.
     seed : int
-        The seed of the random draw in `ResidualSet.white`, which restores the part of the noise
-        that the fit has absorbed.
+        The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
+        the noise that the fit has absorbed.
     """
     dynamic_trials = tuple(fitted.trial for fitted in residuals.trials if fitted.trial.is_dynamic)
     _, own_laws = problem.model.without_laws()
@@ -139,8 +139,8 @@ def residual_windows(
     residuals : ResidualSet
         The residuals.
     seed : int
-        The seed of the random draw in `ResidualSet.white`, which restores the part of the noise
-        that the fit has absorbed.
+        The seed of the random draw in `ResidualSet.whitened_residuals`, which restores the part of
+        the noise that the fit has absorbed.
     with_effect : bool
         Whether the residuals are those of the best hypothesis, not of the unchanged model.
     kinds : frozenset of TrialKind

@@ -263,7 +263,8 @@ def test_restored_residuals_are_white_with_unit_variance(held_out):
     bench = Bench(count=40, noise_freedom=np.inf, held_out=(False, held_out))
     generator = np.random.default_rng(11)
     draws = np.array([
-        np.concatenate([part.ravel() for part in bench.fit(generator).whitened_residuals(generator)]) for _ in range(500)
+        np.concatenate([part.ravel() for part in bench.fit(generator).whitened_residuals(generator)])
+        for _ in range(500)
     ])  # fmt: skip
     covariance = draws.T @ draws / len(draws)
     plain = np.abs(covariance - np.eye(len(covariance)))
