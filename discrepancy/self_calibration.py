@@ -78,7 +78,7 @@ class CalibrationCase:
     outcome : str
         "right", "wrong", "missed", "in part", "group", "family", "unexplained", "below
         detectability" or "data error"; see `outcome_of`.
-    covered : tuple of Covered
+    covered : tuple of ParameterCoverage
         Parameters of the effect with their intervals, if it was named correctly.
     """
 
@@ -266,7 +266,7 @@ def _hidden_effects(
 
     Returns
     -------
-    hidden : list of Hidden or None
+    hidden : list of HiddenEffect or None
         The effect of each campaign; None for none.
     not_detectable : list of str
         Identifiers of the effects of which no draw was detectable.
@@ -305,7 +305,7 @@ def _investigate_simulated(
         Simulates the campaign.
     effects : sequence of Effect
         The catalogue.
-    hidden : Hidden or None
+    hidden : HiddenEffect or None
         The effect that the structure has; None for none.
     seed : SeedSequence
         Seed of the campaign.

@@ -116,7 +116,7 @@ class Simulator:
 
         Parameters
         ----------
-        hidden : Hidden or None
+        hidden : HiddenEffect or None
             The effect that the structure has; None for none.
         generator : Generator
             Source of nuisances and noise.

@@ -158,7 +158,8 @@ def whiteness_is_tested(channel: Channel) -> bool:
     series = record_at_rest(channel)
     if series is None:
         return True
-    p_values = (fisher_g(series)[1], ljung_box(series)[1], cumulative_periodogram(series)[1])
+    tests = (fisher_g(series), ljung_box(series), cumulative_periodogram(series))
+    p_values = [test.p_value for test in tests]
     return min(p_values) >= NOISE_RECORD_LEVEL
 
 
@@ -212,7 +213,7 @@ def noise_model(channel: Channel, fallback: float) -> NoiseModel:
         interval=interval,
         lines=lines,
     )
-    if ljung_box(residual)[1] > WHITE_LEVEL:  # the second value is the p-value of whiteness
+    if ljung_box(residual).p_value > WHITE_LEVEL:
         return white
     coefficients, innovation_variance = fit_autoregression(residual)
     return replace(

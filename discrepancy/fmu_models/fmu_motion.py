@@ -60,7 +60,7 @@ class FmuSimulator(FmuAtRest):
             The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for its length and name.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         readout : Readout
             Outputs and times.
@@ -121,7 +121,7 @@ class FmuSimulator(FmuAtRest):
             The state, force, releases and inputs of the FMU.
         trial : Trial
             The trial, for the stamps of its force.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         ports : LawPorts
             Where they act.
@@ -209,7 +209,7 @@ class FmuSimulator(FmuAtRest):
             The linear system.
         excitation : FmuExcitation
             The state, force, releases and inputs of the FMU.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         ports : LawPorts
             The ports at which the laws act.
@@ -250,7 +250,7 @@ class FmuSimulator(FmuAtRest):
             The trial, for its kind and name.
         end : float
             Time of the last step [s].
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         columns : sequence of int
             Columns of the outputs that are read.
@@ -404,7 +404,7 @@ class FmuSimulator(FmuAtRest):
 
         Parameters
         ----------
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         motion_key : hashable
             Key of everything else that the number depends on.

@@ -163,7 +163,7 @@ class FmuAtRest(IdentifiedFmu):
             Parameters and constant inputs of each of the L rows.
         loads : mapping of str to (L,) array
             What is added to inputs in each row.
-        laws : Laws
+        laws : PortLaws
             Internal forces.
         trial : str
             Name of the trial, for sentences.
@@ -207,7 +207,7 @@ class FmuAtRest(IdentifiedFmu):
         ----------
         loads : mapping of str to (L,) array
             Loads by input.
-        laws : Laws
+        laws : PortLaws
             J internal forces.
         forces : (L, J) array
             The force of each law in each row.
@@ -234,7 +234,7 @@ class FmuAtRest(IdentifiedFmu):
 
         Parameters
         ----------
-        laws : Laws
+        laws : PortLaws
             J internal forces.
         outputs_under : callable
             Returns the outputs (L, C) at rest under forces (L, J) of the laws.

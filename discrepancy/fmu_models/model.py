@@ -174,18 +174,16 @@ class FmuModel(DescribedModel):
 
         Otherwise the static stiffness stands for both.
         """
-        static_trial = first_trial(campaign, is_dynamic=False) or trial_without_readings(
-            TrialKind.STATIC, 1.0
-        )
-        compliance = np.diag(
-            self.fmu.port_flexibility(self._operating_point(static_trial, conditions))
-        )
+        static_trial = first_trial(campaign, is_dynamic=False)
+        if static_trial is None:
+            static_trial = trial_without_readings(TrialKind.STATIC, 1.0)
+        static_state = self._operating_point(static_trial, conditions)
+        compliance = np.diag(self.fmu.port_flexibility(static_state))
         dynamic_trial = first_trial(campaign, is_dynamic=True)
         if dynamic_trial is not None:
             state = self._operating_point(dynamic_trial, conditions)
-            system = self.fmu.linear_system(
-                self.fmu.excitation_of(dynamic_trial, state, self.ports)
-            )
+            excitation = self.fmu.excitation_of(dynamic_trial, state, self.ports)
+            system = self.fmu.linear_system(excitation)
             if system is not None:
                 return self._stiffnesses_of_system(system)
         return [PortStiffness(1.0 / value, 1.0 / value) for value in compliance.tolist()]

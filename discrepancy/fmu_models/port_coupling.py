@@ -24,7 +24,7 @@ class PortCoupling:
 
     Parameters
     ----------
-    laws : Laws
+    laws : PortLaws
         The laws.
     ports : sequence of str
         Names of their ports.

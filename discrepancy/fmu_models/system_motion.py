@@ -75,7 +75,7 @@ def system_motion(
         Forces, with directions (E,).
     start : (n,) array
         State at the first time.
-    laws : Laws
+    laws : PortLaws
         J internal forces.
     ports : LawPorts
         Where they act.

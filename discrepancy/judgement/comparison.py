@@ -342,16 +342,14 @@ class Comparison(ABC, Generic[HypothesisT]):
             return False
         if not family_place_pairs(option) <= family_place_pairs(best):
             return False
-        fitted_share = self.gap_share(option, held_out=False).value
-        if (
-            fitted_share
-            <= self.gap_share(best, held_out=False).value - 3.0 * SEARCH.least_added_share
-        ):
+        # any freedom gains something in trials that were fitted, so more may be lost there
+        best_fitted_share = self.gap_share(best, held_out=False).value
+        least_fitted_share = best_fitted_share - 3.0 * SEARCH.least_added_share
+        if self.gap_share(option, held_out=False).value <= least_fitted_share:
             return False
-        if (
-            self.held_out_or_fitted_share(option).value
-            <= self.held_out_or_fitted_share(best).value - SEARCH.least_added_share
-        ):
+        best_share = self.held_out_or_fitted_share(best).value
+        least_share = best_share - SEARCH.least_added_share
+        if self.held_out_or_fitted_share(option).value <= least_share:
             return False
         return not self.objection_to_naming(option)
 

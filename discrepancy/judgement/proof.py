@@ -72,7 +72,7 @@ def compute_scores(residuals: ResidualSet, *, seed: int = 0) -> Scores:
     densities = [log_density(fitted)[fitted.used] for fitted in residuals.trials]
     chi_square = chi_square_of(residuals)
     white = residuals.whitened_residuals(np.random.default_rng(seed))
-    p_values = [ljung_box(series)[1] for _, _, series in residuals.dynamic_series(white)]
+    p_values = [ljung_box(series.values).p_value for series in residuals.dynamic_series(white)]
     counts, _ = np.histogram(stats.norm.cdf(used_transforms), bins=PIT_BINS, range=(0.0, 1.0))
     return Scores(
         rms=rms_by_channel(residuals),

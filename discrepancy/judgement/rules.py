@@ -272,7 +272,7 @@ class VerdictCase:
 
         Parameters
         ----------
-        most_probable : FittedMember
+        most_probable : FittedEffectSet
             The most probable set.
         count : int
             The number of sets that pass the test of absolute fit.
@@ -296,7 +296,7 @@ class VerdictCase:
 
         Parameters
         ----------
-        members : sequence of FittedMember
+        members : sequence of FittedEffectSet
             The sets.
         probability : float
             The probability that one of them is missing.

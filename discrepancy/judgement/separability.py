@@ -391,7 +391,8 @@ def _squared_distance(
     nearest = max(options, key=cosine)
     if nearest.squared_size <= 0.0:
         return target.squared_size
-    # spanning changes: the nearest option, and its differences by the parameters
+    # spanning changes: the nearest option, and its differences by the parameters, over ten times
+    # the step of derivatives
     changes = [nearest.vector]
     for index in range(len(nearest.start)):
         stepped = nearest.start.copy()
@@ -399,7 +400,8 @@ def _squared_distance(
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
             change = screen.change(nearest.term, stepped)
             changes.append(change.vector - nearest.vector)
-    # least squares by normal equations, scaled to unit length and regularised
+    # least squares by normal equations, scaled to unit length; a small multiple of the identity is
+    # added because changes by several parameters may be nearly parallel
     spanning_changes = np.stack(changes)
     gram = (spanning_changes * sign) @ spanning_changes.T
     lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))

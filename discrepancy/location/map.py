@@ -253,6 +253,8 @@ def _rms_or_one(values: FloatArray) -> float:
 
 BIN_COUNT = 6
 """Bins of time, amplitude and frequency of a dynamic record."""
+LOAD_BIN_COUNT = 3
+"""Bins of load of a static trial, which has few rows."""
 
 _LEAST_SAMPLES_OF_CELL = 4
 """Fewest samples of a cell whose size is tested."""
@@ -414,7 +416,7 @@ def _spans(fitted: FittedTrial, column: int) -> Iterator[_Span]:
                 edges = np.geomspace(least, amplitude.max(), BIN_COUNT + 1)
                 yield from _spans_of_bins("amplitude", amplitude, edges, used)
     else:
-        edges = np.linspace(trial.load.min(), trial.load.max(), 4)
+        edges = np.linspace(trial.load.min(), trial.load.max(), LOAD_BIN_COUNT + 1)
         yield from _spans_of_bins("load", trial.load, edges, used)
 
 

@@ -159,39 +159,41 @@ def serial_tests(
     coloured : sequence of str
         Channels whose noise record is not white itself, and which are therefore left out.
     """
-    ljung_box: list[_SerialTest] = []
-    cumulative_periodogram: list[_SerialTest] = []
-    fisher_g: list[_SerialTest] = []
-    for fitted, name, series in residuals.dynamic_series(white):
-        if name in coloured:
+    portmanteau_tests: list[_RecordTest] = []
+    periodogram_tests: list[_RecordTest] = []
+    line_tests: list[_RecordTest] = []
+    for series in residuals.dynamic_series(white):
+        if series.channel in coloured:
             continue
-        where = f"{fitted.trial.name}, {name}"
-        statistic, p_value = noise_tests.ljung_box(series)
-        ljung_box.append(_SerialTest(statistic, p_value, where))
-        statistic, p_value = noise_tests.cumulative_periodogram(series)
-        cumulative_periodogram.append(_SerialTest(statistic, p_value, where))
-        statistic, p_value, index = noise_tests.fisher_g(series)
-        frequency = index / (len(series) * fitted.trial.interval)
-        fisher_g.append(_SerialTest(statistic, p_value, f"{where}, {frequency:.4g} Hz"))
+        trial = series.fitted_trial.trial
+        record = f"{trial.name}, {series.channel}"
+        portmanteau = noise_tests.ljung_box(series.values)
+        portmanteau_tests.append(_RecordTest(portmanteau.statistic, portmanteau.p_value, record))
+        cumulative = noise_tests.cumulative_periodogram(series.values)
+        periodogram_tests.append(_RecordTest(cumulative.statistic, cumulative.p_value, record))
+        line = noise_tests.fisher_g(series.values)
+        frequency = line.frequency_index / (len(series.values) * trial.interval)
+        record_and_line = f"{record}, {frequency:.4g} Hz"
+        line_tests.append(_RecordTest(line.statistic, line.p_value, record_and_line))
     return (
-        _combine_series_tests("Ljung-Box", ljung_box),
-        _combine_series_tests("cumulative periodogram", cumulative_periodogram),
-        _combine_series_tests("Fisher g", fisher_g),
+        _combine_record_tests("Ljung-Box", portmanteau_tests),
+        _combine_record_tests("cumulative periodogram", periodogram_tests),
+        _combine_record_tests("Fisher g", line_tests),
     )
 
 
-class _SerialTest(NamedTuple):
-    """A test of one series: statistic, p-value, and its trial and channel."""
+class _RecordTest(NamedTuple):
+    """A test of one record: statistic, p-value, and its trial and channel in words."""
 
     statistic: float
     p_value: float
     where: str
 
 
-def _combine_series_tests(name: str, tests: Sequence[_SerialTest]) -> OmnibusTest:
-    """Return the tests of all series combined into one; its p-value is nan if there are none.
+def _combine_record_tests(name: str, tests: Sequence[_RecordTest]) -> OmnibusTest:
+    """Return the tests of all records combined into one; its p-value is nan if there are none.
 
-    Statistic and place are those of the series with the least p-value.
+    Statistic and place are those of the record with the least p-value.
     """
     if not tests:
         return OmnibusTest(name, np.nan, np.nan, "")
@@ -207,13 +209,15 @@ def coloured_noise_remarks(residuals: ResidualSet) -> dict[str, str]:
         series = record_at_rest(channel)
         if series is None or channel.noise is None or whiteness_is_tested(channel):
             continue
-        fraction, p_value, index = noise_tests.fisher_g(series)
-        if p_value < NOISE_RECORD_LEVEL:
+        line = noise_tests.fisher_g(series)
+        if line.p_value < NOISE_RECORD_LEVEL:
             frequency = ""
             if channel.noise.interval:
-                frequency = f" at {index / (series.size * channel.noise.interval):.4g} Hz"
+                hertz = line.frequency_index / (series.size * channel.noise.interval)
+                frequency = f" at {hertz:.4g} Hz"
+            percent = 100.0 * line.statistic
             remarks[name] = (
-                f"The noise record of {name} holds a line{frequency} ({100.0 * fraction:.0f} % of "
+                f"The noise record of {name} holds a line{frequency} ({percent:.0f} % of "
                 "its variance): the line is in the acquisition, and whiteness is not tested on "
                 "this channel."
             )

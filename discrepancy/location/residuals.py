@@ -119,6 +119,24 @@ class ChannelFit(NamedTuple):
     used: BoolArray
 
 
+class DynamicSeries(NamedTuple):
+    """White residuals of a channel in a dynamic trial.
+
+    Attributes
+    ----------
+    fitted_trial : FittedTrial
+        The trial.
+    channel : str
+        Name of the channel.
+    values : (N,) ndarray
+        The residuals, in units of the noise.
+    """
+
+    fitted_trial: FittedTrial
+    channel: str
+    values: FloatArray
+
+
 def channel_fits(trials: Iterable[FittedTrial], channel: str) -> Iterator[ChannelFit]:
     """Yield the column and the used samples of a channel in each trial that records it."""
     for fitted_trial in trials:
@@ -231,31 +249,20 @@ class ResidualSet:
                 return int(fitted.sensitivity.shape[2])
         return 0
 
-    def dynamic_series(
-        self, white: Sequence[FloatArray]
-    ) -> Iterator[tuple[FittedTrial, str, FloatArray]]:
+    def dynamic_series(self, white: Sequence[FloatArray]) -> Iterator[DynamicSeries]:
         """Yield the white residuals of each dynamic record that is long enough for serial tests.
 
         Parameters
         ----------
         white : sequence of (N, C) ndarray
             White residuals of each trial, from the method `whitened_residuals`.
-
-        Yields
-        ------
-        fitted : FittedTrial
-            The trial.
-        channel : str
-            Name of the channel.
-        series : (N,) ndarray
-            White residuals of the channel, in units of the noise.
         """
         for fitted, values in zip(self.trials, white, strict=True):
             if not fitted.trial.is_dynamic or len(values) < SHORTEST_SERIES:
                 continue
             for column, name in enumerate(fitted.trial.channels):
                 if fitted.used[:, column].any():
-                    yield fitted, name, values[:, column]
+                    yield DynamicSeries(fitted, name, values[:, column])
 
     def _held_out_draw(self, draw: FloatArray) -> FloatArray:
         """Return a draw (P,) of the error z of the parameters, given the held-out residuals.

@@ -38,7 +38,7 @@ def state_at_first_stamp(
         The system that moves.
     excitation : Excitation
         Its loads, prescribed motions and release.
-    laws : Laws
+    laws : PortLaws
         Internal forces.
 
     Raises
@@ -104,7 +104,7 @@ def released_state(
         Its loads, prescribed motions and release.
     point : ReleasePoint
         The point from which the system is released, and how.
-    laws : Laws
+    laws : PortLaws
         Internal forces.
 
     Raises

@@ -301,7 +301,7 @@ class LinearSystem:
         return forces
 
     def rows_of_laws(self, laws: PortLaws, time: float | None = None) -> FloatArray:
-        """Return the rows (J, N) of the laws' ports; see `Laws.rows`."""
+        """Return the rows (J, N) of the laws' ports; see `PortLaws.port_rows`."""
         return laws.port_rows(self.ports, self.unknown_count, time)
 
     # ------------------------------------------------------------ equilibrium

@@ -43,7 +43,7 @@ class Motion:
         The system that moves.
     excitation : Excitation
         Its loads, prescribed motions and release.
-    laws : Laws
+    laws : PortLaws
         J internal forces.
     time : (N,) ndarray
         Times of the motion since the release or the begin of the record [s].
@@ -254,7 +254,7 @@ def _motion_from_release(
         Its loads, prescribed motions and release.
     point : ReleasePoint
         The point from which the system is released, and how.
-    laws : Laws
+    laws : PortLaws
         Internal forces.
     refinement : int
         Steps are this many times smaller.

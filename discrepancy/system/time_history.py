@@ -140,10 +140,10 @@ def equivalent_ramps(
     """
     middle = 0.5 * (time[1:] + time[:-1])
     half_step = 0.5 * np.diff(time)
-    # The two points lie at a distance of half / sqrt(3) from the middle, so that a line rises over
-    # half a step by sqrt(3) / 2 times its rise between them.
-    at_first_point = values_at(middle + -1.0 * half_step / sqrt(3.0))
-    at_second_point = values_at(middle + 1.0 * half_step / sqrt(3.0))
+    # The two points lie at a distance of half_step / sqrt(3) from the middle, so that a line rises
+    # over half a step by sqrt(3) / 2 times its rise between them.
+    at_first_point = values_at(middle - half_step / sqrt(3.0))
+    at_second_point = values_at(middle + half_step / sqrt(3.0))
     mean = 0.5 * (at_first_point + at_second_point)
     half_rise = 0.5 * sqrt(3.0) * (at_second_point - at_first_point)
     return mean - half_rise, mean + half_rise
