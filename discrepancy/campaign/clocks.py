@@ -100,18 +100,21 @@ def merge_clocks(
     loads_are_known = np.ones(count, dtype=bool)
     filled_loads = []
     for clock, own_times, position in zip(clocks, times, positions, strict=True):
+        has_all_times = len(position) == count
+        is_in_record = seconds >= own_times.seconds[0]
+        is_in_record &= seconds <= own_times.seconds[-1]
         for column in clock.columns:
             column_cells = _place_cells(
                 column.cells_in_si(decimal), own_times.rows, position, count
             )
-            if _must_be_known_throughout(column, kind) and len(position) < count:
-                is_after_begin = seconds >= own_times.seconds[0]
-                loads_are_known &= is_after_begin & (seconds <= own_times.seconds[-1])
+            if _must_be_known_throughout(column, kind) and not has_all_times:
                 hold = _hold_of_load(column, holds)
                 _fill_between_samples(column_cells, seconds, position, hold)
                 filled_loads.append(f"{column.head!r} ({hold.value.replace('_', ' ')})")
+                loads_are_known &= is_in_record
             cells[column.title] = column_cells
 
+    # rows in which all loads are known
     rows = np.flatnonzero(loads_are_known).tolist()
     cells_of_rows = {title: tuple(column[row] for row in rows) for title, column in cells.items()}
     unread = [title for title, column in cells_of_rows.items() if not any(column)]

@@ -181,7 +181,9 @@ def autocorrelation(series: Sequence[FloatArray]) -> tuple[FloatArray, FloatArra
     return rho, pair_counts[1:] / pair_counts[0] ** 2
 
 
-def statistical_inefficiency(rho: FloatArray, chance: FloatArray, ratio: float = 1.0) -> float:
+def statistical_inefficiency(
+    rho: FloatArray, white_variance: FloatArray, ratio: float = 1.0
+) -> float:
     """Return the number of samples over the effective number of independent ones.
 
     For a variance estimate this factor is 1 + 2 sum_k rho_k^2. Estimated autocorrelations are not
@@ -190,7 +192,7 @@ def statistical_inefficiency(rho: FloatArray, chance: FloatArray, ratio: float =
 
     Parameters
     ----------
-    rho, chance : (K,) ndarray
+    rho, white_variance : (K,) ndarray
         Autocorrelation and its variance for white noise, from `autocorrelation`.
     ratio : float
         Factor on the autocorrelation `rho`, if the correlation of the samples in question is
@@ -202,7 +204,7 @@ def statistical_inefficiency(rho: FloatArray, chance: FloatArray, ratio: float =
         The factor, at least 1.
     """
     squares = float(np.sum(rho**2))
-    squares_by_chance = float(np.sum(chance))
+    squares_by_chance = float(np.sum(white_variance))
     squares_by_chance *= (1.0 + 2.0 * squares) / (1.0 + 2.0 * squares_by_chance)
     return max(1.0 + 2.0 * ratio**2 * (squares - squares_by_chance), 1.0)
 

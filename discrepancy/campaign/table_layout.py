@@ -115,7 +115,7 @@ def find_table(rows: Rows, name: str, place: str) -> TableLayout:
     name : str
         Name of the file, for messages.
     place : str
-        Begin of the place of a row, for messages, before its number.
+        Start of the place of a row, for messages, before its number.
 
     Raises
     ------

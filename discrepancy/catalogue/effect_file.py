@@ -254,7 +254,7 @@ class _PrimitiveTemplate:
                 yield replace(primitive, windows=(Window(trial.name, begin, end),))
 
     def _evaluate_moment(self, key: str, values_by_name: Mapping[str, float]) -> float | None:
-        """Return the begin or end of the primitive's window [s]; None if it is open on that side.
+        """Return the start or end of the primitive's window [s]; None if it is open on that side.
 
         Parameters
         ----------

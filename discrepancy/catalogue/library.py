@@ -108,7 +108,7 @@ def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
 def variants_in_events(effects: Sequence[Effect], setting: Setting) -> tuple[Effect, ...]:
     """Return variants of effects that act only during an event, as further hypotheses.
 
-    Such a variant acts in all trials that have the event, also in held-out ones, from the begin of
+    Such a variant acts in all trials that have the event, also in held-out ones, from the start of
     the event to its end. These times are known and not fitted. Effects that cannot act in a window
     of time, or that the model cannot switch on and off, have no variant.
 

@@ -47,10 +47,10 @@ class BuildContext:
         """Natural scales of the port; raises `CatalogueError` if the model has no such port."""
         ports = self.setting.scales.ports
         if self.target.name not in ports:
-            known = ", ".join(ports) or "none"
+            port_names = ", ".join(ports) or "none"
             raise CatalogueError(
                 f"The model {self.setting.model.name!r} has no port {self.target.name!r}; it has "
-                f"{known}."
+                f"{port_names}."
             )
         return ports[self.target.name]
 

@@ -128,9 +128,9 @@ def _describe_copy(
     """
     # the overlap of the two records after the shift
     count = len(original) - abs(shift)
-    first = max(-shift, 0)
+    first_sample = max(-shift, 0)
     first_of_copy = max(shift, 0)
-    in_original = slice(first, first + count)
+    in_original = slice(first_sample, first_sample + count)
     in_copy = slice(first_of_copy, first_of_copy + count)
     used = original_used[in_original] & copy_used[in_copy]
     x = original[in_original][used]

@@ -142,7 +142,7 @@ def check_against_model(campaign: Campaign, model: Model) -> tuple[DataFault, ..
         faults += _hold_faults(campaign, model, trial)
     if any(trial.kind is TrialKind.DRIVEN for trial in campaign.fitted) and model.parameters:
         faults += unobservable_parameter_faults(campaign, model)
-    faults += [swap_fault(first, second) for first, second in swaps]
+    faults += [swap_fault(first_channel, second_channel) for first_channel, second_channel in swaps]
     return mark_accepted(faults, campaign)
 
 

@@ -115,9 +115,9 @@ def _static_scale(
     """
     # all pairs of at most 400 rows
     rows = np.linspace(0, len(data) - 1, min(len(data), 400)).round().astype(int)
-    first, second = np.triu_indices(len(rows), 1)
-    data_steps = data[rows][first] - data[rows][second]
-    model_steps = model[rows][first] - model[rows][second]
+    first_rows, second_rows = np.triu_indices(len(rows), 1)
+    data_steps = data[rows][first_rows] - data[rows][second_rows]
+    model_steps = model[rows][first_rows] - model[rows][second_rows]
     # Only pairs of clearly different predictions: rows that differ in the damage state alone would
     # give slopes of noise over nearly zero.
     is_clear_step = np.abs(model_steps) > 0.2 * np.max(np.abs(model))

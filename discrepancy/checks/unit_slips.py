@@ -74,7 +74,7 @@ class Slip(NamedTuple):
 
 
 def find_slip(
-    scale: float, quantity: Quantity, stated: str = "", *, drive: bool = False
+    scale: float, quantity: Quantity, stated: str = "", *, is_input: bool = False
 ) -> Slip | None:
     """Return the two units of a quantity whose confusion best explains a ratio of data to model.
 
@@ -86,7 +86,7 @@ def find_slip(
         The quantity whose units may have been mixed up.
     stated : str
         The unit that the file states. If it is empty, all pairs with one SI unit are tried.
-    drive : bool
+    is_input : bool
         True if the quantity is an input of the model. An input that is too small makes the data
         look too large, so that the ratio is inverted.
 
@@ -108,7 +108,7 @@ def find_slip(
             has_si = 1.0 in (assumed_in_si, meant_in_si)
             if assumed != stated and (stated or not has_si):
                 continue
-            factor = meant_in_si / assumed_in_si if drive else assumed_in_si / meant_in_si
+            factor = meant_in_si / assumed_in_si if is_input else assumed_in_si / meant_in_si
             slip = Slip(factor, meant, assumed)
             if slip.ratio > LEAST_FACTOR:
                 distances[slip] = slip.log_distance(scale)
@@ -230,7 +230,7 @@ def _slip_of_input(trial: Trial, scale: float) -> Slip | None:
         drives.append(_DRIVES[trial.kind])
     drives += [(recorded.quantity, recorded.unit) for recorded in trial.inputs]
     for quantity, unit in drives:
-        slip = find_slip(scale, quantity, unit, drive=True)
+        slip = find_slip(scale, quantity, unit, is_input=True)
         if slip is not None:
             return slip
     return None

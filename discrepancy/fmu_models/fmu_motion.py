@@ -198,7 +198,7 @@ class FmuSimulator(FmuAtRest):
         ports: LawPorts,
         release_values: Mapping[str, float],
     ) -> "StartState":
-        """Return the state at the begin of a trial with laws.
+        """Return the state at the start of a trial with laws.
 
         Under a recorded force it is the equilibrium with the laws under the first force; otherwise
         it is the released state.
@@ -318,7 +318,7 @@ class FmuSimulator(FmuAtRest):
         return SettledRun(run_under(solution.forces), solution.memory)
 
     def _outputs_at_begin(self, run: FmuRun) -> FloatArray:
-        """Return the outputs (1, C) at the begin of a run."""
+        """Return the outputs (1, C) at the start of a run."""
         _, outputs, _ = self.start_run(run)
         return outputs[None]
 
@@ -346,7 +346,7 @@ class FmuSimulator(FmuAtRest):
         outputs = [first_outputs]
         forces = np.column_stack([*loads_by_input.values()])
         port_columns = [list(loads_by_input).index(name) for name in inputs]
-        # speeds before the begin, extrapolated from the first step without laws
+        # speeds before the start, extrapolated from the first step without laws
         previous_speeds = 2.0 * first_step[0] - first_step[1]
         speed_loss = np.zeros(len(ports))
         for step_forces in forces:
@@ -451,7 +451,7 @@ class Refinement(NamedTuple):
 
 
 class StartState(NamedTuple):
-    """State (n,) of a linear system at the begin, and the memory of laws loaded before."""
+    """State (n,) of a linear system at the start, and the memory of laws loaded before."""
 
     state: FloatArray
     memory: FloatArray | None

@@ -100,7 +100,7 @@ class FmuAtRest(IdentifiedFmu):
             inputs=names,
             decays_to_rest=True,
         )
-        if self._rest_is_linear.get(names) is False:
+        if not self._rest_is_linear.get(names, True):
             return self._step_to_rest(state, load_values, names)
         system = self.linear_system(excitation)
         if system is None:

@@ -183,19 +183,22 @@ class IdentifiedFmu(FmuRuns):
         The system is identified from the responses to single forces and releases. The FMU is linear
         if such a system exists, and predicts the response to all of them together.
         """
-        kind = excitation.linearity_key
-        may_be_linear = self.description.superposition and (
-            excitation.inputs or excitation.releases
-        )
-        if not may_be_linear or self._is_linear.get(kind) is False:
+        has_excitation = bool(excitation.inputs or excitation.releases)
+        if not self.description.superposition or not has_excitation:
             return None
-        key = (kind, *excitation.recording_arguments)
+        linearity_key = excitation.linearity_key
+        if not self._is_linear.get(linearity_key, True):
+            return None
+        system_key = (linearity_key, *excitation.recording_arguments)
         system: FmuStateSpace | None = self._systems.get(
-            key, lambda: self._identify_system(excitation)
+            system_key, lambda: self._identify_system(excitation)
         )
-        if system is not None and kind not in self._is_linear:
-            self._is_linear[kind] = self._predicts_motion(system, excitation, LINEARITY_TOLERANCE)
-        return system if self._is_linear.get(kind) else None
+        if system is None:
+            return None
+        if linearity_key not in self._is_linear:
+            is_linear = self._predicts_motion(system, excitation, LINEARITY_TOLERANCE)
+            self._is_linear[linearity_key] = is_linear
+        return system if self._is_linear[linearity_key] else None
 
     def _identify_system(self, excitation: FmuExcitation) -> FmuStateSpace | None:
         """Return the linear system with the FMU's responses to unit forces and releases, if any."""
@@ -303,7 +306,7 @@ class IdentifiedFmu(FmuRuns):
     def _find_release_values(self, excitation: FmuExcitation) -> dict[str, float]:
         """Return the release parameters or holding force that give any FMU its displacement.
 
-        The amount is found by the secant method, with the FMU at the begin of a run.
+        The amount is found by the secant method, with the FMU at the start of a run.
 
         Raises
         ------
@@ -366,7 +369,7 @@ class IdentifiedFmu(FmuRuns):
     def _start_state(
         self, system: FmuStateSpace, excitation: FmuExcitation, release_values: Mapping[str, float]
     ) -> FloatArray:
-        """Return the state (n,) at the begin of a trial.
+        """Return the state (n,) at the start of a trial.
 
         It is the released state, plus equilibrium under the recorded force at the first sample.
         """

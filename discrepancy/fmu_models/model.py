@@ -32,7 +32,7 @@ from reporting.words import comma_list
 
 LATEST_BEGIN = 100.0
 """If the first stamp is later than this many lengths of the record, the stamps do not count from
-the begin of the trial."""
+the start of the trial."""
 PHASE_IN_INTERVAL = 0.3
 """Suitable phase of the first mode in a sampling interval [rad]."""
 

@@ -102,7 +102,7 @@ def system_motion(
     )
     direct_displacement = excitation.loads_at(boundaries.time, system.feedthrough[ports.columns].T)
     steps = loaded_steps(modal, boundaries, begin_force, end_force, direct_displacement)
-    # position and speed of the ports at the begin, from the state
+    # position and speed of the ports at the start, from the state
     port_rows = system.output_matrix[ports.columns[coupled.first_laws]]
     rest_positions = ports.rest_positions[coupled.first_laws]
     positions = port_rows @ start + rest_positions

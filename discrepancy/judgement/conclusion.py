@@ -438,11 +438,11 @@ def is_negligible_instrument_error(
         size = _instrument_error(problem, primitive)
         if size is None:
             return False
-        has_unstated_gain = isinstance(primitive, SensorGain) and _has_exact_gain(
-            problem, primitive
-        )
-        least = least_unstated_gain if has_unstated_gain else LEAST_INSTRUMENT_ERROR
+        least = LEAST_INSTRUMENT_ERROR
+        if isinstance(primitive, SensorGain) and _has_exact_gain(problem, primitive):
+            least = least_unstated_gain
         ratios.append(size / least)
+    # an empty change is not an error of instruments
     return max(ratios, default=1.0) < 1.0
 
 

@@ -298,11 +298,11 @@ def feasible_proposals(problem: Problem, *, is_oscillating: bool = True) -> Iter
         if not trials_of_kind or (row["change"] == "length" and not is_oscillating):
             continue
         min_or_max = min if row.get("of") == "smallest" else max
-        model_trial = min_or_max(trials_of_kind, key=lambda trial: trial.level)
-        changed_trial = _changed_trial(problem, model_trial, row["change"], row["by"])
+        varied_trial = min_or_max(trials_of_kind, key=lambda trial: trial.level)
+        changed_trial = _changed_trial(problem, varied_trial, row["change"], row["by"])
         if changed_trial is None:
             continue
-        level = model_trial.level
+        level = varied_trial.level
         description = row["description"].format(
             top=level,
             most=abs(row["by"]) * level,

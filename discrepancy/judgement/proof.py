@@ -402,7 +402,7 @@ def prove_effects(
 
 
 def _held_out_scores(residuals: ResidualSet, seed: int) -> Scores | None:
-    """Return the scores of the held-out trials; None without any."""
+    """Return the scores of the held-out trials; None if there is none."""
     return None if residuals.held_out is None else compute_scores(residuals.held_out, seed=seed)
 
 

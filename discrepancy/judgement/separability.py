@@ -341,23 +341,30 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
     (E, E) array
         The distances, see `Separability.distance` [sigma^2].
     """
-    small_options = [
-        [_SmallChange(*screen.shrunk(change)) for change in effect.options] for effect in effects
-    ]
+    small_changes = [_small_changes(screen, effect) for effect in effects]
     distance = np.zeros((len(effects), len(effects)))
     for i, effect in enumerate(effects):
         reference = effect.reference
-        small_reference = small_options[i][0]
+        small_reference = small_changes[i][0]
         for j, other in enumerate(effects):
             if i == j:
                 continue
-            other_changes = [small.change for small in small_options[j]]
-            first_order = _squared_distance(screen, small_reference.change, other_changes)
+            small_changes_of_other = [small.change for small in small_changes[j]]
+            first_order = _squared_distance(screen, small_reference.change, small_changes_of_other)
             # back to the size of the reference: squared distances grow with the square of it
             first_order /= small_reference.factor**2
             least_distance = min(_squared_distance(screen, reference, other.options), first_order)
             distance[i, j] = least_distance * max(1.0, DETECTION_DISTANCE / reference.squared_size)
     return distance
+
+
+def _small_changes(screen: Screen, effect: _VisibleEffect) -> list[_SmallChange]:
+    """Return the changes of an effect, each with a magnitude at which it is linear."""
+    small_changes = []
+    for option in effect.options:
+        change, factor = screen.shrunk(option)
+        small_changes.append(_SmallChange(change, factor))
+    return small_changes
 
 
 def _squared_distance(

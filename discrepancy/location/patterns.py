@@ -77,7 +77,7 @@ class TrialsOfKind(NamedTuple):
         subject, dependence : str
             Entries of the finding.
         phrase : str
-            Begin of its sentence.
+            Start of its sentence.
         share : float
             Fraction of the excess variance that it explains.
         p_value : float
@@ -194,7 +194,7 @@ class _PatternMeaning(NamedTuple):
     subject : str
         "sensor", "common", "dynamics or load" or "mixed".
     phrase : str
-        Begin of a sentence about it.
+        Start of a sentence about it.
     """
 
     subject: str

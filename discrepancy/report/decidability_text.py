@@ -89,7 +89,7 @@ def campaign_needs(
     separability: Separability,
     campaign: Campaign,
     effects: Sequence[Effect],
-    possible: Collection[TrialKind],
+    possible_kinds: Collection[TrialKind],
 ) -> list[str]:
     """Return sentences on what the campaign would need to decide more.
 
@@ -101,22 +101,24 @@ def campaign_needs(
         The campaign.
     effects : sequence of Effect
         The catalogue.
-    possible : collection of TrialKind
+    possible_kinds : collection of TrialKind
         Kinds of trials that the model follows.
     """
-    known_effects = {effect.identifier: effect for effect in effects}
-    missing_kinds = set(possible) - {trial.kind for trial in campaign.trials}
-    lines = []
+    effects_by_identifier = {effect.identifier: effect for effect in effects}
+    missing_kinds = set(possible_kinds) - {trial.kind for trial in campaign.trials}
+    sentences = []
     for group in separability.groups:
-        kinds_of_effects = [known_effects[name].acts_on for name in group if name in known_effects]
-        lines.append(_sentence_on_group(group, kinds_of_effects, missing_kinds))
-    lines += _sentence_on_hidden_effects(separability)
+        kinds_of_effects = [
+            effects_by_identifier[name].acts_on for name in group if name in effects_by_identifier
+        ]
+        sentences.append(_sentence_on_group(group, kinds_of_effects, missing_kinds))
+    sentences += _sentence_on_hidden_effects(separability)
     without_noise = [name for name, channel in campaign.channels.items() if channel.noise is None]
     if without_noise:
-        lines.append(WORDS.say("give_noise", names=", ".join(without_noise)))
+        sentences.append(WORDS.say("give_noise", names=", ".join(without_noise)))
     if not campaign.held_out:
-        lines.append(WORDS.say("hold_out"))
-    return lines
+        sentences.append(WORDS.say("hold_out"))
+    return sentences
 
 
 def _sentence_on_group(

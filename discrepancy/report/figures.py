@@ -348,8 +348,10 @@ def report_figures(content: ReportInput) -> dict[str, ReportFigure]:
         before, after, trials = proof_scores(investigation.proof)
         scores = {"model as it was": before, "with the effect": after}
         with_pit = {title: score for title, score in scores.items() if score.pit}
-        where = "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
-        _add_figure(figures, "pit", pit_figure(with_pit), where=where)
+        trials_text = (
+            "Held-out trials." if trials == "held-out" else "Fitted trials: none is held out."
+        )
+        _add_figure(figures, "pit", pit_figure(with_pit), where=trials_text)
     if content.separability is not None:
         figure = separability_figure(content.separability)
         _add_figure(figures, "separability", figure, confused=CONFUSION_DISTANCE)

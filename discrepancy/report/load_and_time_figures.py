@@ -207,7 +207,7 @@ def _draw_record(
     lines = (row - 0.14, row + 0.2) if has_two_rows else row
     axes.hlines(lines, first, last, color=style.REFERENCE, lw=1.0, zorder=1)
     for window in windows:
-        # a window without a begin or an end extends to that end of the record
+        # a window without a start or an end extends to that end of the record
         begin = first if window.begin is None else window.begin.value
         end = last if window.end is None else window.end.value
         if window.with_effect:

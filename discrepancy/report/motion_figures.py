@@ -350,7 +350,10 @@ def _backbones_by_mode(
 
 
 def _clear_points(curve: Backbone) -> Backbone | None:
-    """Return the points of a backbone with small errors, and nan after them; None without any."""
+    """Return the points of a backbone with small errors, and nan after them.
+
+    None is returned if there is no such point.
+    """
     median_ratio = float(np.median(np.abs(curve.damping_ratio)))
     is_clear = curve.damping_ratio_error < LARGEST_ERROR * max(median_ratio, 1e-4)
     if not is_clear.any():

@@ -297,8 +297,8 @@ def si_sizes(
             half_width = 0.5 * (size.high - size.low)
             interval = f" ({between(size.low, size.high, half_width)})"
         name = _size_name(size.parameter, primitive, unit)
-        where = _location_text(primitive, size, model, campaign)
-        sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{where}"] = None
+        place_text = _location_text(primitive, size, model, campaign)
+        sizes[f"{name} {rounded(size.value, half_width)} {unit}{interval}{place_text}"] = None
     return ", ".join(sizes)
 
 

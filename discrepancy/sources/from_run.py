@@ -166,11 +166,11 @@ def _build_campaign(
         )
     noise, source_of_noise = _strain_noise(scenario)
     channels = {}
-    for number in observed["sensor"].values.tolist():
-        channels[f"g{number}"] = records.Channel(
-            name=f"g{number}",
+    for gauge_number in observed["sensor"].values.tolist():
+        channels[f"g{gauge_number}"] = records.Channel(
+            name=f"g{gauge_number}",
             quantity=records.Quantity.STRAIN,
-            output=f"strain[{number}]",
+            output=f"strain[{gauge_number}]",
             noise=records.NoiseRecord(noise, inf),
         )
     temperature = _temperature_rises(run, steps)

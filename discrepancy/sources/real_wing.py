@@ -45,7 +45,7 @@ averaging does not reduce it.
 TREND_COLUMNS = 67
 """Columns of the moving average that is the slow zero: 0.54 s, three periods of the first mode."""
 WINDOW_BEGIN = 0.8
-"""Begin of the window after the release [s].
+"""Start of the window after the release [s].
 
 Before it higher modes ring, which the model does not have.
 """
@@ -55,7 +55,7 @@ AVERAGED_COLUMNS = 4
 Four columns (32 ms) have a zero of their frequency response at 30.8 Hz, where the second bending
 mode rings."""
 RELEASE = {"displacement": 0.05, "deviation": 1.0, "at_rest": False, "mode_count": 2}
-"""Release of the ring-downs: nominal displacement of the tip at the begin of the window [m].
+"""Release of the ring-downs: nominal displacement of the tip at the start of the window [m].
 
 As the scale of the signal is unknown, any displacement would do. The state of two modes is free."""
 AT_TIP = {"name": TIP, "quantity": "displacement", "unit": "m", "output": "load_point_displacement"}
@@ -77,7 +77,7 @@ def real_wing(
     data : Path
         The authors' calibration folder, with `step2` and `step3`.
     begin : float
-        Begin of the window after the release [s].
+        Start of the window after the release [s].
     columns : int
         Columns of the plot that are averaged into one sample.
     detrended : bool
@@ -215,7 +215,7 @@ def _shared_zero(records: tuple[RingDownRecord, ...]) -> FloatArray:
 def _plot_window(
     record: RingDownRecord, zero: FloatArray, begin: float, columns: int
 ) -> PlotWindow:
-    """Return the part of a record from the begin of the window on, averaged over plot columns.
+    """Return the part of a record from the start of the window on, averaged over plot columns.
 
     The slow zero is subtracted, and the times are made even and start at zero.
 
@@ -226,7 +226,7 @@ def _plot_window(
     zero : (N,) ndarray
         Slow zero that is subtracted [V]; nan where it is not known.
     begin : float
-        Begin of the window after the release [s].
+        Start of the window after the release [s].
     columns : int
         Columns that are averaged into one sample.
 

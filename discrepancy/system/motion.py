@@ -26,7 +26,7 @@ from fe.runtime.port_laws import PortLaws
 from fe.runtime.time_steps import Boundaries, loaded_steps, step_boundaries
 
 LEAST_LEAD = 1e-9
-"""A first sample counts as taken at the begin of the motion if it is later by no more than this
+"""A first sample counts as taken at the start of the motion if it is later by no more than this
 fraction of the mean sampling interval."""
 FADING_LAGS = 40.0
 """Number of relaxation times after which a released deflection of the modes without inertia is zero
@@ -46,7 +46,7 @@ class Motion:
     laws : PortLaws
         J internal forces.
     time : (N,) ndarray
-        Times of the motion since the release or the begin of the record [s].
+        Times of the motion since the release or the start of the record [s].
     q, velocity : (N, M + P) ndarray
         Modal coordinates and their rates, mass-normalised; the drives come last.
     port_forces : (N, J) ndarray
@@ -214,7 +214,7 @@ def _motion_from_record(
     motion = _integrate_from(system, excitation, laws, first_stamp, times, begin, refinement)
     starts_at_sample = excitation.begins is not Start.UNKNOWN and times[0] <= first_stamp
     if starts_at_sample and len(laws) and len(system.drives):
-        # A speed-dependent law at a port that only drives move has no force at the begin if the
+        # A speed-dependent law at a port that only drives move has no force at the start if the
         # drives begin at rest. The kernel instead computes the force that would hold the drive's
         # coordinate like a free mass, which no reading contains.
         rows = laws.port_rows(system.modal_system.ports, len(begin.v))
@@ -358,7 +358,7 @@ def _integrate_from(
             return ModalMotion(q, v, no_forces, no_forces, laws.unloaded_memory())
     if not is_late:
         return _integrate_in_steps(system, excitation, laws, stamps, begin, refinement)
-    # integrate from the earlier begin, and leave out the begin itself
+    # integrate from the earlier begin, and leave out the start itself
     from_begin = np.append(first, stamps)
     motion = _integrate_in_steps(system, excitation, laws, from_begin, begin, refinement)
     return motion._replace(

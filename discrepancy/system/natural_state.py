@@ -15,7 +15,7 @@ SMALLEST_SIZE = 1e-9
 def natural_state_magnitudes(
     motion: Motion, equations: Sequence[OutputEquation], trial: Trial
 ) -> FloatArray:
-    """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
+    """Return typical magnitudes (L,) of the unknown state at the start of a trial.
 
     The magnitude of an amplitude is the larger of its largest value in the motion from rest, and
     of the value that could explain the largest reading of a channel.

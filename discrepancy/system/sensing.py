@@ -51,7 +51,7 @@ class TurnedGauges:
 def shift_clock_to_first_sample(trial: Trial, patch: ModelPatch) -> tuple[Trial, ModelPatch]:
     """Return a trial and its patch with time counted from the first sample, if stamps are far off.
 
-    Models count time from the begin of the trial, but stamps may count from an epoch, or from the
+    Models count time from the start of the trial, but stamps may count from an epoch, or from the
     start of a logger. Stamps that begin within the length of the record from zero are kept, since
     a release happens at zero.
 

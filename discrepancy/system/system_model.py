@@ -165,7 +165,7 @@ class SystemModel(Model):
     def patched_trial(
         self, trial: Trial, conditions: Conditions, patch: ModelPatch = NO_PATCH
     ) -> PatchedTrial:
-        """Return a trial with its patch and conditions, and the state of the matrices at its begin.
+        """Return a trial with its patch and conditions, and the state of the matrices at its start.
 
         Parameters
         ----------
@@ -359,7 +359,7 @@ class SystemModel(Model):
     # ------------------------------------------------------------ natural sizes and scales
 
     def initial_state_magnitudes(self, campaign: Campaign, trial: Trial) -> FloatArray:
-        """Return typical magnitudes (L,) of the unknown state at the begin of a trial.
+        """Return typical magnitudes (L,) of the unknown state at the start of a trial.
 
         See `natural_state_magnitudes`; the motion from rest is that of the prior mean.
         """

@@ -121,7 +121,7 @@ class FormulaHistory:
 def equivalent_ramps(
     values_at: Callable[[FloatArray], FloatArray], time: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return begin and end values of straight lines that replace a function in each step.
+    """Return start and end values of straight lines that replace a function in each step.
 
     Each line goes through the function at the two Gauss-Legendre points of its step, so that it has
     the same mean effect to fourth order in the step.
@@ -136,7 +136,7 @@ def equivalent_ramps(
     Returns
     -------
     begin, end : (K, ...) arrays
-        The values of the lines at the begin and at the end of each step.
+        The values of the lines at the start and at the end of each step.
     """
     middle = 0.5 * (time[1:] + time[:-1])
     half_step = 0.5 * np.diff(time)

@@ -87,7 +87,7 @@ def test_what_moves_alike_is_no_copy():
     ("scale", "quantity", "stated", "drive", "pair"), INPUTS.table("faults.toml")["slips"]
 )
 def test_a_factor_names_its_pair_of_units(scale, quantity, stated, drive, pair):
-    assert str(find_slip(scale, Quantity(quantity), stated, drive=drive) or "").strip("(?)") == pair
+    assert str(find_slip(scale, Quantity(quantity), stated, is_input=drive) or "").strip("(?)") == pair
 
 
 # ---------------------------------------------------------------- at rest
