@@ -150,14 +150,16 @@ def investigate(
         If the campaign cannot be compared with the model at all.
     """
     campaign, model = _read_input(campaign, model)
-    shown, seconds = reporter(progress), {}
+    progress_reporter = reporter(progress)
+    seconds: dict[str, float] = {}
 
     @contextmanager
     def stage(description: str, key: str) -> Iterator[OnProgress]:
-        began = time.perf_counter()
-        with shown.stage(description) as under_way:
-            yield lambda what: under_way.advance(0, what)
-        seconds[key] = time.perf_counter() - began
+        """Report a stage of the work, and record its duration [s]."""
+        start = time.perf_counter()
+        with progress_reporter.stage(description) as shown_stage:
+            yield lambda message: shown_stage.advance(0, message)
+        seconds[key] = time.perf_counter() - start
 
     with stage("Checking the data", "check"):
         campaign, faults = check_and_prepare(campaign, model)
@@ -169,12 +171,12 @@ def investigate(
         return Investigation(campaign, model, faults, verdict, seconds=seconds)
     with stage("Fitting what is known, and searching the catalogue", "name") as tell:
         problem = problem_without_wrong_ends(campaign, model)
-        campaign, setting = problem.campaign, problem.setting
+        campaign = problem.campaign
         catalogue = load_catalogue() if effects is None else effects
         verdict, search, fit = reach_verdict(
             problem, catalogue, on_progress=tell, on_search=on_search
         )
-        verdict = verdict_with_untested_effects(verdict, setting, catalogue)
+        verdict = verdict_with_untested_effects(verdict, problem.setting, catalogue)
     remarks += _remarks(problem, catalogue, verdict, search, fit)
     with stage("Checking the time steps", "steps"):
         share = time_step_error(problem, fit)
@@ -185,12 +187,12 @@ def investigate(
             )
     with stage("Residuals", "residuals"):
         before = residual_set(problem, search.no_effect, sensitivities=thorough)
-        after = (
-            residual_set(problem, fit, sensitivities=False)
-            if fit is not search.no_effect
-            else before
-        )
-    location, missing, proof = None, None, None
+        after = before
+        if fit is not search.no_effect:
+            after = residual_set(problem, fit, sensitivities=False)
+    location = None
+    missing = None
+    proof = None
     windows: tuple[GapWindow, ...] = ()
     if thorough:
         with stage("Locating the gap", "locate"):

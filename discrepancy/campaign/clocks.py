@@ -101,8 +101,6 @@ def merge_clocks(
     filled_loads = []
     for clock, own_times, position in zip(clocks, times, positions, strict=True):
         has_all_times = len(position) == count
-        is_in_record = seconds >= own_times.seconds[0]
-        is_in_record &= seconds <= own_times.seconds[-1]
         for column in clock.columns:
             column_cells = _place_cells(
                 column.cells_in_si(decimal), own_times.rows, position, count
@@ -111,7 +109,9 @@ def merge_clocks(
                 hold = _hold_of_load(column, holds)
                 _fill_between_samples(column_cells, seconds, position, hold)
                 filled_loads.append(f"{column.head!r} ({hold.value.replace('_', ' ')})")
-                loads_are_known &= is_in_record
+                is_after_first_sample = seconds >= own_times.seconds[0]
+                is_before_last_sample = seconds <= own_times.seconds[-1]
+                loads_are_known &= is_after_first_sample & is_before_last_sample
             cells[column.title] = column_cells
 
     # rows in which all loads are known

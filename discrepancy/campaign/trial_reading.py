@@ -240,10 +240,10 @@ def _channels_of_trial(
         table.cells(channel.table_column, f"the channel {channel.name!r}")
     if not channels:
         columns = ", ".join(table.columns)
-        wanted = ", ".join(channel.table_column for channel in campaign.channel)
+        named_channels = ", ".join(channel.table_column for channel in campaign.channel)
         raise CampaignFileError(
             f"{table.name} of the trial {section.name!r} holds no channel: its columns are "
-            f"{columns}, and those of the channels {wanted}."
+            f"{columns}, and those of the channels {named_channels}."
         )
     return channels
 

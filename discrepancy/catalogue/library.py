@@ -190,11 +190,11 @@ def check_effects(effects: Iterable[Effect]) -> None:
                 f"The catalogue has {count} effects with the identifier {identifier!r}."
             )
     for effect in effects:
-        for other in effect.confusable:
-            if other not in counts or other == effect.identifier:
+        for confusable in effect.confusable:
+            if confusable not in counts or confusable == effect.identifier:
                 raise CatalogueError(
-                    f"The effect {effect.identifier!r} names {other!r} as confusable, which is no "
-                    "other effect of the catalogue."
+                    f"The effect {effect.identifier!r} names {confusable!r} as confusable, which "
+                    "is no other effect of the catalogue."
                 )
 
 

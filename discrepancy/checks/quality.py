@@ -232,13 +232,13 @@ def _is_clipped_over_load(
     digit : float
         Quantum of the readings.
     """
-    others = np.delete(np.arange(len(values)), np.s_[start:stop])
+    other_rows = np.delete(np.arange(len(values)), np.s_[start:stop])
     loads_of_run = np.unique(load[start:stop])
-    if loads_of_run.size < LEAST_CLIPPED_RUN or np.unique(load[others]).size < 2:
+    if loads_of_run.size < LEAST_CLIPPED_RUN or np.unique(load[other_rows]).size < 2:
         return False
-    line = np.polynomial.Polynomial.fit(load[others], values[others], 1)
+    line = np.polynomial.Polynomial.fit(load[other_rows], values[other_rows], 1)
     beyond = float(np.max(np.abs(line(load[start:stop]) - values[start])))
-    scatter = float(np.std(values[others] - line(load[others])))
+    scatter = float(np.std(values[other_rows] - line(load[other_rows])))
     return beyond > 1.5 * digit + 6.0 * scatter
 
 

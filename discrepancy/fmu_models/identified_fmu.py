@@ -327,8 +327,8 @@ class IdentifiedFmu(FmuRuns):
             run = self._run_of_excitation(at_begin, {name: amount})
             key = (excitation.state, excitation.step, name, amount, "begin")
             outputs = self.cached(key, lambda: self.start_run(run)[1])
-            moved = float((outputs - self._undisturbed_outputs(excitation))[column])
-            return moved - displacement
+            displaced = float((outputs - self._undisturbed_outputs(excitation))[column])
+            return displaced - displacement
 
         guess = self.probing_amplitude(name) if self._is_input(name) else displacement
         solution = root_scalar(missing_displacement, x0=0.0, x1=guess, rtol=1e-10, maxiter=20)

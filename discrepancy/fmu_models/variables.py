@@ -137,14 +137,16 @@ class FmuVariables:
         return bound
 
     def _bound_parameters(
-        self, known: Mapping[str, ParameterBinding]
+        self, known_bindings: Mapping[str, ParameterBinding]
     ) -> dict[str, ParameterBinding]:
         """Return the parameters that the binding does not have, or has in another unit.
 
         The value and the range that the binding has in another unit are left out.
         """
         description = self._description
-        units: dict[str | None, str] = {item.variable: item.unit for item in description.parameter}
+        units: dict[str | None, str] = {
+            section.variable: section.unit for section in description.parameter
+        }
         if description.release is not None:
             units[description.release.displacement] = "m"
             units[description.release.velocity] = "m/s"
@@ -153,8 +155,8 @@ class FmuVariables:
             if name is None:
                 continue
             key = self.parameter(name)
-            if key not in known or unit != known[key].unit:
-                variable = known[key].variable if key in known else key
+            if key not in known_bindings or unit != known_bindings[key].unit:
+                variable = known_bindings[key].variable if key in known_bindings else key
                 bound[key] = ParameterBinding(variable=variable, unit=unit)
         return bound
 

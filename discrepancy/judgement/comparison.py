@@ -360,15 +360,15 @@ class Comparison(ABC, Generic[HypothesisT]):
         its families at their places. Hypotheses that trials refute have no probability.
         """
         not_refuted = []
-        for other in self.ranked_hypotheses:
-            is_asked = any(other is hypothesis for hypothesis in hypotheses)
-            if is_asked or not other.candidate.terms or not self._is_refuted_by_trials(other):
-                not_refuted.append(other)
-        scores = np.array([self.score(other) for other in not_refuted])
+        for compared in self.ranked_hypotheses:
+            is_asked = any(compared is hypothesis for hypothesis in hypotheses)
+            if is_asked or not compared.candidate.terms or not self._is_refuted_by_trials(compared):
+                not_refuted.append(compared)
+        scores = np.array([self.score(compared) for compared in not_refuted])
         families_asked = [family_place_pairs(hypothesis) for hypothesis in hypotheses]
         includes_asked = []
-        for other in not_refuted:
-            families = family_place_pairs(other)
+        for compared in not_refuted:
+            families = family_place_pairs(compared)
             includes_asked.append(
                 any(asked_families <= families for asked_families in families_asked)
             )

@@ -233,9 +233,11 @@ class Conclusion:
         fit_with_draws = with_draws(self.search.problem, fit)
         effects = named_effects(self.search.problem, fit_with_draws)
         family = ", ".join(sorted({effect.family for effect in effects if effect.shape}))
-        others = ", ".join(effect.name for effect in effects if not effect.shape)
-        beside = f", beside {others}" if others else ""
-        sentence = f"An effect of the family {family} is missing, with a shape of its own{beside}."
+        other_names = ", ".join(effect.name for effect in effects if not effect.shape)
+        beside_clause = f", beside {other_names}" if other_names else ""
+        sentence = (
+            f"An effect of the family {family} is missing, with a shape of its own{beside_clause}."
+        )
         return self.build_outcome(
             VerdictKind.FAMILY,
             sentence,

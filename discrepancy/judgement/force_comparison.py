@@ -69,7 +69,9 @@ class ForceComparison(Comparison[ForceHypothesis]):
         """Return the hypothesis of a single law with its shape free; None if there is none."""
         (term,) = hypothesis.candidate.terms
         key = Candidate((replace(term, free_shape=True),)).key
-        return next((other for other in self.ranked_hypotheses if other.candidate.key == key), None)
+        return next(
+            (fitted for fitted in self.ranked_hypotheses if fitted.candidate.key == key), None
+        )
 
     def start_point(self, hypothesis: ForceHypothesis) -> Point:
         """Return the values of all unknowns of a hypothesis as fitted to the missing force."""

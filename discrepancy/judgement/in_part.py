@@ -463,11 +463,11 @@ def _outcome_of_comparison(
     effects, group, family, gates, resembles
         Further attributes of the `Verdict`.
     """
-    others = []
-    for other in comparison.ranked_hypotheses:
-        if not any(other is member for member in members):
-            others.append(other)
-    listed: list[HypothesisT] = [*members, *others]
+    remaining = []
+    for ranked in comparison.ranked_hypotheses:
+        if not any(ranked is member for member in members):
+            remaining.append(ranked)
+    listed: list[HypothesisT] = [*members, *remaining]
     scores = np.array([comparison.score(hypothesis) for hypothesis in listed])
     probabilities = np.exp(scores - logsumexp(scores)).tolist()
     weighted: list[WeightedHypothesis] = []

@@ -34,8 +34,8 @@ def moved_unknowns(problem: Problem, fit: CandidateFit) -> tuple[MovedUnknown, .
         *_gain_values(problem, fit),
         *_zero_and_constant_values(problem, fit),
     ]
-    moved = [unknown for unknown in unknowns if abs(unknown.deviations) > MOVED_DEVIATIONS]
-    return tuple(sorted(moved, key=lambda unknown: -abs(unknown.deviations)))
+    moved_far = [unknown for unknown in unknowns if abs(unknown.deviations) > MOVED_DEVIATIONS]
+    return tuple(sorted(moved_far, key=lambda unknown: -abs(unknown.deviations)))
 
 
 def _parameter_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
@@ -133,12 +133,12 @@ def _unknown_stated_as_zero(
     )
 
 
-def moved_sentence(moved: Sequence[MovedUnknown]) -> str:
+def moved_sentence(unknowns: Sequence[MovedUnknown]) -> str:
     """Return a sentence on the unknowns that the fit without effect moves; empty if none."""
-    if not moved:
+    if not unknowns:
         return ""
-    parts = [_moved_text(unknown) for unknown in moved[:MOST_MENTIONED]]
-    remaining = len(moved) - MOST_MENTIONED
+    parts = [_moved_text(unknown) for unknown in unknowns[:MOST_MENTIONED]]
+    remaining = len(unknowns) - MOST_MENTIONED
     if remaining > 0:
         parts.append(f"{remaining} more")
     return f"Fitted without an effect, the model moves {listing(parts)}."

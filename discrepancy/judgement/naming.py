@@ -60,9 +60,9 @@ def reach_verdict(
         _verdict_of_two_searches(problem, effects, on_progress, on_search)
     )
     verdict = outcome.verdict
-    moved = moved_unknowns(problem, outcome.search.no_effect)
-    sentence = f"{verdict.sentence} {moved_sentence(moved)}".strip()
-    return outcome._replace(verdict=replace(verdict, sentence=sentence, moved=moved))
+    unknowns = moved_unknowns(problem, outcome.search.no_effect)
+    sentence = f"{verdict.sentence} {moved_sentence(unknowns)}".strip()
+    return outcome._replace(verdict=replace(verdict, sentence=sentence, moved=unknowns))
 
 
 def _verdict_of_two_searches(

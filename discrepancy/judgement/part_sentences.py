@@ -47,11 +47,11 @@ def unproved_addition_sentence(comparison: Comparison[HypothesisT], best: Hypoth
     families = family_place_pairs(best)
     least_score = comparison.score(best) - SEARCH.contender_range
     larger_hypothesis = None
-    for other in comparison.ranked_hypotheses:
-        has_more_laws = family_place_pairs(other) > families
-        only_laws = all(comparison.acts_on_structure(term) for term in other.candidate.terms)
-        if has_more_laws and only_laws and comparison.score(other) > least_score:
-            larger_hypothesis = other
+    for hypothesis in comparison.ranked_hypotheses:
+        has_more_laws = family_place_pairs(hypothesis) > families
+        only_laws = all(comparison.acts_on_structure(term) for term in hypothesis.candidate.terms)
+        if has_more_laws and only_laws and comparison.score(hypothesis) > least_score:
+            larger_hypothesis = hypothesis
             break
     if larger_hypothesis is None:
         return ""

@@ -176,21 +176,23 @@ def look_alike_remark(verdict: Verdict, compared: Iterable[Effect]) -> str | Non
     named = {effect.identifier: effect.name for effect in verdict.effects}
     compared_by_identifier = {effect.identifier: effect for effect in compared}
     similar = _similar_effects(set(named), compared_by_identifier)
-    tried = sorted(similar & compared_by_identifier.keys())
-    untried = sorted(similar - compared_by_identifier.keys())
+    compared_similar = sorted(similar & compared_by_identifier.keys())
+    not_compared_similar = sorted(similar - compared_by_identifier.keys())
     does = "does" if len(named) == 1 else "do together"
     remark = (
         "A cause that the catalogue lacks and that acts on these trials as "
         f"{' and '.join(named.values())} {does}, within the noise, would be given the same name."
     )
-    not_compared = f"{', '.join(untried)} {_was_or_were(untried)} not compared."
-    if tried:
+    not_compared = (
+        f"{', '.join(not_compared_similar)} {_was_or_were(not_compared_similar)} not compared."
+    )
+    if compared_similar:
         remark += (
-            f" Of what is known to look alike, {', '.join(tried)} {_was_or_were(tried)} compared, "
-            "with less evidence"
+            f" Of what is known to look alike, {', '.join(compared_similar)} "
+            f"{_was_or_were(compared_similar)} compared, with less evidence"
         )
-        return f"{remark}; {not_compared}" if untried else f"{remark}."
-    if untried:
+        return f"{remark}; {not_compared}" if not_compared_similar else f"{remark}."
+    if not_compared_similar:
         return f"{remark} Of what is known to look alike, {not_compared}"
     return remark
 

@@ -66,9 +66,13 @@ def group_lines(separability: Separability, hint: str = "the table says to which
         Where a reader finds which member is close to which.
     """
     detectable = [
-        item for item in separability.detectability if not item.reason and isfinite(item.detectable)
+        detectability
+        for detectability in separability.detectability
+        if not detectability.reason and isfinite(detectability.detectable)
     ]
-    shows_any = any(item.parameter and item.distance > 0.0 for item in detectable)
+    shows_any = any(
+        detectability.parameter and detectability.distance > 0.0 for detectability in detectable
+    )
     if not separability.identifiers or not shows_any:
         return [WORDS.say("nothing_shown")]
     if not separability.groups:

@@ -45,15 +45,15 @@ def evidence_rows(verdict: Verdict) -> list[tuple[Hypothesis, str]]:
         role = verdict.kind.value
     remaining_members = {member for member in members if member}
     chosen: list[tuple[Hypothesis, str]] = []
-    others: list[tuple[Hypothesis, str]] = []
+    remaining_hypotheses: list[tuple[Hypothesis, str]] = []
     for hypothesis in verdict.hypotheses:  # the most probable first
         identifiers = " + ".join(hypothesis.identifiers)
         if identifiers in remaining_members:
             remaining_members.remove(identifiers)
             chosen.append((hypothesis, role))
         else:
-            others.append((hypothesis, ""))
-    ranked = chosen + others
+            remaining_hypotheses.append((hypothesis, ""))
+    ranked = chosen + remaining_hypotheses
     without_effects = [row for row in ranked[MOST_SHOWN_HYPOTHESES:] if not row[0].effects]
     return ranked[:MOST_SHOWN_HYPOTHESES] + without_effects
 
@@ -201,13 +201,15 @@ def deciding_gates(verdict: Verdict) -> list[Gate]:
     return sorted(compared, key=lambda gate: not gate.has_failed)
 
 
-def calibration_rows(tried: SelfCalibration) -> list[tuple[str, str, Proportion]]:
+def calibration_rows(self_calibration: SelfCalibration) -> list[tuple[str, str, Proportion]]:
     """Return the rows of the self-calibration: hidden or not, the outcome, and its fraction."""
     rows = []
     for title, null in (("an effect was hidden", False), ("nothing was hidden", True)):
-        for outcome in ordered_outcomes(tried, null=null):
-            rows.append((title, outcome, tried.share(outcome, null=null)))
-    rows.append(("named rightly", "90 % intervals that hold the true value", tried.coverage()))
+        for outcome in ordered_outcomes(self_calibration, null=null):
+            rows.append((title, outcome, self_calibration.share(outcome, null=null)))
+    rows.append(
+        ("named rightly", "90 % intervals that hold the true value", self_calibration.coverage())
+    )
     return rows
 
 

@@ -86,13 +86,13 @@ def size_colour_scale(values: Sequence[float] | FloatArray) -> Normalize:
     return LogNorm(0.7, max(largest, 3.0), clip=True)
 
 
-def add_size_bar(figure: Figure, norm: Normalize, beside: Sequence[Axes]) -> None:
+def add_size_bar(figure: Figure, norm: Normalize, panels: Sequence[Axes]) -> None:
     """Draw the colour bar of sizes of residuals beside panels."""
     bar = style.color_bar(
         figure,
         ScalarMappable(norm, style.LEVELS),
         "rms residual / noise",
-        ax=beside,
+        ax=panels,
         fraction=0.045,
         pad=0.02,
         aspect=14,

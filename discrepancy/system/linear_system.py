@@ -88,10 +88,10 @@ class StaticPath(NamedTuple):
     memory: FloatArray | None
 
 
-def _differ_beyond_rounding(matrix: FloatArray, other: FloatArray) -> bool:
+def _differ_beyond_rounding(matrix: FloatArray, other_matrix: FloatArray) -> bool:
     """Return whether two matrices differ by more than rounding."""
     largest = np.abs(matrix).max(initial=1e-300)
-    return bool(np.abs(matrix - other).max(initial=0.0) > ROUNDING * largest)
+    return bool(np.abs(matrix - other_matrix).max(initial=0.0) > ROUNDING * largest)
 
 
 @dataclass(frozen=True, eq=False)

@@ -366,7 +366,7 @@ class LumpedDescription(ModelDescription):
         part_names: list[str] = []
         for kind in KINDS:
             part_names += [part.name for part in getattr(self, f"{kind}_part")]
-        references = [item.reference for item in self.controller if item.reference]
+        references = [table.reference for table in self.controller if table.reference]
         unique_names = names | {
             "part": [*KINDS, *part_names],
             "input or reference": [*names["input"], *references],
@@ -381,7 +381,7 @@ class LumpedDescription(ModelDescription):
         for controller in names["controller"]:
             scalable += [f"{controller}.{gain}" for gain in GAINS]
         prescribed = [section.name for section in self.input if section.quantity.motion_chain]
-        for kind, key, verb, known in (
+        for kind, key, verb, allowed_names in (
             ("input", "through", "acts through", matrices),
             ("load", "through", "acts through", matrices),
             ("law", "port", "acts on the port", names["port"]),
@@ -389,7 +389,7 @@ class LumpedDescription(ModelDescription):
             ("output", "controller", "is what a controller gives,", names["controller"]),
             ("parameter", "terms", "scales", scalable),
         ):
-            yield from self._reference_faults(kind, key, verb, known)
+            yield from self._reference_faults(kind, key, verb, allowed_names)
 
     def _reference_faults(
         self, kind: str, key: str, verb: str, known_names: Sequence[str]

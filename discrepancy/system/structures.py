@@ -157,12 +157,12 @@ class StructureModel(SystemModel):
         ModelError
             If there is such a port: readings could not distinguish the forces at both.
         """
-        for other, other_row in self.port_rows.items():
+        for other_port, other_row in self.port_rows.items():
             if _acts_along(row, other_row):
                 raise ModelError(
-                    f"The port {port!r} of the structure {self.name} moves as its port {other!r} "
-                    "does, so that no reading tells their forces apart: take this [[port]] out of "
-                    "the file."
+                    f"The port {port!r} of the structure {self.name} moves as its port "
+                    f"{other_port!r} does, so that no reading tells their forces apart: take this "
+                    "[[port]] out of the file."
                 )
 
     def _input_vector(self, state: SystemState, controls: Mapping[str, float]) -> FloatArray:

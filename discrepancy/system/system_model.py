@@ -276,7 +276,10 @@ class SystemModel(Model):
                         "acceleration."
                     )
             # at rest an output shows displacements (row 0) and the values of states (row 1)
-            output_rows = [np.append(item.rows[0, :n], item.rows[1, n:]) for item in equations]
+            output_rows = [
+                np.append(output_equation.rows[0, :n], output_equation.rows[1, n:])
+                for output_equation in equations
+            ]
             trial_text = f"The trial {trial.name!r} is at rest, but "
             with ModelError.instead_of(ModelError, FiniteElementError, before=trial_text):
                 values[rows], memory = system.static_path(
