@@ -99,30 +99,28 @@ def backbones(
     for first in range(0, time.size - width + 1, max(1, round(0.5 * width))):
         samples = slice(first, first + width)
         window = DampedCosines(time[samples], signal[samples], averaging_width)
+        window_time = time[samples] - time[first]
         while is_ringing.any():
             solution = window.fit(poles[is_ringing])
-            window_time = time[samples] - time[first]
             modes = np.flatnonzero(is_ringing).tolist()
-            points_of_window = dict(
-                zip(modes, _points_of_window(window_time, solution, noise_deviation), strict=True)
-            )
-            died_away = [
-                mode
-                for mode, point in points_of_window.items()
-                if not point.is_credible(start[mode])
-            ]
-            if died_away:
-                # fit again without these modes, which would spoil the errors of the others
-                is_ringing[died_away] = False
-                continue
-            for mode, point in points_of_window.items():
-                points[mode].append(point._replace(time=float(time[first]) + point.time))
-            # start values for the next window: these poles, with a damping ratio of at least 1e-4
-            fitted = solution.pole
-            poles[is_ringing] = np.minimum(fitted.real, -1e-4 * fitted.imag) + 1j * fitted.imag
-            break
+            points_of_window = _points_of_window(window_time, solution, noise_deviation)
+            died_away = []
+            for mode, point in zip(modes, points_of_window, strict=True):
+                if not point.is_credible(start[mode]):
+                    died_away.append(mode)
+            if not died_away:
+                break
+            # fit again without these modes, which would spoil the errors of the others
+            is_ringing[died_away] = False
         if not is_ringing.any():
             break
+        for mode, point in zip(modes, points_of_window, strict=True):
+            points[mode].append(point._replace(time=float(time[first]) + point.time))
+        # start values for the next window: these poles, with a damping ratio of at least 1e-4
+        fitted_poles = solution.pole
+        largest_real_part = -1e-4 * fitted_poles.imag
+        real_parts = np.minimum(fitted_poles.real, largest_real_part)
+        poles[is_ringing] = real_parts + 1j * fitted_poles.imag
     return tuple(
         _backbone_of_points(mode, points_of_mode) for mode, points_of_mode in enumerate(points, 1)
     )

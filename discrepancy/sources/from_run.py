@@ -3,6 +3,7 @@
 `docs/run_folder.md` describes the folder; only its files are read.
 """
 
+from collections.abc import Sequence
 from itertools import product
 from math import inf
 from pathlib import Path
@@ -165,14 +166,7 @@ def _build_campaign(
             f"No strain reached the twin in {folder}: there is nothing to compare."
         )
     noise, source_of_noise = _strain_noise(scenario)
-    channels = {}
-    for gauge_number in observed["sensor"].values.tolist():
-        channels[f"g{gauge_number}"] = records.Channel(
-            name=f"g{gauge_number}",
-            quantity=records.Quantity.STRAIN,
-            output=f"strain[{gauge_number}]",
-            noise=records.NoiseRecord(noise, inf),
-        )
+    channels = _strain_channels(observed["sensor"].values.tolist(), noise)
     temperature = _temperature_rises(run, steps)
     belief = run["smoothed"].to_dataset().sel(step=steps)
     flight = records.Trial.plain(
@@ -202,6 +196,19 @@ def _build_campaign(
         data_hash=hash_file(folder / RUN_FILE),
         remarks=remarks,
     )
+
+
+def _strain_channels(gauge_numbers: Sequence[int], noise: float) -> dict[str, records.Channel]:
+    """Return a channel for each strain gauge, by its name, with a stated noise deviation [1]."""
+    channels = {}
+    for gauge_number in gauge_numbers:
+        channels[f"g{gauge_number}"] = records.Channel(
+            name=f"g{gauge_number}",
+            quantity=records.Quantity.STRAIN,
+            output=f"strain[{gauge_number}]",
+            noise=records.NoiseRecord(noise, inf),
+        )
+    return channels
 
 
 def _flight_remarks(used: BoolArray, noise: float, source_of_noise: str) -> tuple[str, ...]:

@@ -92,19 +92,7 @@ def real_wing(
     CampaignDataError
         If there are fewer than two records, or of several lengths, or too short ones.
     """
-    with CampaignFileError.instead_of(
-        CalibrationError, before="The measurements of the wing cannot be read: "
-    ):
-        records = read_records(data)
-        folders = [data / above / "step2" for above in (".", "datafiles", "src/datafiles")]
-        measurements = None
-        if any(folder.is_dir() for folder in folders):
-            measurements = read_measurements(data)
-    if len({len(record.time) for record in records}) > 1 or len(records) < 2:
-        raise CampaignDataError(
-            f"{data} must hold two or more ring-down records of one length; it holds "
-            f"{len(records)}."
-        )
+    records, measurements = _read_lab_data(data)
     zero = _shared_zero(records) if detrended else np.zeros(records[0].count)
     windows = [_plot_window(record, zero, begin, columns) for record in records]
     interval = float(windows[0].time[1])
@@ -131,18 +119,49 @@ def real_wing(
         keys["channel"] = loading.campaign_keys["channel"]
         trials += loading.campaign_keys["trial"]
     for number, window in enumerate(windows, start=1):
-        file = f"release_{number}.csv"
-        tables[file] = table_text({"time": window.time, SIGNAL: window.signal})
-        trials.append(
-            {
-                "name": f"release {number}",
-                "kind": "ringdown",
-                "file": file,
-                "held_out": number in HELD_OUT,
-                "release": RELEASE,
-            }
-        )
+        trial = {
+            "name": f"release {number}",
+            "kind": "ringdown",
+            "file": f"release_{number}.csv",
+            "held_out": number in HELD_OUT,
+            "release": RELEASE,
+        }
+        tables[f"release_{number}.csv"] = table_text({"time": window.time, SIGNAL: window.signal})
+        trials.append(trial)
     return RigFiles(tables, {**keys, "trial": trials})
+
+
+class _LabData(NamedTuple):
+    """The ring-downs of the wing, and its loading runs; None if the folder has no loading runs."""
+
+    records: tuple[RingDownRecord, ...]
+    measurements: LoadDisplacementData | None
+
+
+def _read_lab_data(data: Path) -> _LabData:
+    """Read the ring-downs and loading runs of the wing from the authors' calibration folder.
+
+    Raises
+    ------
+    CampaignFileError
+        If the measurements cannot be read.
+    CampaignDataError
+        If there are fewer than two ring-downs, or ring-downs of several lengths.
+    """
+    with CampaignFileError.instead_of(
+        CalibrationError, before="The measurements of the wing cannot be read: "
+    ):
+        records = read_records(data)
+        folders = [data / above / "step2" for above in (".", "datafiles", "src/datafiles")]
+        measurements = None
+        if any(folder.is_dir() for folder in folders):
+            measurements = read_measurements(data)
+    if len({len(record.time) for record in records}) > 1 or len(records) < 2:
+        raise CampaignDataError(
+            f"{data} must hold two or more ring-down records of one length; it holds "
+            f"{len(records)}."
+        )
+    return _LabData(records, measurements)
 
 
 def _loading_runs(measurements: LoadDisplacementData) -> RigFiles:
