@@ -115,9 +115,9 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         if getattr(self.scenario.asset, "seeds", ()):  # chance of its own, which begins with it
             self._let_go()
-            scenario = self.scenario.under(self._seed)
+            scenario = self.scenario.with_seed(self._seed)
             source = scenario.asset.source(scenario)
-            source.use(self._folder)
+            source.use_prepared_folder(self._folder)
             self._asset = source.open()
         else:
             self._asset.restore_state(self._start)

@@ -97,9 +97,9 @@ class Excitation:
     release: ReleasePoint | None = None
 
     @property
-    def jump_times(self) -> list[float]:
-        """Times at which a load jumps, begins or ends [s]."""
-        return [edge for load in self.loads for edge in load.history.jump_times]
+    def jump_times(self) -> FloatArray:
+        """Times at which a load jumps, begins or ends, (J,) [s]."""
+        return np.concatenate([np.zeros(0), *(load.history.jump_times for load in self.loads)])
 
     @property
     def is_smooth(self) -> bool:

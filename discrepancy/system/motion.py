@@ -381,7 +381,7 @@ def _integrate_in_steps(
     modal = system.modal_system
     follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
     least_parts = SMOOTH_PARTS if follows_curve else 1
-    edges = (*laws.switching_times, *excitation.jump_times)
+    edges = np.concatenate((laws.switching_times, excitation.jump_times))
     boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
     # displacements of the ports under loads in the modes without inertia
     port_displacements = np.zeros((len(boundaries.time), len(laws)))

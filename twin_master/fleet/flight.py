@@ -207,7 +207,7 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
 def flies_model(scenario: Scenario) -> bool:
     """Return whether the reduced model itself is flown, in the place of the FMU that is packed of it."""
     asset, belief = scenario.asset, scenario.belief
-    same = (asset.kind, belief.kind) == ("design", "design") and not scenario.another_model
+    same = (asset.kind, belief.kind) == ("design", "design") and not scenario.models_differ
     return same and getattr(asset, "design", None) == getattr(belief, "design", None)
 
 
@@ -280,7 +280,7 @@ def _check_truth(group: Group, scenario: Scenario) -> None:
 
 def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
     """Return what `fly_shard` wants of a scenario, what belongs to it made in a folder."""
-    located = scenario.portable().moved(folder)
+    located = scenario.portable().with_paths_from(folder)
     write_members(folder, source_of(scenario, real=real).files())
     source = source_of(located, real=real)
     source.prepare(folder, SilentProgress())

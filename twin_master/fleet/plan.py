@@ -17,7 +17,7 @@ from twin_master.errors import FleetError, TwinMasterError, said
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.scenario.reading import load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Count, Flag, Name, Probability, Section, Seed, named_once
+from twin_master.scenario.section import Count, Flag, Name, Probability, Section, Seed, repeated_name_fault
 from twin_master.seeds import generator
 from twin_master.watch.feeds import is_broker
 from twin_master.watch.message import Fed
@@ -95,7 +95,7 @@ class FleetFile(Section):
 
     def faults(self) -> Iterator[Fault]:
         """Yield names that come twice."""
-        yield named_once("group", [group.name for group in self.group])
+        yield repeated_name_fault("group", [group.name for group in self.group])
 
 
 @dataclass(frozen=True)

@@ -189,7 +189,7 @@ def known_twins(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") ->
     for place in np.unique(places).tolist():
         rows, table = flown[places == place], record["scenarios"][place]
         home = folder / GROUPS / record["name"] / str(place)
-        yield rows, home, kept_knowledge(home, Scenario.model_validate(table).moved(home))
+        yield rows, home, kept_knowledge(home, Scenario.model_validate(table).with_paths_from(home))
 
 
 def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:

@@ -118,7 +118,7 @@ class Kit:
         self._folder = folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         write_members(folder, files)
-        self.scenario = Scenario.model_validate(scenario).moved(folder)
+        self.scenario = Scenario.model_validate(scenario).with_paths_from(folder)
         self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
 
     def told(self, sentence: str) -> str:
@@ -131,10 +131,10 @@ class Kit:
         if self.wing is not None:
             return ReducedModelSource(scenario, self.wing).open()
         if seed is not None:
-            scenario = scenario.under(seed)
+            scenario = scenario.with_seed(seed)
         source: AssetSource = scenario.asset.source(scenario)
         if isinstance(source, FmuSource):
-            source.use(self._folder)  # packed already
+            source.use_prepared_folder(self._folder)  # packed already
         else:
             source.prepare(self._folder, SilentProgress())
         return source.open()
@@ -148,7 +148,7 @@ def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scen
     """Return a scenario whose asset has these true parameters, beside those that it has."""
     if not parameters:
         return scenario
-    return scenario.having("asset", parameters={**scenario.asset.true_parameters, **parameters})
+    return scenario.with_changes("asset", parameters={**scenario.asset.true_parameters, **parameters})
 
 
 def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:

@@ -16,7 +16,7 @@ from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Page, ReportFigure, Words
 from reporting.words import counted, listing, parameter_title, small
-from twin_master.assets.asset_source import calibrated_with
+from twin_master.assets.asset_source import calibration_sentence
 from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.errors import RunFolderError
 from twin_master.network.estimator import is_state_believed
@@ -297,7 +297,7 @@ def render_page(run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, R
             f"{one.title.lower()} {tailored.with_interval(np.nanmedian(one.prior, axis=0))}" for one in own
         ],
         "calibrated": _calibrated(kept), "monitors": _monitors(run),
-        "of": asset and model and calibrated_with(kept, asset, model, run.config.get("inputs", {})),
+        "of": asset and model and calibration_sentence(kept, asset, model, run.config.get("inputs", {})),
     }  # fmt: skip
     WORDS.fill(page, drawings, **told)
     return page.render()

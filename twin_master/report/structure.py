@@ -26,7 +26,8 @@ from twin_master.assets.structure_source import FLOWN_COPY, MODEL_COPY
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy
 from twin_master.report.reading import Run
-from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
+from twin_master.scenario.mission import CALIBRATION_COPY
+from twin_master.scenario.schema import Scenario
 
 LOSS = "YlOrRd"
 """Colour map of what regions have lost."""
