@@ -51,9 +51,9 @@ class SearchSettings:
     first_order_change: float = 25.0
     """Squared change of all readings [noise variances] to which an effect is reduced, so that its
     direction can be computed to first order."""
-    zero_padding_factor: int = 4
+    zero_padding: int = 4
     """Factor of zero padding of spectra, because lines lie between the frequencies of a record."""
-    spectrum_peaks: int = 3
+    most_peaks: int = 3
     """Peaks of a spectrum that are tried."""
     starts_near_data: int = 2
     """Starts of the fit of each effect, if the model is close to the data."""

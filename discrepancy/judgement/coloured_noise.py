@@ -40,7 +40,7 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
         return _nothing_missing_outcome(conclusion, no_effect, no_effect_gate, probability_of_none)
     if (
         not best.candidate.terms
-        or best.candidate.is_family
+        or best.candidate.has_free_shape
         or not _residuals_have_recorded_colour(best)
     ):
         return None

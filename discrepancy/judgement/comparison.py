@@ -18,13 +18,13 @@ from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm, Point
-from discrepancy.fits.fitting import CandidateFit, attempt
-from discrepancy.fits.gates import ABSOLUTE_LEVEL, check_absolute_fit
+from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.gates import ABSOLUTE_FIT_LEVEL, check_absolute_fit
 from discrepancy.fits.predictive import residual_set
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.gap_share import GapShare
 from discrepancy.proof_record import ClosedShare
-from discrepancy.search.starts import acts_within
+from discrepancy.search.starts import changes_structure
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate
@@ -155,7 +155,7 @@ class Comparison(ABC, Generic[HypothesisT]):
         simulation = self.search.exact_fits.get(hypothesis.candidate.key)
         if simulation is None:
             start = self.start_point(hypothesis)
-            simulation = attempt(self.problem, hypothesis.candidate, start)
+            simulation = try_fit(self.problem, hypothesis.candidate, start)
         if simulation is None:
             return False
         return not check_absolute_fit(self.problem, simulation).has_failed
@@ -196,20 +196,20 @@ class Comparison(ABC, Generic[HypothesisT]):
         """
         if self.has_held_out:
             held_out_share = self.gap_share(hypothesis, held_out=True)
-            if held_out_share.tested:
+            if held_out_share.is_tested:
                 return held_out_share
         return self.gap_share(hypothesis, held_out=False)
 
     def acts_on_structure(self, term: EffectTerm) -> bool:
         """Return whether an effect changes the structure or its loads, and not only readings."""
-        return acts_within(term.effect, self.problem.setting)
+        return changes_structure(term.effect, self.problem.setting)
 
     def objection_to_naming(self, hypothesis: HypothesisT) -> str:
         """Return the reason why a hypothesis may not be named; empty if it may be named."""
         candidate = hypothesis.candidate
         if not any(self.acts_on_structure(term) for term in candidate.terms):
             return "it describes readings, causes nothing and leaves more than noise"
-        if candidate.is_family and len(candidate.terms) > 1:
+        if candidate.has_free_shape and len(candidate.terms) > 1:
             return "beside another law a shape of its own imitates nearly anything"
         fitted_share = self.gap_share(hypothesis, held_out=False)
         if _is_share_too_small(fitted_share, self.least_low_end):
@@ -237,8 +237,8 @@ class Comparison(ABC, Generic[HypothesisT]):
         shared = self.problem.shared
         has_prior = shared.precision > 0.0
         indices_by_kind = {
-            "calibrated parameters": slice(shared.count),
-            "gains": slice(shared.count, None),
+            "calibrated parameters": slice(shared.parameter_count),
+            "gains": slice(shared.parameter_count, None),
         }
         for kind, indices in indices_by_kind.items():
             scaled_values = hypothesis.shared[indices][has_prior[indices]]
@@ -247,7 +247,7 @@ class Comparison(ABC, Generic[HypothesisT]):
                 and chi2.sf(
                     scaled_values @ scaled_values / SEARCH.prior_widening**2, scaled_values.size
                 )
-                < ABSOLUTE_LEVEL
+                < ABSOLUTE_FIT_LEVEL
             ):
                 return kind
         return ""
@@ -266,7 +266,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             The least lower end of the interval of its share in held-out trials.
         """
         share = self.gap_share(hypothesis, held_out=True)
-        if share.tested:
+        if share.is_tested:
             return not _is_share_too_small(share, least_low_end)
         return share.value > CONTRADICTING_SHARE
 
@@ -302,7 +302,7 @@ class Comparison(ABC, Generic[HypothesisT]):
 
         It is None if these terms cannot be fitted alone.
         """
-        candidate, effect = hypothesis.candidate.subset(term_indices, hypothesis.effect)
+        candidate, effect = hypothesis.candidate.subset_of_terms(term_indices, hypothesis.effect)
         key = candidate.key
         for fitted in self.ranked_hypotheses:
             if fitted.candidate.key == key:
@@ -403,7 +403,7 @@ class Comparison(ABC, Generic[HypothesisT]):
             is_same_family = family_place_pairs(hypothesis) == family_place_pairs(best)
             is_longer = len(candidate.terms) > len(best.candidate.terms)
             # the same law with a free shape is no other cause, and more effects are no simpler one
-            if (candidate.is_family and is_same_family) or is_longer:
+            if (candidate.has_free_shape and is_same_family) or is_longer:
                 continue
             if self.score(hypothesis) <= least_competing_score:
                 continue

@@ -176,14 +176,14 @@ def _projected_directions(
     group : mapping of str to Direction
         The directions by their names.
     """
-    sign = screen.sign
+    sign = screen.inner_product_signs
     labels = []
     vectors = []
     scores = []
     for label, direction in group.items():
         changes = {}
         for trial_index, change in direction.items():
-            changes[trial_index] = problem.trials[trial_index].standardised(change)
+            changes[trial_index] = problem.trials[trial_index].standardise(change)
         vector, score, _ = screen.project(changes)
         length = float(np.linalg.norm(vector[sign > 0.0]))
         if length > 0.0:
@@ -220,12 +220,12 @@ def _noise_freedom(
     for direction in group:
         for trial_index, change in direction.items():
             is_changed = np.any(change != 0.0, axis=0)
-            channels.update(problem.trials[trial_index].groups[is_changed].tolist())
+            channels.update(problem.trials[trial_index].channel_indices[is_changed].tolist())
     channel_indices = sorted(channels)
-    freedom = problem.freedom[channel_indices] + problem.counts[channel_indices]
+    freedom = problem.record_freedom[channel_indices] + problem.sample_counts[channel_indices]
     if np.any(np.isinf(freedom)):
         return _NoiseFreedom(np.inf, 1.0)
-    residual_freedom = float(np.sum(freedom - fit.spent[channel_indices]))
+    residual_freedom = float(np.sum(freedom - fit.absorbed_freedom[channel_indices]))
     return _NoiseFreedom(residual_freedom, residual_freedom / float(freedom.sum()))
 
 
@@ -445,7 +445,7 @@ def _zero_scale(problem: Problem, quantity: Quantity) -> float:
     deviations = []
     for channel in problem.campaign.channels.values():
         if channel.quantity is quantity:
-            deviations.append(problem.noise[channel.name].static_deviation)
+            deviations.append(problem.noise_models[channel.name].static_deviation)
     return min(deviations)
 
 
@@ -485,7 +485,7 @@ def _channels_of_effects(problem: Problem, fit: CandidateFit) -> Sequence[str]:
 
 def _only_channel_of_term(problem: Problem, term: EffectTerm) -> str:
     """Return the only sensor channel that a term acts on; empty if it acts on anything else."""
-    patch = term.patch(problem.setting, term.start() + 1.0)
+    patch = term.patch(problem.setting, term.start_values() + 1.0)
     if not all(isinstance(primitive, SENSORS) for primitive in patch):
         return ""
     channels = {getattr(primitive, "channel", "") for primitive in patch}

@@ -67,7 +67,7 @@ def _gain_values(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     shared = problem.shared
     unknowns = []
     for gain_number, channel in enumerate(shared.gain_channels):
-        shared_number = shared.count + gain_number
+        shared_number = shared.parameter_count + gain_number
         if shared.precision[shared_number] > 0.0:
             scaled_value = float(fit.point.shared[shared_number])
             scale = float(shared.scale[shared_number])
@@ -81,7 +81,7 @@ def _zero_and_constant_values(problem: Problem, fit: CandidateFit) -> list[Moved
     for data, local in zip(problem.trials, fit.point.local, strict=True):
         layout = data.unknowns
         names_and_units = _names_of_zeros_and_constants(problem, data)
-        zeros_end, initial_end, inputs_end, _ = layout.ends
+        zeros_end, initial_end, inputs_end, _ = layout.ends_by_kind
         indices = [*range(zeros_end), *range(initial_end, inputs_end)]
         for (name, unit), index in zip(names_and_units, indices, strict=True):
             if layout.precision[index] > 0.0:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.fits.fitting import CandidateFit, fit_free_shape
-from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit, check_shape
+from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit, check_shape
 from discrepancy.fits.predictive import with_draws
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -73,7 +73,7 @@ class VerdictCase:
         self.leading_set = next(iter(probabilities)) if leading_set is None else leading_set
         self.leading_fit = search.best()
         if self.leading_set:
-            self.leading_fit = search.fit_exactly(search.best_of(self.leading_set))
+            self.leading_fit = search.fit_exactly(search.best_fit_of_set(self.leading_set))
         self.conclusion = Conclusion.from_probabilities(search, self.leading_fit, probabilities)
         self.no_effect_probability = probabilities.get((), 0.0)
         self.has_enough_evidence = self.conclusion.log_bayes_factor >= SEARCH.least_log_bayes_factor
@@ -105,7 +105,7 @@ class VerdictCase:
             if leading <= set(names_without_free_shape(names)):
                 total += probability
         if (
-            self.leading_fit.candidate.is_family
+            self.leading_fit.candidate.has_free_shape
         ):  # one family is reached from several members or places
             family = self.leading_fit.candidate.terms[0].effect.family
             total = max(total, _family_probability(self.search, family))
@@ -153,7 +153,7 @@ class VerdictCase:
     @property
     def family_fit(self) -> CandidateFit | None:
         """The fit with a free shape, if its evidence is enough to name the family instead."""
-        return self._best_free_shape if self.shape_gate.statistic > SHAPE_GAIN else None
+        return self._best_free_shape if self.shape_gate.statistic > LEAST_SHAPE_GAIN else None
 
     @property
     def all_gates(self) -> tuple[Gate, ...]:
@@ -161,7 +161,7 @@ class VerdictCase:
 
         The test of shape is left out if a shape is free already.
         """
-        if self.leading_fit.candidate.is_family:
+        if self.leading_fit.candidate.has_free_shape:
             return self.tested_set.absolute_fit, self.tested_set.consistency
         return self.tested_set.absolute_fit, self.shape_gate, self.tested_set.consistency
 
@@ -178,7 +178,7 @@ class VerdictCase:
         A law of free shape together with a second law could fit nearly anything.
         """
         candidate = self.leading_fit.candidate
-        family_fit = None if candidate.is_family else self.family_fit
+        family_fit = None if candidate.has_free_shape else self.family_fit
         patches = candidate.patches(self.problem.setting, self.leading_fit.effect)
         law_count = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
         if family_fit is None or law_count > 1 or len(patches) == SEARCH.largest_set:
@@ -239,7 +239,7 @@ class VerdictCase:
             return self._below_limit_verdict()
         members = []
         for names in self.probable_sets:
-            fit = self.search.fit_exactly(self.search.best_of(names))
+            fit = self.search.fit_exactly(self.search.best_fit_of_set(names))
             members.append(FittedEffectSet(names, fit, check_absolute_fit(self.problem, fit)))
         # sets that fail the test are no members, and their probability is not counted
         fitting = [member for member in members if not member.absolute_fit.has_failed]
@@ -345,7 +345,7 @@ class VerdictCase:
         reason = tested.absolute_fit.reason
         if not tested.absolute_fit.has_failed and tested.consistency.has_failed:
             reason = tested.consistency.reason
-        if self.leading_fit.candidate.is_family:
+        if self.leading_fit.candidate.has_free_shape:
             sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
             gates = (tested.absolute_fit, tested.consistency)
             return self._unexplained_verdict(sentence, self.probability, gates)
@@ -391,7 +391,9 @@ def decide_verdict(case: VerdictCase) -> VerdictOutcome:
         return case.common_effects_verdict() or case.undecided_verdict()
     if case.passes_all_tests:
         return (
-            case.family_verdict() if case.leading_fit.candidate.is_family else case.named_verdict()
+            case.family_verdict()
+            if case.leading_fit.candidate.has_free_shape
+            else case.named_verdict()
         )
     family = case.tested_family_set
     if family is None or _any_fails((family.absolute_fit, family.consistency)):

@@ -117,7 +117,7 @@ def campaign_as_predicted(campaign: Campaign, model: Model, setting: Setting) ->
     point = prior_point_with_initial_states(problem)
     predictions = {}
     for trial_index, data in enumerate(problem.trials):
-        response = problem.response_with(trial_index, point, Candidate())
+        response = problem.response_of_candidate(trial_index, point, Candidate())
         predictions[data.trial.name] = problem.prediction(trial_index, point, response)
     trials: list[Trial] = []
     for trial in campaign.trials:
@@ -148,7 +148,7 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
     FitError
         If the model gives numbers that are not finite.
     """
-    start = problem.start(Candidate())
+    start = problem.prior_mean_point(Candidate())
     if not any(has_free_initial_state(data.trial) for data in problem.trials):
         return start
     # parameters are fitted, too: with a wrong frequency the initial motion would fade out
@@ -198,7 +198,7 @@ def compute_separability(
             reason = "The structure cannot carry it at any size that was tried."
             detectability.append(Detectability(effect, reason))
             continue
-        small = _SmallChange(*screen.shrunk(best))
+        small = _SmallChange(*screen.shrink_change(best))
         distance = min(best.squared_size, small.change.squared_size / small.factor**2)
         detectability.append(_detectability(effect, best, distance))
         if best.squared_size > VISIBILITY_DISTANCE:
@@ -238,7 +238,7 @@ def _all_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
     """Return the changes by an effect over the grid of its parameters, at all its places."""
     changes: list[ScreenedChange] = []
     for place in effect.places(screen.problem.setting):
-        changes.extend(screen.changes(EffectTerm(effect, place)))
+        changes.extend(screen.changes_on_grid(EffectTerm(effect, place)))
     return changes
 
 
@@ -278,18 +278,18 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
     changes = []
     for place in effect.places(screen.problem.setting):
         term = EffectTerm(effect, place)
-        start = term.start()
+        start = term.start_values()
         for index, parameter in enumerate(term.parameters):
             if parameter.magnitude and parameter.prior.value(0.0) == 0.0:
                 start[index] = 1.0
         with suppress(DiscrepancyError):
-            changes.append(screen.change(term, start))
+            changes.append(screen.change_by_effect(term, start))
     return changes
 
 
 def _has_reference_magnitude(change: ScreenedChange) -> bool:
     """Return whether the magnitudes of a change are those of `_changes_at_prior_median`."""
-    for parameter, scaled_value in zip(change.term.parameters, change.start, strict=True):
+    for parameter, scaled_value in zip(change.term.parameters, change.effect_values, strict=True):
         if parameter.magnitude and abs(scaled_value) not in (0.0, 1.0):
             return False
     return True
@@ -312,7 +312,7 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     """
     for index, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:
-            typical = abs(parameter.prior.value(float(change.start[index])))
+            typical = abs(parameter.prior.value(float(change.effect_values[index])))
             detectable = typical * sqrt(DETECTION_DISTANCE / distance) if distance > 0.0 else inf
             return Detectability(
                 effect=effect,
@@ -362,7 +362,7 @@ def _small_changes(screen: Screen, effect: _VisibleEffect) -> list[_SmallChange]
     """Return the changes of an effect, each with a magnitude at which it is linear."""
     small_changes = []
     for option in effect.options:
-        change, factor = screen.shrunk(option)
+        change, factor = screen.shrink_change(option)
         small_changes.append(_SmallChange(change, factor))
     return small_changes
 
@@ -385,7 +385,7 @@ def _squared_distance(
     options : sequence of ScreenedChange
         The changes by the effect over a grid of its parameters.
     """
-    sign = screen.sign
+    sign = screen.inner_product_signs
     if target.squared_size <= 0.0:
         return 0.0
 
@@ -401,11 +401,11 @@ def _squared_distance(
     # spanning changes: the nearest option, and its differences by the parameters, over ten times
     # the step of derivatives
     changes = [nearest.vector]
-    for index in range(len(nearest.start)):
-        stepped = nearest.start.copy()
+    for index in range(len(nearest.effect_values)):
+        stepped = nearest.effect_values.copy()
         stepped[index] += 10.0 * PARAMETER_STEP
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
-            change = screen.change(nearest.term, stepped)
+            change = screen.change_by_effect(nearest.term, stepped)
             changes.append(change.vector - nearest.vector)
     # least squares by normal equations, scaled to unit length; a small multiple of the identity is
     # added because changes by several parameters may be nearly parallel
