@@ -18,7 +18,7 @@ from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import Asset
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError, said
-from twin_master.fleet.flight import source_of
+from twin_master.fleet.checks import source_of
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.steps import Plant, decided_to_end
 from twin_master.scenario.reading import LoadedScenario, load_scenario

@@ -13,6 +13,7 @@ from discrepancy.catalogue.effect_in_setting import DYNAMIC
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from discrepancy.errors import CatalogueError
 from fe.runtime.patch import SENSORS, ModelPatch, Window
+from reporting.choices import did_you_mean
 
 THEMES = (
     "structure",
@@ -101,6 +102,7 @@ def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
         raise CatalogueError(
             f"The catalogue has no effect {identifier!r}; it has "
             f"{', '.join(effects_by_identifier)}."
+            f"{did_you_mean(identifier, effects_by_identifier)}"
         )
     return effects_by_identifier[identifier]
 

@@ -196,22 +196,22 @@ class _TrialPredictions:
         shared_count = len(self.covariance_root)
         local_counts = [data.unknowns.unknown_count for data in self.problem.trials]
         first_local = shared_count
-        for number, data in enumerate(self.problem.trials):
+        for trial_index, data in enumerate(self.problem.trials):
             rows = trial_jacobian(
-                self.problem, number, self.local_fit, self.local_fit.candidate, self.precision
+                self.problem, trial_index, self.local_fit, self.local_fit.candidate, self.precision
             )
-            projection = self._covariance_factors(rows, data.unknowns.unknown_count)
+            factors = self._covariance_factors(rows, data.unknowns.unknown_count)
             sensitivity = None
             if sensitivities:
-                shape = self.local_fit.residuals[number].shape
+                shape = self.local_fit.residuals[trial_index].shape
                 sensitivity = np.zeros((*shape, shared_count + sum(local_counts)))
-                by_shared = projection.by_shared.reshape(*shape, shared_count)
+                by_shared = factors.by_shared.reshape(*shape, shared_count)
                 sensitivity[..., :shared_count] = by_shared
-                local_count = len(projection.by_local)
-                by_local = projection.by_local.T.reshape(*shape, local_count)
+                local_count = len(factors.by_local)
+                by_local = factors.by_local.T.reshape(*shape, local_count)
                 sensitivity[..., first_local : first_local + local_count] = by_local
                 first_local += local_count
-            fitted_trials.append(self._fitted_trial(number, data, projection, sensitivity))
+            fitted_trials.append(self._fitted_trial(trial_index, data, factors, sensitivity))
         return fitted_trials
 
     def _covariance_factors(self, rows: TrialJacobian, local_count: int) -> _CovarianceFactors:
@@ -235,17 +235,17 @@ class _TrialPredictions:
         )
 
     def _leverage_and_variance(
-        self, number: int, data: TrialData, projection: _CovarianceFactors
+        self, trial_index: int, data: TrialData, factors: _CovarianceFactors
     ) -> tuple[FloatArray, FloatArray]:
         """Return the leverage of the readings and the variance of a new reading, both (N, C).
 
         Both are relative to the noise variance; `FittedTrial` defines the leverage.
         """
-        shape = self.local_fit.residuals[number].shape
+        shape = self.local_fit.residuals[trial_index].shape
         process = self.fitted.residual_process
         shared_weight = float(process is None)  # 0: the residual process stands for shared unknowns
-        local_variance = projection.local_variance()
-        shared_variance = projection.shared_variance()
+        local_variance = factors.local_variance()
+        shared_variance = factors.shared_variance()
         if self.is_held_out:
             # own unknowns were fitted to the trial and reduce its residuals; the uncertainty of
             # shared unknowns, which were not, adds to them
@@ -264,29 +264,29 @@ class _TrialPredictions:
 
     def _fitted_trial(
         self,
-        number: int,
+        trial_index: int,
         data: TrialData,
-        projection: _CovarianceFactors,
+        factors: _CovarianceFactors,
         sensitivity: FloatArray | None,
     ) -> FittedTrial:
         """Return a trial with its prediction, its residuals and their expected variance.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         data : TrialData
             The trial.
-        projection : _CovarianceFactors
+        factors : _CovarianceFactors
             The factors of the covariance of its prediction.
         sensitivity : (N, C, P) array or None
             The factor of the exact covariance of its residuals, if that is asked for.
         """
         point = self.local_fit.point
-        response = self.local_fit.responses[number]
-        prediction = self.problem.prediction(number, point, response)
-        residual = self.problem.standardised_residual(number, point, response)
-        leverage, variance = self._leverage_and_variance(number, data, projection)
+        response = self.local_fit.responses[trial_index]
+        prediction = self.problem.prediction(trial_index, point, response)
+        residual = self.problem.standardised_residual(trial_index, point, response)
+        leverage, variance = self._leverage_and_variance(trial_index, data, factors)
         noise_deviation = data.deviation / np.sqrt(self.precision[data.channel_indices])
         rates = None
         if data.trial.is_dynamic:

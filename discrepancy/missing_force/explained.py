@@ -18,8 +18,8 @@ NO_EFFECTS = Candidate()
 NO_EFFECT_VALUES = np.zeros(0)
 """The effect parameters of the candidate without effects."""
 HIDDEN_SHARE = 0.5
-"""Share of the remaining force that may be hidden along a law of the hypothesis. Without it, the
-intervals of a weaker law contain only 4 of 9 hidden values."""
+"""Share of the unexplained force that may look like a law of the hypothesis. Without it, the
+intervals of a weaker law contain only 4 of 9 true values."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,7 @@
-"""The most probable sizes and correlation times of missing forces, by Newton's method."""
+"""The most probable sizes and correlation times of missing forces, by Newton's method.
+
+The size of a missing force is its standard deviation as a random process.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -33,7 +36,7 @@ MOST_STEPS = 20
 def prior_log_density(median: Processes, processes: Processes) -> float:
     """Return the log prior density of missing forces [nat], up to a constant.
 
-    Size and time of a missing force are lognormal about their medians, and independent.
+    The size and the correlation time of a missing force are independent and log-normal.
 
     Parameters
     ----------
@@ -150,10 +153,10 @@ class ProcessSearch:
         return logs
 
     def _climb(self, logs: FloatArray, most_steps: int) -> tuple[FloatArray, float]:
-        """Return the maximum that Newton's method reaches, as logarithms (P, 2), and its value.
+        """Return the logarithms (P, 2) that Newton's method reaches, and the value there [nat].
 
-        If the number of steps ended the search before the maximum, its result would depend on
-        rounding; the maximum itself does not.
+        `most_steps` should be large enough to reach the maximum. The result of a search that ends
+        before it depends on rounding errors; the maximum does not.
         """
         value = self.log_posterior(logs)
         offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)

@@ -61,8 +61,8 @@ class FittedCandidates:
         uncertain. Hypotheses with a missing force take the recorded variance as exact; with this
         score a simulation can be compared with them.
         """
-        averaged_misfit = self.problem.misfit(fit.squares)
-        recorded_misfit = self.problem.recorded_misfit(fit.squares)
+        averaged_misfit = self.problem.misfit(fit.squares_by_channel)
+        recorded_misfit = self.problem.recorded_misfit(fit.squares_by_channel)
         return self.score(fit) + averaged_misfit - recorded_misfit
 
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
