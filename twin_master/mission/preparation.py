@@ -28,7 +28,7 @@ from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.planning import discounts, expected_plan
 from twin_master.mission.steps import Plant, Truth
 from twin_master.network.belief_planning import DecisionProblem
-from twin_master.network.estimator import Estimator, ExactFilter, Words
+from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
 from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
@@ -171,7 +171,7 @@ class Knowledge:
         inner = self.learning or ExactFilter(self.model, self.sensor_model, self.scenario.mission.name)
         if notice is None:
             return inner
-        words = Words.of(self.scenario)
+        words = NoticeWording.of(self.scenario)
         return WatchfulEstimator(inner, self.sensor_model, self.draws.values, notice, words)
 
     @cached_property

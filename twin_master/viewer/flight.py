@@ -28,7 +28,7 @@ from reporting.arrays import Float
 from reporting.errors import ReportingError
 from reporting.json_file import plain
 from twin_master.errors import RunFolderError, TwinMasterError, said
-from twin_master.learning.expectation import Expected, expected_of, joined
+from twin_master.learning.expectation import Expectation, concatenate_expectations, expectation_of_draws
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt, is_state_believed
@@ -56,7 +56,7 @@ class Belief(NamedTuple):
         Of each state.
     believed : (n,)
         Whether a state is believed; else none explains the sensors.
-    expected : Expected
+    expected : Expectation
         Of sensors and rewards, without quantiles; the reward of the error is NaN where nothing was observed.
     control_probability : (n, U)
         Of a step that was flown: what its next control was decided by. Of a predicted one: p(U).
@@ -64,7 +64,7 @@ class Belief(NamedTuple):
 
     probability: Float
     believed: NDArray[np.bool_]
-    expected: Expected
+    expected: Expectation
     control_probability: Float
 
 
@@ -206,7 +206,7 @@ class Flight:
         return Belief(
             probability=np.concatenate([part.probability for part in parts]),
             believed=np.concatenate([part.believed for part in parts]),
-            expected=joined(part.expected for part in parts),
+            expected=concatenate_expectations(part.expected for part in parts),
             control_probability=np.concatenate([part.control_probability for part in parts]),
         )
 
@@ -223,7 +223,7 @@ class Flight:
             for step, own, seen in zip(steps, joint, self.observed(steps), strict=True):
                 u = slice(step["control_index"], step["control_index"] + 1)
                 parts.append(learns.of_marginals(_learnt(step), own[None, :, u], u, seen))
-            expected = joined(parts)
+            expected = concatenate_expectations(parts)
         believed = np.array([is_state_believed(_unexplained(step)) for step in steps])
         decided = np.array([step["decision_probability"] for step in steps])
         return Belief(filtered, believed, expected, decided)
@@ -248,8 +248,8 @@ def _unexplained(step: Record) -> float:
     return float(step.get("suspicion", {}).get("hypotheses", {}).get("none of these", 0.0))
 
 
-def _expected(known: Knowledge, joint: Float, rows: Float | None) -> Expected:
-    return expected_of(known.sensor_model, known.rewards, joint, rows, quantiles=False)
+def _expected(known: Knowledge, joint: Float, rows: Float | None) -> Expectation:
+    return expectation_of_draws(known.sensor_model, known.rewards, joint, rows, quantiles=False)
 
 
 def _learnt(record: Record) -> dict[str, Learnt]:

@@ -19,7 +19,7 @@ from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError, said
 from twin_master.mission.journal import state_text, step_record
 from twin_master.mission.steps import MissionStep, Reading
-from twin_master.network.estimator import Notice, Words
+from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.clock import Clock
@@ -132,7 +132,7 @@ class Intake:
     """
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: Path | None = None) -> None:
-        self._section, self._words = scenario.watch, Words.of(scenario)
+        self._section, self._words = scenario.watch, NoticeWording.of(scenario)
         self._width = scenario.row_width
         self._feed = feed
         self._rejected, self._kept = rejected, 0
@@ -325,11 +325,11 @@ class Intake:
         came, words = reading.unreadable, self._words
         when = f"{words.step.capitalize()} {self.observation_step}"
         for g in sorted(came.keys() - self._unreadable):
-            sentence = said("watch.left_out", when=when, sensor=words.sensors([g]), came=came[g])
+            sentence = said("watch.left_out", when=when, sensor=words.name_sensors([g]), came=came[g])
             yield Notice("gauge_left_out", sentence, (g + 1,))
         back = {g for g in self._unreadable - came.keys() if not np.isnan(reading.observed[g])}
         for g in sorted(back):
-            sentence = f"{when}: the readings of {words.sensors([g])} are back, and used again."
+            sentence = f"{when}: the readings of {words.name_sensors([g])} are back, and used again."
             yield Notice("gauge_back", sentence, (g + 1,))
         self._unreadable = (self._unreadable | came.keys()) - back
 

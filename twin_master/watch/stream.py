@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from reporting.words import counted, listing
-from twin_master.network.estimator import Notice, Words
+from twin_master.network.estimator import Notice, NoticeWording
 
 REFUSALS_IN_A_ROW = 3
 """Refused messages, with none between them that was taken, of which the operator is told."""
@@ -26,7 +26,7 @@ class StreamNotices:
 
     Parameters
     ----------
-    words : Words
+    words : NoticeWording
         How sentences speak of steps and sensors.
 
     Attributes
@@ -39,7 +39,7 @@ class StreamNotices:
         Why the last of them was refused.
     """
 
-    def __init__(self, words: Words) -> None:
+    def __init__(self, words: NoticeWording) -> None:
         self._words = words
         self._coming: list[Notice] = []  # with the next reading
         self._gap_end = -1  # the step behind the last gap that was told
