@@ -11,7 +11,7 @@ import numpy as np
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
 from twin_master.fleet.posterior import POINTS
-from twin_master.network.kernels import Lists, apply_blocks
+from twin_master.network.kernels import PredecessorLists, apply_blocks
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model, factor_tables
@@ -20,7 +20,12 @@ from twin_master.scenario.schema import Scenario
 
 @compiled
 def _on_points(
-    prior: Float, lists: Lists, probability: Float, control: Index, likelihood: Float, result: Float
+    prior: Float,
+    lists: PredecessorLists,
+    probability: Float,
+    control: Index,
+    likelihood: Float,
+    result: Float,
 ) -> None:
     """Fill result (B, P) with the log evidence of B twins for probabilities (P, non-zeros) of P points.
 
@@ -59,7 +64,7 @@ def why_transitions_are_kept(scenario: Scenario) -> str:
     return ""
 
 
-def _predecessors(scenario: Scenario) -> Lists:
+def _predecessors(scenario: Scenario) -> PredecessorLists:
     """Return the predecessors of the levels of each factor of the state of a scenario."""
     tables = factor_tables(scenario).values()
     return predecessor_lists([np.stack([rows[name] for rows in tables]) for name in scenario.state_names])
@@ -77,7 +82,7 @@ class Worsening:
         One for each probability: the control, and the factor where each has its own.
     assumed : (K,)
         What the scenario assumes.
-    lists : Lists
+    lists : PredecessorLists
         Predecessors of the levels of each factor of the state.
     place : (non-zeros,)
         Number of the probability of each entry of the lists, which is linear in it.
@@ -91,7 +96,7 @@ class Worsening:
 
     names: tuple[str, ...]
     assumed: Float
-    lists: Lists
+    lists: PredecessorLists
     place: Index
     ends: Float
     prior: Float
@@ -101,8 +106,8 @@ class Worsening:
     def kept(cls, scenario: Scenario, reason: str) -> "Worsening":
         """Return none for a scenario whose transitions stay as assumed, for a reason."""
         lists = _predecessors(scenario)
-        ends = np.stack([lists[4], lists[4]])
-        place = np.zeros(len(lists[4]), dtype=np.int64)
+        ends = np.stack([lists.probability, lists.probability])
+        place = np.zeros(len(lists.probability), dtype=np.int64)
         return cls((), np.empty(0), lists, place, ends, build_graphical_model(scenario).prior, reason)
 
     @classmethod
@@ -112,7 +117,7 @@ class Worsening:
         each = {c: entry if isinstance(entry, dict) else {"": entry} for c, entry in given.items()}
         assumed = {(c, name): value for c in scenario.control_names for name, value in each[c].items()}
 
-        def lists_at(probability: float) -> Lists:
+        def lists_at(probability: float) -> PredecessorLists:
             same = {"probability": dict.fromkeys(scenario.control_names, probability)}
             transition = scenario.transition.model_copy(update=same)
             return _predecessors(scenario.model_copy(update={"transition": transition}))
@@ -121,17 +126,17 @@ class Worsening:
         rows = np.array(
             [
                 keys.index((control, name if name in each[control] else ""))
-                for name, levels in zip(scenario.state_names, lists[0].tolist(), strict=True)
+                for name, levels in zip(scenario.state_names, lists.levels.tolist(), strict=True)
                 for control in scenario.control_names
                 for _ in range(levels)
             ]
         )
-        count = (lists[2][1:] - lists[2][:-1]).astype(np.int64)
-        slope = 2.0 * (other[4] - lists[4])
+        count = (lists.start[1:] - lists.start[:-1]).astype(np.int64)
+        slope = 2.0 * (other.probability - lists.probability)
         return cls(
             tuple(f"{control}, {name}" if name else control for control, name in keys),
             np.array([*assumed.values()]), lists, np.repeat(rows, count),
-            lists[4] + slope * [[-0.25], [0.75]], build_graphical_model(scenario).prior,
+            lists.probability + slope * [[-0.25], [0.75]], build_graphical_model(scenario).prior,
         )  # fmt: skip
 
     def probability(self, points: Float) -> Float:

@@ -207,7 +207,7 @@ def _noisier(model: GaussianSensorModel, factor: float, nodes: _Nodes | None = N
         average="inside" if model.averages_inside else "outside",
         model_error=model.model_error,
         interval=model.interval,
-        **model.beside,
+        **model.extra_arguments,
     )
 
 

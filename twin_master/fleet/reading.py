@@ -12,8 +12,8 @@ from reporting.arrays import Float
 from twin_master.fleet.flight import GROUPS, fleet_config
 from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, WITHIN, has_flown, open_group
 from twin_master.mission.preparation import Knowledge, kept_knowledge
-from twin_master.network.belief_planning import leaving_probability
 from twin_master.network.estimator import BELIEVED
+from twin_master.network.simulated_missions import leaving_probability
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
@@ -157,9 +157,9 @@ def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
     keeps = (knowledge.plan.control_index == control).astype(np.float64)
     stays = keeps.copy()
     for _ in range(steps - 1):
-        stays = keeps * transition.expected(control, stays)
+        stays = keeps * transition.expected_value(control, stays)
     if scenario.planner.decide_on == "predicted":
-        stays = transition.expected(control, stays)
+        stays = transition.expected_value(control, stays)
     return np.asarray(np.maximum(1.0 - belief @ stays, 0.0))
 
 

@@ -350,7 +350,7 @@ class FaultFilter:
         # Gauges count by the noise that is learnt. Otherwise a gauge that is off would shift the
         # best fit within the interval of a state, and with it the residuals of all other gauges.
         precision = np.minimum((degrees + count) / (degrees + state.model_squares), 1.0)
-        best_fit = self._sensor_model.nearest(
+        best_fit = self._sensor_model.fit_within_interval(
             readings, control_index, self._value[control_index], precision
         )
         present = ~np.isnan(readings)

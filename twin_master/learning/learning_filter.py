@@ -157,12 +157,12 @@ class LearningFilter:
         the parameter, `transition_factor`, and `noise_scale[g]`, `gauge_gain[g]` and
         `gauge_offset[g]` for the sensors g from 1.
         """
-        sensor_values, log_density_beside = self.sensor_model.apart(observation)
+        sensor_values, log_density_beside = self.sensor_model.split_observation(observation)
         forecast, statistics, count = self._forecast(before)
 
         # Correct the belief.
         inverse_deviation = self._inverse_deviation[:, control_index]
-        best_fit = self.sensor_model.nearest(
+        best_fit = self.sensor_model.fit_within_interval(
             sensor_values,
             control_index,
             self.sensor_model.value_per_draw[:, :, control_index],
@@ -184,8 +184,10 @@ class LearningFilter:
         # Update the regressions. Each gauge is compared with the fit by all other gauges, so that
         # its own noise does not seem smaller than it is.
         if self._gauges.learns:
-            predictive_scale = inverse_deviation * np.sqrt(best_fit.left)
-            readings = GaugeReadings(sensor_values, self._draw, best_fit.alone, predictive_scale)
+            predictive_scale = inverse_deviation * np.sqrt(best_fit.one_minus_leverage)
+            readings = GaugeReadings(
+                sensor_values, self._draw, best_fit.value_by_others, predictive_scale
+            )
             statistics = statistics + self._gauges.expected_products(readings, log_belief)
         count = count + ~np.isnan(sensor_values)
         arrays = {"log_belief": log_belief, "statistics": statistics, "count": count}

@@ -126,7 +126,7 @@ class WatchfulEstimator:
     ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         # Leave out absurd readings.
-        readings, log_density_beside = self._sensor_model.apart(observation)
+        readings, log_density_beside = self._sensor_model.split_observation(observation)
         is_absurd = (readings < self._notices.lowest_plausible[control_index]) | (
             readings > self._notices.highest_plausible[control_index]
         )

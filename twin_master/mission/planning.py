@@ -10,16 +10,12 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError, said
-from twin_master.network.belief_planning import (
-    BeliefPlan,
-    Decide,
-    DecisionProblem,
-    plan_on_belief,
-    simulated_returns,
-)
+from twin_master.network.belief_planning import BeliefPlan, plan_on_belief
+from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy, value_iteration
 from twin_master.network.quantity import RewardModel
+from twin_master.network.simulated_missions import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 

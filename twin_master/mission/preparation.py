@@ -27,13 +27,14 @@ from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.planning import discounts, expected_plan
 from twin_master.mission.steps import Plant, Truth
-from twin_master.network.belief_planning import DecisionProblem
+from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
-from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
+from twin_master.network.observation_classes import observation_classes
+from twin_master.network.planner import BeliefPolicy, PlannedPolicy, evaluate_policy, value_iteration
 from twin_master.network.quantity import RewardModel
-from twin_master.network.sensor_model import GaussianSensorModel, check_noise, observation_classes
+from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
@@ -116,7 +117,7 @@ class Knowledge:
         scenario, policy = self.scenario, self.policy
         basis = self.model.transition, self.planning_reward, discounts(scenario)
         if policy is not None and not isinstance(policy, BeliefPolicy):
-            return given_policy(*basis, self.model.policy(policy))
+            return evaluate_policy(*basis, self.model.policy(policy))
         plan = value_iteration(*basis)
         if policy is None and scenario.planner.policy == "qmdp":
             policy = BeliefPolicy(plan.action_value.T, np.arange(len(scenario.control)))

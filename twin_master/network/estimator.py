@@ -211,17 +211,21 @@ class Estimate:
     @property
     def unexplained(self) -> float:
         """Probability of the hypotheses under which no state is believed."""
-        return sum(hypothesis.probability for hypothesis in self.hypotheses if hypothesis.belief is None)
+        return sum(
+            hypothesis.probability for hypothesis in self.hypotheses if hypothesis.belief is None
+        )
 
 
 class Estimator(Protocol):
-    """What holds the belief of a twin: the exact filter, or one that learns or watches beside it."""
+    """Holds the belief of a twin: the exact filter, or one that learns or watches beside it."""
 
     @property
     def model(self) -> GraphicalModel:
         """States, controls, prior and transitions, with which the twin predicts."""
 
-    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+    def step(
+        self, before: Carried | None, observation: Float, control_index: int, step: int
+    ) -> Estimate:
         """Advance the belief to step t and correct it by an observation.
 
         Parameters
@@ -262,12 +266,16 @@ class ExactFilter:
         The name of the twin, for messages.
     """
 
-    def __init__(self, model: GraphicalModel, sensor_model: SensorModel, name: str = "twin") -> None:
+    def __init__(
+        self, model: GraphicalModel, sensor_model: SensorModel, name: str = "twin"
+    ) -> None:
         self.model = model
         self._sensor_model = sensor_model
         self._name = name
 
-    def step(self, before: Carried | None, observation: Float, control_index: int, step: int) -> Estimate:
+    def step(
+        self, before: Carried | None, observation: Float, control_index: int, step: int
+    ) -> Estimate:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         log_likelihood = self._sensor_model.log_likelihood(observation, control_index)
         previous = None

@@ -213,7 +213,7 @@ def test_filter_and_smoother_equal_arbitrary_precision(seed, scale, steps, shift
     model = random_model(rng, shape=(2, 3), zeros=0.0 if ruled_out else 0.6, product=product)
     assert model.transition.is_product is product
     value, matrix = rng.normal(size=6), model.transition.matrix[1]
-    np.testing.assert_allclose(model.transition.expected(1, value), matrix @ value, atol=1e-14)
+    np.testing.assert_allclose(model.transition.expected_value(1, value), matrix @ value, atol=1e-14)
     control = rng.integers(0, 2, steps)
     log_likelihood = rng.normal(size=(steps, 6)) * scale + shift
     log_likelihood[rng.random(steps) < 0.3] = 0.0
