@@ -159,7 +159,7 @@ class LearntExpectation:
         ]
         return stack_expectations(parts)
 
-    def of_marginals(
+    def from_marginals(
         self,
         learnt: Mapping[str, Learnt],
         joint: Float,

@@ -149,22 +149,35 @@ class FaultFilter:
         return state
 
     def _advance_belief(self, belief: NDArray[Any], control_index: int) -> None:
-        """Advance a belief (..., S) by one transition, in place; rows of zeros stay."""
+        """Advance a belief (..., S) by one transition, in place.
+
+        Rows of zeros stay zero. They are skipped, because most beliefs of gauge faults are zero.
+        """
         rows = belief.reshape(-1, belief.shape[-1])
         is_believed = rows.any(axis=1)
         rows[is_believed] = self._model.transition.forward(control_index, rows[is_believed])
 
     def _begin_gauge_faults(self, state: WatchState, log_begins_now: float) -> None:
-        """Let faults of single gauges begin in this step, and let their gains fade."""
-        shape = self._gauge_belief_shape
+        """Let faults of single gauges begin in this step, and let their gains fade.
+
+        A fault that begins now has the belief and the sums of squares of the model so far.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch; updated in place.
+        log_begins_now : float
+            The log prior probability that a fault begins in this step.
+        """
+        sensors, gains, draws, states = self._gauge_belief_shape
         earlier_weight = faults.mix_in_beginning_faults(
             state.model_belief,
-            state.gauge_belief.reshape(-1, *shape[2:]),
+            state.gauge_belief.reshape(-1, draws, states),
             state.log_gauge_evidence.reshape(-1),
             state.gauge_onset.reshape(-1),
-            log_begins_now - np.log(len(_GAINS)),
+            log_begins_now - np.log(gains),  # each gain with equal probability
             state.step_count,
-        ).reshape(shape[:2])
+        ).reshape(sensors, gains)
         fading = self._fading_per_step()
         state.gauge_sum_cc *= fading * earlier_weight
         state.gauge_sum_cx *= fading * earlier_weight
@@ -174,7 +187,17 @@ class FaultFilter:
         )
 
     def _begin_free_gains(self, state: WatchState, log_begins_now: float) -> None:
-        """Let the fault of free gains begin in this step, and let its gains fade."""
+        """Let the fault that several gauges have unknown gains begin in this step; let gains fade.
+
+        A fault that begins now has the belief and the sums of squares of the model so far.
+
+        Parameters
+        ----------
+        state : WatchState
+            The state of the watch; updated in place.
+        log_begins_now : float
+            The log prior probability that the fault begins in this step.
+        """
         (earlier_weight,) = faults.mix_in_beginning_faults(
             state.model_belief,
             state.free_gains_belief,
@@ -195,7 +218,7 @@ class FaultFilter:
         statistics.sum_cx *= fading * earlier_weight
 
     def _fading_per_step(self) -> float:
-        """Return the factor by which what is known of gains fades in a step."""
+        """Return the factor by which the sums of gains fade in a step, as gains may change."""
         return float(np.exp(-1.0 / self._settings.memory_steps))
 
     def probability_to_begin_after(self, step: float) -> float:
@@ -230,7 +253,9 @@ class FaultFilter:
             self._move_to_recovered(state, right_again)
 
     def _move_to_recovered(self, state: WatchState, right_again: Float) -> None:
-        """Mix beliefs and sums of squares of faults into those of "recovered".
+        """Mix beliefs and sums of squares of ended faults into those of "recovered".
+
+        "Recovered" is the hypothesis that gauges are right again after a fault.
 
         Parameters
         ----------
@@ -240,6 +265,7 @@ class FaultFilter:
             The probability of each fault that it ended or was hidden in this step.
         """
         total = right_again.sum()
+        # Of the probability that gauges are right after a fault, the part that is new.
         fraction_new = min(total * np.exp(-state.weights.log_right_after_fault), 1.0)
         weight = right_again / total
         free_gains_weight = weight[hypothesis_weights.FREE_GAINS_OF_FAULTS]
@@ -257,7 +283,7 @@ class FaultFilter:
 
         # A gauge has the squares of the model, but for the one that was off, or if gains were free.
         squares = state.model_squares.copy()
-        gauge_weight = gauge_weight.reshape(self._gauge_belief_shape[:2])
+        gauge_weight = gauge_weight.reshape(state.gauge_squares.shape)
         squares += np.sum(gauge_weight * (state.gauge_squares - squares[:, None]), axis=1)
         statistics = state.free_gain_statistics
         free_probability = statistics.free_probability
@@ -271,7 +297,7 @@ class FaultFilter:
     def assimilate(
         self, state: WatchState, readings: Float, log_density_beside: Float, control_index: int
     ) -> None:
-        """Correct all hypotheses by an observation.
+        """Correct the beliefs and weights of all hypotheses by an observation.
 
         Parameters
         ----------
@@ -284,26 +310,13 @@ class FaultFilter:
         control_index : int
             The control in force.
         """
-        observation, log_prior_density = self._standardize(
+        observation, log_density_without_residuals = self._standardize(
             state, readings, log_density_beside, control_index
         )
-        degrees = observation.degrees
+        log_recovered = self._update_recovered(state, observation, log_density_without_residuals)
+
         model_squares_before = state.model_squares.copy()
-        recovered_squares_before = state.recovered_squares.copy()
-
-        log_recovered, _ = faults.update_model(
-            observation,
-            state.recovered_squares,
-            state.recovered_belief.reshape(-1),
-            log_prior_density.copy(),
-        )
-        # The constant of the density differs from that of the model by the noise scales.
-        log_scale_ratio = np.log(
-            (degrees + model_squares_before) / (degrees + recovered_squares_before)
-        )
-        log_recovered += 0.5 * np.sum(log_scale_ratio, where=observation.present)
-
-        log_likelihood = log_prior_density.copy()
+        log_likelihood = log_density_without_residuals.copy()
         log_model, kernel = faults.update_model(
             observation, state.model_squares, state.model_belief.reshape(-1), log_likelihood
         )
@@ -327,6 +340,7 @@ class FaultFilter:
                 state.free_gain_statistics,
             )
 
+        # Evidence over that of the model: for alarms, and for the weights of the mixture.
         state.log_gauge_evidence += log_gauges - log_model
         state.log_free_gains_evidence += log_free_gains - log_model
         log_ratio = np.zeros_like(state.weights.current)
@@ -337,13 +351,38 @@ class FaultFilter:
         state.observation_count += observation.present
         state.step_count += 1.0
 
+    def _update_recovered(
+        self,
+        state: WatchState,
+        observation: StandardizedObservation,
+        log_density_without_residuals: Float,
+    ) -> float:
+        """Correct the belief that gauges are right again after a fault; return its log evidence.
+
+        The state of the watch, with the squares of the model before the observation, is updated in
+        place. The log density is (N,), for each pair of a draw and a state.
+        """
+        recovered_squares_before = state.recovered_squares.copy()
+        log_evidence, _ = faults.update_model(
+            observation,
+            state.recovered_squares,
+            state.recovered_belief.reshape(-1),
+            log_density_without_residuals.copy(),
+        )
+        # The constant of the density differs from that of the model by the noise scales.
+        log_scale_ratio = np.log(
+            (observation.degrees + state.model_squares)
+            / (observation.degrees + recovered_squares_before)
+        )
+        return log_evidence + 0.5 * float(np.sum(log_scale_ratio, where=observation.present))
+
     def _standardize(
         self, state: WatchState, readings: Float, log_density_beside: Float, control_index: int
     ) -> tuple[StandardizedObservation, Float]:
         """Return an observation in units of noise, and the part of its density without residuals.
 
-        The latter is (N,), for each pair of a draw and a state. Parameters are those of
-        `assimilate`.
+        That part is the log density (N,) for each pair of a draw and a state, but for the
+        densities of the standardised residuals. Parameters are those of `assimilate`.
         """
         degrees = self._settings.noise_degrees
         count = state.observation_count

@@ -117,7 +117,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
         if isinstance(kept, np.ndarray):
             return model.policy(kept)
         with kept:
-            policy, controls = BeliefPolicy.of(kept), tuple(kept["controls"].tolist())
+            policy, controls = BeliefPolicy.from_arrays(kept), tuple(kept["controls"].tolist())
     except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         # NumPy takes what it does not know for Python objects, and says how to load them unsafely.
         reason = "it is neither NPY nor NPZ" if "pickle" in str(error) else error

@@ -87,7 +87,7 @@ class Knowledge:
             kind = IdentifiedSensorModel
         elif self.scenario.readings:
             kind = partial(InspectedSensorModel, **_readings(self.scenario, self.model))
-        within = self.model.states.within_interval
+        within = self.model.states.change_within_interval
         return kind(
             self.predicted,
             section.standard_deviation,
@@ -292,7 +292,7 @@ def _readings(scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
     coordinates = model.states.coordinates
     within = np.zeros_like(coordinates)
     if scenario.observation.between_levels:
-        within = np.einsum("sff->sf", model.states.within_interval(coordinates))
+        within = np.einsum("sff->sf", model.states.change_within_interval(coordinates))
     return {
         "asked_by": asked_by,
         "reading": coordinates[:, places],
@@ -407,7 +407,7 @@ def kept_knowledge(folder: Path, scenario: Scenario, number: int | None = None) 
                 np.asarray(kept[name], dtype=np.float64) for name in ("predicted", "draws", "policy")
             )
             true = np.asarray(kept["true"], dtype=np.float64) if "true" in kept else None
-            on_belief = BeliefPolicy.of(kept, "belief_") if "belief_control" in kept else None
+            on_belief = BeliefPolicy.from_arrays(kept, "belief_") if "belief_control" in kept else None
         calibration = scenario.calibration
         parameter = ParameterDraws(
             calibration.parameter, draws, float(draws.mean()), float(draws.std()), calibration.source

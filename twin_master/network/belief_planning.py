@@ -56,7 +56,7 @@ class _Bounds:
         self.vectors = np.array(values)  # (N, S)
         self.control = np.arange(controls)  # (N,), the first control of each vector
 
-    def lower(self, rows: Float) -> Float:
+    def lower_bound_at(self, rows: Float) -> Float:
         """Return the lower bound at rows (K, S) of probabilities that need not sum to one: (K,)."""
         return np.asarray((rows @ self.vectors.T).max(axis=1))
 
@@ -75,14 +75,14 @@ class _Bounds:
         discount = self.problem.discount[control]
         return np.asarray(self.problem.reward[:, control] + discount * later)
 
-    def raise_at(self, belief: Float) -> None:
+    def raise_lower_bound_at(self, belief: Float) -> None:
         """Improve the lower bound at a belief (S,)."""
         problem = self.problem
         next_rows = [problem.next_beliefs(belief, u) for u in range(len(problem.discount))]
-        later = np.array([self.lower(rows).sum() for rows in next_rows])
+        later = np.array([self.lower_bound_at(rows).sum() for rows in next_rows])
         action_value = belief @ problem.reward + problem.discount * later
         best = int(np.argmax(action_value))
-        if action_value[best] > self.lower(belief[None])[0] + _LEAST_IMPROVEMENT:
+        if action_value[best] > self.lower_bound_at(belief[None])[0] + _LEAST_IMPROVEMENT:
             vector = self.backup(best, next_rows[best])
             # Vectors that the new one exceeds in every state are not needed any more.
             is_needed = ~np.all(self.vectors <= vector, axis=1)
@@ -111,7 +111,7 @@ class _Bounds:
             rows = self.problem.next_beliefs(belief, control)
             # What is allowed later counts less now.
             gap /= max(float(self.problem.discount[control]), _LEAST_IMPROVEMENT)
-            excess = self.upper.bound_at(rows) - self.lower(rows) - gap * rows.sum(axis=1)
+            excess = self.upper.bound_at(rows) - self.lower_bound_at(rows) - gap * rows.sum(axis=1)
             widest = int(np.argmax(excess))
             if excess[widest] <= 0.0:
                 break
@@ -122,11 +122,11 @@ class _Bounds:
         """Return lower and upper bound at a belief (S,), under a first control if it is given."""
         if first is None:
             rows = belief[None]
-            return float(self.lower(rows)[0]), float(self.upper.bound_at(rows)[0])
+            return float(self.lower_bound_at(rows)[0]), float(self.upper.bound_at(rows)[0])
         rows = self.problem.next_beliefs(belief, first)
         reward = float(belief @ self.problem.reward[:, first])
         discount = float(self.problem.discount[first])
-        lower = reward + discount * float(self.lower(rows).sum())
+        lower = reward + discount * float(self.lower_bound_at(rows).sum())
         upper = reward + discount * float(self.upper.bound_at(rows).sum())
         return lower, upper
 
@@ -178,7 +178,7 @@ def plan_on_belief(
     while upper - lower > gap * max(abs(lower), abs(upper)) and len(visited) < most:
         path = bounds.descend(problem.prior, first, _GAP_OF_DESCENT * (upper - lower))
         for belief in reversed(path):
-            bounds.raise_at(belief)
+            bounds.raise_lower_bound_at(belief)
             bounds.upper.improve_at(belief)
         visited += path
         if not most_beliefs:
@@ -187,7 +187,7 @@ def plan_on_belief(
             next_settling = int(_SETTLING_GROWTH * len(visited))
             bounds.upper.settle()
             for belief in visited * _RAISING_SWEEPS:
-                bounds.raise_at(belief)
+                bounds.raise_lower_bound_at(belief)
         lower, upper = bounds.bounds_at(problem.prior, first)
     beliefs = np.unique(np.array(visited or [problem.prior]), axis=0)
     return BeliefPlan(_policy_at(bounds, beliefs), lower, upper)

@@ -148,7 +148,7 @@ class StateSpace:
         variance = np.einsum("...s,...sf->...f", belief, deviation**2)
         return np.asarray(np.sqrt(variance))
 
-    def within_interval(self, table: ArrayLike) -> Float:
+    def change_within_interval(self, table: ArrayLike) -> Float:
         """Return the change of a table within the interval that each state stands for.
 
         A level stands for the values nearest to it: half way to its neighbours, and to one side

@@ -45,7 +45,7 @@ class BeliefPolicy:
     control: Index
 
     @classmethod
-    def of(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], prefix: str = "") -> "BeliefPolicy":
         """Return the policy in the arrays of a file.
 
         Parameters
@@ -249,7 +249,7 @@ class _DecisionProcess:
     discount: Float
 
     @classmethod
-    def checked(
+    def from_arrays(
         cls, transition: TransitionModel, reward: ArrayLike, discount: ArrayLike
     ) -> "_DecisionProcess":
         """Return the problem with checked rewards (S, U) and discounts, one or (U,).
@@ -355,13 +355,13 @@ class _DecisionProcess:
         ]
         return np.asarray(self.reward + self.discount * np.stack(expected, axis=1))
 
-    def rounding(self, value: Float) -> Float:
+    def rounding_error(self, value: Float) -> Float:
         """Return the rounding error of the returns of controls in each state: (S,)."""
         absolute = replace(self, reward=np.abs(self.reward))
         size_of_terms = absolute.action_value(np.abs(value))
         return np.asarray(_ROUNDING * size_of_terms.max(axis=1))
 
-    def value_of(self, policy: Float, start: Float | None = None) -> Float:
+    def evaluate(self, policy: Float, start: Float | None = None) -> Float:
         """Return the value (S,) of a policy: V = r + gamma P V with its rewards and transitions.
 
         Parameters
@@ -397,15 +397,15 @@ class _DecisionProcess:
         """
         states = np.arange(len(control))
         certain = np.eye(len(self.discount))
-        value = self.value_of(certain[control], start)
+        value = self.evaluate(certain[control], start)
         while True:
             action_value = self.action_value(value)
             gain = action_value.max(axis=1) - action_value[states, control]
-            is_gain_real = gain > self.rounding(value)
+            is_gain_real = gain > self.rounding_error(value)
             better = np.where(is_gain_real, np.argmax(action_value, axis=1), control)
             if np.array_equal(better, control):
                 return control, value
-            better_value = self.value_of(certain[better], value)
+            better_value = self.evaluate(certain[better], value)
             if not better_value.sum() > value.sum():  # an improvement by rounding alone
                 return control, value
             control = better
@@ -457,7 +457,7 @@ def value_iteration(
     """
     if not isinstance(transition, TransitionModel):
         transition = TransitionModel((np.asarray(transition, dtype=np.float64),))
-    problem = _DecisionProcess.checked(transition, reward, discount)
+    problem = _DecisionProcess.from_arrays(transition, reward, discount)
     most_sweeps = max_iterations
     if problem.is_solved:
         most_sweeps = min(max_iterations, _WARM_UP_SWEEPS)
@@ -469,11 +469,11 @@ def value_iteration(
 
     # The first of equally good controls.
     action_value = problem.action_value(value)
-    least = action_value.max(axis=1) - problem.rounding(value)
+    least = action_value.max(axis=1) - problem.rounding_error(value)
     first_of_equals = np.argmax(action_value >= least[:, None], axis=1)
     policy = np.eye(len(problem.discount))[first_of_equals]
     if not np.array_equal(first_of_equals, control):
-        value = problem.value_of(policy, value)
+        value = problem.evaluate(policy, value)
         action_value = problem.action_value(value)
     return PlannedPolicy(value, action_value, policy, iteration.sweeps)
 
@@ -490,6 +490,6 @@ def evaluate_policy(
     policy : (S, U) array
         p(U | D), row-stochastic.
     """
-    problem = _DecisionProcess.checked(transition, reward, discount)
-    value = problem.value_of(policy)
+    problem = _DecisionProcess.from_arrays(transition, reward, discount)
+    value = problem.evaluate(policy)
     return PlannedPolicy(value, problem.action_value(value), policy, iterations=0)

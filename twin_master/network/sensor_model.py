@@ -109,8 +109,8 @@ class GaussianSensorModel(QuantityModel):
         The standard deviation of the predicted value as a fraction of it; zero by default.
     interval : (S, U, G, F) array, optional
         The change of each sensor, SI, if a factor moves by one standard deviation within the
-        interval of the state (`StateSpace.within_interval`). If left out, the true values are
-        exactly at the levels.
+        interval of the state, see `StateSpace.change_within_interval`. If left out, the true values
+        are exactly at the levels.
 
     Raises
     ------

@@ -222,7 +222,7 @@ class Flight:
             parts = []
             for step, own, seen in zip(steps, joint, self.observed(steps), strict=True):
                 u = slice(step["control_index"], step["control_index"] + 1)
-                parts.append(learns.of_marginals(_learnt(step), own[None, :, u], u, seen))
+                parts.append(learns.from_marginals(_learnt(step), own[None, :, u], u, seen))
             expected = concatenate_expectations(parts)
         believed = np.array([is_state_believed(_unexplained(step)) for step in steps])
         decided = np.array([step["decision_probability"] for step in steps])
@@ -238,7 +238,7 @@ class Flight:
         if learns is None:
             expected = _expected(known, joint, None)
         else:
-            expected = learns.of_marginals(_learnt(step), joint, slice(None), None)
+            expected = learns.from_marginals(_learnt(step), joint, slice(None), None)
         believed = np.full(len(coming), is_state_believed(none))
         return Belief(coming, believed, expected, joint.sum(axis=-2))
 

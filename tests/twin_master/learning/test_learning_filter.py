@@ -273,7 +273,7 @@ def test_a_parameter_known_by_its_moments_stands_a_deviation_to_either_side():
     joint[0, 1, 1] = 1.0
     told = {"e": Learnt(1.0, 0.05, 0.9, 1.1)}  # half way between draws on both sides
     expectation = LearntExpectation(learner, rewards, np.full((3, 2), 0.5))
-    found = expectation.of_marginals(told, joint, slice(None), None)
+    found = expectation.from_marginals(told, joint, slice(None), None)
     value, weight = sensor.value_per_draw[:, 1, 1], np.array([0.25, 0.25, 0.5])
     np.testing.assert_allclose(found.mean[0], weight @ value, rtol=1e-12)
     spread = np.sqrt(weight @ (value - weight @ value) ** 2)
