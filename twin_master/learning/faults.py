@@ -143,7 +143,7 @@ def mix_in_beginning_faults(
     earlier_weight = np.exp(log_evidence - total)
     log_evidence[:] = total
     onset[:] = earlier_weight * onset + (1.0 - earlier_weight) * step
-    earlier = earlier_weight[:, None, None].astype(np.float32)
+    earlier = earlier_weight[:, None, None].astype(np.float32)  # as precise as the beliefs
     fault_belief[:] = earlier * fault_belief + (1.0 - earlier) * model_belief.astype(np.float32)
     return np.asarray(earlier_weight)
 

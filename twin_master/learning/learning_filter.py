@@ -218,7 +218,7 @@ class LearningFilter:
         control = self._first_control + before.control_index
         forecast = log_forecast(self._transition, control, before.arrays["log_belief"])
         if self.parameter is None:
-            forecast = self._with_prior_draw_weights(forecast)
+            forecast = self._restore_draw_weights(forecast)
         return forecast, before.arrays["statistics"], before.arrays["count"]
 
     def hypotheses(self, carried: Carried, weight: Float | None = None) -> StaticHypotheses:
@@ -267,7 +267,7 @@ class LearningFilter:
             return result
         log_belief = np.array([step.arrays["log_belief"] for step in carried])  # (n, K, S)
         if self.parameter is None and len(self._draw) > 1:
-            log_belief = np.stack([self._with_prior_draw_weights(row) for row in log_belief])
+            log_belief = np.stack([self._restore_draw_weights(row) for row in log_belief])
 
         # Given its hypothesis each filter is smoothed by itself; the weights are those of the end.
         weight = np.exp(log_belief[-1]).sum(axis=1)
@@ -284,8 +284,8 @@ class LearningFilter:
         result[:, possible] = weight[possible, None] * smoothed.swapaxes(0, 1)
         return result
 
-    def _with_prior_draw_weights(self, log_belief: Float) -> Float:
-        """Return a log belief (K, S) in which the draws have their prior weights in every state.
+    def _restore_draw_weights(self, log_belief: Float) -> Float:
+        """Give the draws of a log belief (K, S) their prior weights again, in every state.
 
         The weights of the transition factors stay as they are.
         """

@@ -127,35 +127,34 @@ class WatchfulEstimator:
         """Advance the belief to step t and correct it by an observation, see `Estimator.step`."""
         # Leave out absurd readings.
         readings, log_density_beside = self._sensor_model.split_observation(observation)
-        is_absurd = (readings < self._notices.lowest_plausible[control_index]) | (
-            readings > self._notices.highest_plausible[control_index]
-        )
+        is_absurd = self._notices.is_absurd(readings, control_index)
         used_readings = np.where(is_absurd, np.nan, readings)
+        # What follows the sensors in an observation, such as readings of inspections, is kept.
         used_observation = np.append(used_readings, observation[len(used_readings) :])
         estimate = self._inner.step(before, used_observation, control_index, step)
 
-        # Advance and correct the hypotheses.
+        # Advance and correct the hypotheses about the gauges.
         if before is not None and self._continues(before):
             state = self._faults.advance(before, control_index)
         else:
             state = self._faults.start(estimate.forecast, control_index)
         self._faults.assimilate(state, used_readings, log_density_beside, control_index)
 
-        # Tell what is noticed.
-        notices = self._notices.notices_of_absurd_readings(
+        # Report what is noticed.
+        notices = self._notices.report_absurd_readings(
             state.left_out, is_absurd, readings, control_index, step
         )
         # A gauge that is left out stays so while it is silent.
         state.left_out = is_absurd | (state.left_out & np.isnan(readings))
         suspicion = self._suspicion(state)
-        notices += self._notices.alarms(state, suspicion, step)
+        notices += self._notices.raise_alarms(state, suspicion, step)
         beliefs = HypothesisBeliefs(estimate.filtered, state.recovered_belief, state.gauge_belief)
         hypotheses = hypothesis_weights.list_hypotheses(
             state.weights, beliefs, self._notices.hypothesis_names
         )
-        notices += self._notices.notices_of_followed_hypothesis(state, hypotheses, step)
+        notices += self._notices.report_followed_hypothesis(state, hypotheses, step)
 
-        # Mix the beliefs.
+        # Mix the beliefs of the hypotheses by their weights.
         mixed = hypothesis_weights.mix_beliefs(state.weights, beliefs)
         state.belief = mixed.belief
         state.competing_belief = mixed.competing
@@ -178,7 +177,8 @@ class WatchfulEstimator:
     def _suspicion(self, state: WatchState) -> Suspicion:
         """Return how well the model explains the sensors so far.
 
-        The evidence of a fault contains that it begins later, under which the model holds so far.
+        A fault that has not begun yet predicts what the model predicts. So its evidence over the
+        model contains, with the ratio one, the prior probability that it begins later.
         """
         log_to_begin = np.log(self._faults.probability_to_begin_after(state.step_count - 1.0))
         log_begun = np.logaddexp.reduce(state.log_gauge_evidence, axis=1)

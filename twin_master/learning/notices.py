@@ -52,7 +52,13 @@ class NoticeWriter:
     highest_plausible: Float
     hypothesis_names: tuple[str, ...]
 
-    def notices_of_absurd_readings(
+    def is_absurd(self, readings: Float, control_index: int) -> NDArray[np.bool_]:
+        """Return which readings (G,) no state can plausibly cause under a control; NaN is not."""
+        is_too_low = readings < self.lowest_plausible[control_index]
+        is_too_high = readings > self.highest_plausible[control_index]
+        return np.asarray(is_too_low | is_too_high)
+
+    def report_absurd_readings(
         self,
         was_left_out: NDArray[np.bool_],
         is_absurd: NDArray[np.bool_],
@@ -83,7 +89,7 @@ class NoticeWriter:
             notices.append(Notice("gauge_back", sentence, (g + 1,), float(readings[g])))
         return notices
 
-    def notices_of_followed_hypothesis(
+    def report_followed_hypothesis(
         self, state: WatchState, hypotheses: Sequence[Hypothesis], step: int
     ) -> list[Notice]:
         """Return a notice if belief and decision follow another hypothesis than before.
@@ -97,9 +103,9 @@ class NoticeWriter:
             followed = -1
         else:
             followed = self.hypothesis_names.index(best.name) + 1
-        if best.probability <= 0.5 or followed == state.followed:
+        if best.probability <= 0.5 or followed == state.followed_hypothesis:
             return []
-        state.followed = followed
+        state.followed_hypothesis = followed
 
         sensors = f"{self.wording.sensor}s"
         probability = f"(probability {best.probability:.3g})"
@@ -120,7 +126,7 @@ class NoticeWriter:
         sentence = f"{self._step_text(step)}: {sentence}"
         return [Notice("hypothesis", sentence, numbers, best.probability)]
 
-    def alarms(self, state: WatchState, suspicion: Suspicion, step: int) -> list[Notice]:
+    def raise_alarms(self, state: WatchState, suspicion: Suspicion, step: int) -> list[Notice]:
         """Return the alarms that are raised in this step; the state remembers them.
 
         A gauge that is off also raises the evidence of free gains, and a region that softens raises

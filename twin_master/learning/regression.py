@@ -56,7 +56,10 @@ class GaugeReadings(NamedTuple):
 
 
 class RegressionSums(NamedTuple):
-    """Sums of products over all observations, each (K, G), with a, c and x of the module.
+    """Sums of products over all observations, each (K, G).
+
+    Of a gauge, x is the standardised residual, and a and c are the changes of its standardised
+    value by one prior standard deviation of offset and gain: `cx` is the sum of c x.
 
     An array (K, G, 6) holds them in this order along its last axis.
     """
@@ -235,6 +238,9 @@ def _add_log_densities(
 ) -> None:
     """Add the factors of the predictive density that depend on the state to result (K, S).
 
+    Of a gauge, x is the standardised residual that the fitted offset and gain leave, and a and c
+    are the changes of its standardised value by one prior standard deviation of offset and gain.
+
     A logarithm is what costs time here. So the factors of gauges whose densities have the same
     power are multiplied, and the logarithm is taken of the product.
     """
@@ -284,7 +290,11 @@ def _add_expected_products(
     log_weight: Float,
     sums: RegressionSums,
 ) -> None:
-    """Add the products of a, c and x of each gauge, expected over the state, to sums (K, G)."""
+    """Add the products of a, c and x of each gauge, expected over the state, to sums (K, G).
+
+    Of a gauge, x is the standardised residual, and a and c are the changes of its standardised
+    value by one prior standard deviation of offset and gain.
+    """
     observation, draw, prediction, inverse_deviation = readings
     weight = np.empty(log_weight.shape[1])
     for k in range(len(draw)):

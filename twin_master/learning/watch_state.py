@@ -55,7 +55,7 @@ class WatchState:
         Whether the alarm of a kind of fault has been raised.
     left_out : (G,) array of bool
         Whether the last reading of a gauge was absurd.
-    followed : int
+    followed_hypothesis : int
         The hypothesis that belief and decision follow: 0 is the model, -1 free gains, and g > 0 is
         gauge g, counted from 1.
     belief, competing_belief : (S,) array
@@ -84,7 +84,7 @@ class WatchState:
     gauge_alarm_raised: bool
     free_gains_alarm_raised: bool
     left_out: NDArray[np.bool_]
-    followed: int
+    followed_hypothesis: int
     belief: Float = field(default_factory=lambda: np.empty(0))
     competing_belief: Float = field(default_factory=lambda: np.empty(0))
     model_weight: float = 1.0
@@ -134,7 +134,7 @@ class WatchState:
             gauge_alarm_raised=False,
             free_gains_alarm_raised=False,
             left_out=np.zeros(sensors, dtype=bool),
-            followed=0,
+            followed_hypothesis=0,
         )
 
     def as_arrays(self, model_key: Unsigned) -> CarriedArrays:
@@ -168,7 +168,7 @@ class WatchState:
                 [float(self.gauge_alarm_raised), float(self.free_gains_alarm_raised)]
             ),
             "left_out": self.left_out.astype(np.float64),
-            "leading": np.array([float(self.followed)]),
+            "leading": np.array([float(self.followed_hypothesis)]),
             "belief": self.belief,
             "rivals": self.competing_belief,
             "right": np.array([self.model_weight]),
@@ -215,7 +215,7 @@ class WatchState:
             gauge_alarm_raised=bool(gauge_alarm_raised),
             free_gains_alarm_raised=bool(free_gains_alarm_raised),
             left_out=stored["left_out"] > 0.0,
-            followed=int(stored["leading"][0]),
+            followed_hypothesis=int(stored["leading"][0]),
             belief=stored["belief"],
             competing_belief=stored["rivals"],
             model_weight=float(stored["right"][0]),

@@ -8,7 +8,6 @@ under u_t. Hence D_t follows D_{t-1} through u_{t-1}, and the first state follow
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,7 +43,7 @@ class Filtered:
     log_filtered: Float
     log_evidence: Float
 
-    def __getitem__(self, index: Any) -> "Filtered":
+    def __getitem__(self, index: int | slice | tuple[int | slice, ...]) -> "Filtered":
         """Return the beliefs at an index of the leading axes."""
         return Filtered(
             forecast=np.asarray(self.forecast[index]),

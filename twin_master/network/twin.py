@@ -229,7 +229,7 @@ class Twin:
         self.lag = lag
         # The present step, `lag` steps before it, and the step from which the first of these came.
         most_kept = None if lag is None else lag + 2
-        self._kept: deque[_KeptStep] = deque(maxlen=most_kept)
+        self._kept_steps: deque[_KeptStep] = deque(maxlen=most_kept)
         self._steps = 0
         self._proposed = self._index_of(first_control)
         self._safest: Float | None = None
@@ -262,7 +262,7 @@ class Twin:
     @property
     def _first_in_memory(self) -> int:
         """The number of the first kept step, which may lie one before `first_kept`."""
-        return self._steps - len(self._kept)
+        return self._steps - len(self._kept_steps)
 
     def step(self, observation: ArrayLike, control: int | str | None = None) -> TwinStep:
         """Advance by one step, correct by an observation, predict and decide.
@@ -339,7 +339,7 @@ class Twin:
             The observation and the control in force of each step.
         """
         steps_before = first - self._first_in_memory
-        before = self._kept[steps_before - 1].carried if steps_before else None
+        before = self._kept_steps[steps_before - 1].carried if steps_before else None
         new_steps: list[_KeptStep] = []
         notices: list[Notice] = []
         for step, (observation, control_index) in enumerate(rows, start=first):
@@ -348,19 +348,19 @@ class Twin:
             new_steps.append(_KeptStep(observation, before))
             notices += estimate.notices
         # From here on nothing fails, so that a refused observation leaves the twin unchanged.
-        for _ in range(len(self._kept) - steps_before):
-            self._kept.pop()
-        self._kept.extend(new_steps)
+        for _ in range(len(self._kept_steps) - steps_before):
+            self._kept_steps.pop()
+        self._kept_steps.extend(new_steps)
         self._steps = first + len(rows)
         return self._decide(replace(estimate, notices=tuple(notices)))
 
     def observed(self, step: int) -> Float:
         """Return what was observed in a kept step: (G,), NaN where nothing was received."""
-        return self._kept[step - self._first_in_memory].observation
+        return self._kept_steps[step - self._first_in_memory].observation
 
     def control_of(self, step: int) -> int:
         """Return the index of the control in force in a kept step."""
-        return self._kept[step - self._first_in_memory].carried.control_index
+        return self._kept_steps[step - self._first_in_memory].carried.control_index
 
     def predict(self, belief: ArrayLike, control: int | str, steps: int | None = None) -> Predicted:
         """Predict through the policy from any belief (S,) under a control in force: (37)-(39)."""
@@ -381,7 +381,7 @@ class Twin:
 
     def save_state(self) -> bytes:
         """Return everything that the twin keeps, for `restore_state`."""
-        return self._state_of(self._steps, self._kept)
+        return self._state_of(self._steps, self._kept_steps)
 
     def settled(self) -> tuple[int, bytes] | None:
         """Return the last step that cannot be revised any more, and the state after it.
@@ -392,7 +392,7 @@ class Twin:
         step = self.first_kept - 1
         if step < 0:
             return None
-        return step, self._state_of(step + 1, [self._kept[0]])
+        return step, self._state_of(step + 1, [self._kept_steps[0]])
 
     def _state_of(self, steps: int, kept_steps: Iterable[_KeptStep]) -> bytes:
         """Return the state after a number of steps, with some of them kept."""
@@ -424,12 +424,12 @@ class Twin:
                 kept_steps.append(_kept_step_from_arrays(arrays, len(kept_steps)))
         self._steps = steps
         self._proposed = proposed
-        self._kept.clear()
-        self._kept.extend(kept_steps)
+        self._kept_steps.clear()
+        self._kept_steps.extend(kept_steps)
 
     def _smoothed_steps(self) -> list[_KeptStep]:
         """Return the kept steps over which the twin smooths."""
-        kept_steps = list(self._kept)
+        kept_steps = list(self._kept_steps)
         return kept_steps if self.lag is None else kept_steps[-(self.lag + 1) :]
 
     def _estimate(

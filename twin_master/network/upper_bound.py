@@ -285,12 +285,13 @@ class UpperBound:
         for _ in range(_PASSES):
             rows = self._compose_next_rows(corner_states)
             for _ in range(_SWEEPS):
+                # Bound of all next beliefs, with the compositions as they are; then of all beliefs.
                 drop = self._drop.ravel()[rows.belief_and_control]
                 bound = rows.corner_bound + np.einsum("kup,kup->ku", rows.weight, drop)
                 later = np.add.reduceat(bound.max(axis=1), rows.first_row)
                 later = later.reshape(-1, controls)
                 self._value = np.minimum(self._value, reward + problem.discount * later)
-                # Beliefs at corners lower the bound of the corners.
+                # A belief at a corner is a bound of that corner, and so of rows that contain it.
                 corner_value = self._value[corner_beliefs].T
                 lowering = np.minimum(corner_value - self._corner[:, corner_states], 0.0)
                 self._corner[:, corner_states] += lowering
