@@ -18,7 +18,7 @@ from reporting.progress import Progress, SilentProgress
 from twin_master.assets.asset_source import Asset
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError, said
-from twin_master.fleet.flight import source_of
+from twin_master.fleet.checks import source_of
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.steps import Plant, decided_to_end
 from twin_master.scenario.reading import LoadedScenario, load_scenario
@@ -115,9 +115,9 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self._seed = int(self.np_random.integers(2**31)) if seed is None else seed
         if getattr(self.scenario.asset, "seeds", ()):  # chance of its own, which begins with it
             self._let_go()
-            scenario = self.scenario.under(self._seed)
+            scenario = self.scenario.with_seed(self._seed)
             source = scenario.asset.source(scenario)
-            source.use(self._folder)
+            source.use_prepared_folder(self._folder)
             self._asset = source.open()
         else:
             self._asset.restore_state(self._start)

@@ -86,7 +86,7 @@ def _without(knowledge: "parts.Knowledge", names: Sequence[str]) -> "parts.Knowl
     levels = np.abs(knowledge.model.states.coordinates).max()
     unread = {"standard_deviation": _BLIND * (1.0 + levels)}
     actions = tuple(a.model_copy(update=unread if a.name in names else {}) for a in scenario.action)
-    bare = scenario.having("observation", standard_deviation=tuple(blind.tolist()))
+    bare = scenario.with_changes("observation", standard_deviation=tuple(blind.tolist()))
     return replace(knowledge, scenario=bare.model_copy(update={"action": actions}))
 
 

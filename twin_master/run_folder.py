@@ -225,7 +225,7 @@ def begun_folder(
         "provenance": collect_provenance(resolved.mission.seed).as_dict(),
     }
     with create_run_folder(folder, config, files, replace=replace):
-        yield config, resolved.portable().moved(folder)
+        yield config, resolved.portable().with_paths_from(folder)
 
 
 @contextmanager
@@ -254,7 +254,7 @@ def resumed_folder(folder: Path, loaded: LoadedScenario | None) -> Held:
         there = {"folder": folder, "does": does, "other": other}
         raise NotResumableError(said("mission.another", **there, path=loaded.path))
     with closing_lock(lock_run_folder(folder)):
-        yield config, scenario.moved(folder)
+        yield config, scenario.with_paths_from(folder)
 
 
 def restore(folder: Path, progress: Progress) -> None:

@@ -17,7 +17,7 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
-from twin_master.assets.asset_source import AssetSource, calibrated_with, shown_without_noise
+from twin_master.assets.asset_source import AssetSource, calibration_sentence, noise_free_observations
 from twin_master.assets.resolution import (
     Overrides,
     asset_source,
@@ -33,8 +33,9 @@ from twin_master.mission.preparation import Knowledge, keep_knowledge, prepare_k
 from twin_master.mission.steps import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.consistency import WATCHED_KIND
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.scenario.schema import WATCHED_KIND, Scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import another_truth
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
@@ -210,7 +211,7 @@ def _known(
         sentence = another_truth(draws.name, truth, draws.mean, draws.standard_deviation)
         if sentence is not None:
             progress.note(said("mission.truth", sentence=sentence, name=draws.name))
-    told = calibrated_with(draws.record or {}, origin.asset, origin.model, config["inputs"])
+    told = calibration_sentence(draws.record or {}, origin.asset, origin.model, config["inputs"])
     if told is not None:
         progress.note(told)
     keep_knowledge(folder, knowledge)
@@ -257,7 +258,7 @@ def _misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
     if not source.origin.differ or knowledge.scenario.truth.kind == "asset":
         return None
     with closing(source.open()) as asset:
-        shown = shown_without_noise(knowledge.scenario, knowledge.model.states.coordinates, asset)
+        shown = noise_free_observations(knowledge.scenario, knowledge.model.states.coordinates, asset)
     shown[shown == 0.0] = np.nan
     return np.asarray((knowledge.sensor_model.mean - shown) / shown)
 
@@ -316,7 +317,7 @@ def check_scenario(
     watched = scenario.asset.kind == WATCHED_KIND
     source = believed_source(scenario) if watched else asset_source(scenario)
     source.check()
-    origin, mission, (drawn, draws) = source.origin, scenario.mission, source.uncertain()
+    origin, mission, (drawn, draws) = source.origin, scenario.mission, source.draw_summary()
     levels = {factor.name: len(factor.levels) for factor in scenario.state}
     return {
         "name": mission.name,

@@ -240,7 +240,7 @@ class Knowledge:
         true = self.scenario.truth.probability
         if not true:
             return self.model
-        return build_graphical_model(self.scenario.having("transition", probability=true))
+        return build_graphical_model(self.scenario.with_changes("transition", probability=true))
 
     def truth(self, seed: int) -> Truth:
         """Return what really happens under a seed."""

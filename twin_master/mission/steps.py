@@ -260,7 +260,7 @@ class Truth:
         for fault in scenario.truth.sensor_faults:
             last = fault.last_step if fault.last_step is not None else scenario.mission.steps
             active = (steps >= fault.first_step) & (steps <= last)
-            cells = np.ix_(active, np.array(fault.places(scenario.observation.count)))
+            cells = np.ix_(active, np.array(fault.sensor_indices(scenario.observation.count)))
             if fault.kind == "dropout":
                 self.status[cells] = SensorStatus.LOST
             else:

@@ -120,12 +120,12 @@ def _truth(scenario: Scenario, name: str) -> Float | None:
             return None  # noise and model error have one scale, and the error is no noise
         scale = np.asarray(truth.noise.standard_deviation) / np.asarray(observation.standard_deviation)
         return np.broadcast_to(scale, (observation.count,)).copy()
-    if scenario.another_model:
+    if scenario.models_differ:
         return None
     healthy = np.zeros(observation.count)
     for fault in truth.sensor_faults:
         if fault.kind == "drift":
-            healthy[fault.places(observation.count)] = np.nan
+            healthy[fault.sensor_indices(observation.count)] = np.nan
     return healthy
 
 

@@ -13,8 +13,9 @@ from reporting.table_file import table_text
 from twin_master.learning.expectation import concatenate_expectations
 from twin_master.mission.loop import expected_in
 from twin_master.mission.steps import SensorStatus, Truth
+from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.schema import REWARD_NAMES
-from twin_master.scenario.section import ObservationSection, printed_state
+from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
 Words = Mapping[str, str]
