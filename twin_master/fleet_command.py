@@ -1,7 +1,6 @@
 """`uav-twin fleet`, and `uav-twin run --seeds`; the process behind `--view` of all commands."""
 
 import json
-import multiprocessing
 import os
 import signal
 import sys
@@ -10,13 +9,23 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from reporting import terminal
+from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
+from reporting.former_options import accepts_former_options
 from twin_master import parts
+from twin_master.command_options import (
+    CertificateOption,
+    ClusterOption,
+    FleetFolderOption,
+    FleetSeedOption,
+    ViewOption,
+    WorkersOption,
+)
 from twin_master.errors import TwinMasterError
 
 WORDS = "twin_master.fleet"
@@ -25,15 +34,35 @@ ROWS = 20
 """Assets that the table on the console shows, the worst first."""
 
 
+@accepts_former_options(steps="--turns")
 def watch(
-    file: Path,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            show_default=False,
+            help="The fleet file, its groups with `observations`.",
+        ),
+    ],
     *,
-    out: Path | None = None,
-    seed: int | None = None,
-    follow: bool = False,
-    steps: int | None = None,
-    ca_file: Path | None = None,
-    view: bool = False,
+    out: FleetFolderOption = None,
+    seed: FleetSeedOption = None,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow",
+            help="Wait for more at the end of CSV files, and for new files.",
+        ),
+    ] = False,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            "--steps",
+            min=0,
+            help="Leave an asset alone after so many steps.",
+        ),
+    ] = None,
+    ca_file: CertificateOption = None,
+    view: ViewOption = False,
 ) -> None:
     """Watch many real assets: observations in, a decision for each step of each asset out, as a line of JSON.
 
@@ -42,6 +71,8 @@ def watch(
     On a terminal a table shows the worst assets in the place of decisions.
 
     Ctrl-C ends it in order; the command repeated goes on.
+
+    Example: `uav-twin fleet watch fleet.toml --follow`
     """
     fleet = parts.load_fleet(file, seed)
     folder = out if out is not None else Path("runs") / fleet.head.name
@@ -131,26 +162,60 @@ def _watched_table(standing: Mapping[str, Any]) -> "parts.Table":
 
 
 def run(
-    file: Path,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            show_default=False,
+            help="The fleet file.",
+        ),
+    ],
     *,
-    out: Path | None = None,
-    seed: int | None = None,
-    workers: int | None = None,
-    cluster: str | None = None,
-    replace: bool = False,
-    no_report: bool = False,
-    json: bool = False,
+    out: FleetFolderOption = None,
+    seed: FleetSeedOption = None,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace",
+            help="Replace another fleet in the folder.",
+        ),
+    ] = False,
+    no_report: NoReportOption = False,
+    json: JsonOption = False,
 ) -> None:
-    """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped."""
+    """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped.
+
+    Example: `uav-twin fleet run fleet.toml --workers 2`
+    """
     found = parts.load_fleet(file, seed)
     engine = engine_of(workers, cluster)
     fly_and_show(found, out, engine, replace=replace, report=not no_report, json=json)
 
 
 def learn(
-    folder: Path, *, out: Path = Path("learnt.toml"), no_report: bool = False, json: bool = False
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            show_default=False,
+            help="The folder of the fleet.",
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            help="The file to write.",
+        ),
+    ] = Path("learnt.toml"),
+    no_report: NoReportOption = False,
+    json: JsonOption = False,
 ) -> None:
-    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
+    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ.
+
+    Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
+    """
     record = parts.learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _report(folder)
@@ -192,8 +257,21 @@ def _report(folder: Path) -> None:
         parts.write_fleet_report(folder)
 
 
-def compare(folders: list[Path], *, json: bool = False) -> None:
-    """Show the figures of several fleets or ensembles side by side."""
+def compare(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(
+            show_default=False,
+            help="Folders of fleets or ensembles.",
+        ),
+    ],
+    *,
+    json: JsonOption = False,
+) -> None:
+    """Show the figures of several fleets or ensembles side by side.
+
+    Example: `uav-twin compare runs/fleet runs/other_fleet`
+    """
     figures = _figures(folders)
     terminal.answer(
         "compare", WORDS, figures, json=json, rows=parts.figure_rows(figures), groups=list(figures)
@@ -235,6 +313,8 @@ def shown(wanted: bool, server: Server | None = None) -> Iterator[Callable[[Path
     if not wanted:
         yield lambda _folder: None
         return
+    import multiprocessing
+
     process: multiprocessing.process.BaseProcess | None = None
 
     def begin(folder: Path) -> None:
