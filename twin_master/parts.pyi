@@ -52,7 +52,7 @@ from twin_master.mission.sensor_design import drawn_readings as drawn_readings
 from twin_master.mission.sensor_design import separations as separations
 from twin_master.mission.sensor_design import with_candidates as with_candidates
 from twin_master.network.belief_planning import BeliefPlan as BeliefPlan
-from twin_master.network.belief_planning import DecisionProblem as DecisionProblem
+from twin_master.network.decision_problem import DecisionProblem as DecisionProblem
 from twin_master.report.planning import design_figure as design_figure
 from twin_master.report.planning import plan_figure as plan_figure
 from twin_master.report.structure import gauge_places as gauge_places

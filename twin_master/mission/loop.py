@@ -22,7 +22,7 @@ from twin_master.errors import (
     TwinMasterError,
     said,
 )
-from twin_master.learning.expectation import Expected, expected_of, joined
+from twin_master.learning.expectation import Expectation, concatenate_expectations, expectation_of_draws
 from twin_master.mission.journal import (
     JournalFile,
     array_of,
@@ -105,7 +105,9 @@ def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
     return told
 
 
-def expected_in(history: History, knowledge: Knowledge, name: str, belief: Float) -> tuple[Expected, Float]:
+def expected_in(
+    history: History, knowledge: Knowledge, name: str, belief: Float
+) -> tuple[Expectation, Float]:
     """Return what is expected in the steps of a history, and the probability of each control there.
 
     Parameters
@@ -127,7 +129,7 @@ def expected_in(history: History, knowledge: Knowledge, name: str, belief: Float
         rows, more = history.row, (history.observed,)
         joint = known_control(belief, history.control_index, len(knowledge.model.controls))
     if learns is None:
-        expected = expected_of(knowledge.sensor_model, knowledge.rewards, joint, rows)
+        expected = expectation_of_draws(knowledge.sensor_model, knowledge.rewards, joint, rows)
     else:
         carried = [step.concluded.carried for step in history.steps]
         expected = getattr(learns, name)(carried, belief, *more)
@@ -151,7 +153,7 @@ def gap_of(history: History, from_step: int, models: "Sequence[BelievedModel]") 
     if not left.steps or np.isnan(left.observed).all():
         return {"rms_residual": None, "log_evidence": None}
     parts = [(known, replace(left, steps=left.steps[part])) for known, part in spans_of(left, models)]
-    expected = joined(
+    expected = concatenate_expectations(
         expected_in(own, known, "filtered", own.filtered)[0] for known, own in parts if own.steps
     )
     residual = (left.observed - expected.mean) / expected.noise

@@ -10,16 +10,12 @@ from numpy.typing import ArrayLike
 
 from reporting.arrays import Float, Index
 from twin_master.errors import PlanningError, said
-from twin_master.network.belief_planning import (
-    BeliefPlan,
-    Decide,
-    DecisionProblem,
-    plan_on_belief,
-    simulated_returns,
-)
+from twin_master.network.belief_planning import BeliefPlan, plan_on_belief
+from twin_master.network.decision_problem import DecisionProblem
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.planner import BeliefPolicy, value_iteration
 from twin_master.network.quantity import RewardModel
+from twin_master.network.simulated_missions import Decide, simulated_returns
 from twin_master.scenario.schema import Scenario
 from twin_master.seeds import generator
 
@@ -121,7 +117,7 @@ def read_policy(path: Path, model: GraphicalModel) -> Float | BeliefPolicy:
         if isinstance(kept, np.ndarray):
             return model.policy(kept)
         with kept:
-            policy, controls = BeliefPolicy.of(kept), tuple(kept["controls"].tolist())
+            policy, controls = BeliefPolicy.from_arrays(kept), tuple(kept["controls"].tolist())
     except (OSError, EOFError, ValueError, KeyError, AttributeError, zipfile.BadZipFile) as error:
         # NumPy takes what it does not know for Python objects, and says how to load them unsafely.
         reason = "it is neither NPY nor NPZ" if "pickle" in str(error) else error

@@ -27,13 +27,14 @@ from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.monitor import WatchfulEstimator
 from twin_master.mission.planning import discounts, expected_plan
 from twin_master.mission.steps import Plant, Truth
-from twin_master.network.belief_planning import DecisionProblem
-from twin_master.network.estimator import Estimator, ExactFilter, Words
+from twin_master.network.decision_problem import DecisionProblem
+from twin_master.network.estimator import Estimator, ExactFilter, NoticeWording
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.identified import IdentifiedSensorModel, InspectedSensorModel
-from twin_master.network.planner import BeliefPolicy, PlannedPolicy, given_policy, value_iteration
+from twin_master.network.observation_classes import observation_classes
+from twin_master.network.planner import BeliefPolicy, PlannedPolicy, evaluate_policy, value_iteration
 from twin_master.network.quantity import RewardModel
-from twin_master.network.sensor_model import GaussianSensorModel, check_noise, observation_classes
+from twin_master.network.sensor_model import GaussianSensorModel, check_noise
 from twin_master.network.twin import Planner, Twin, build_graphical_model
 from twin_master.scenario.reading import LoadedScenario, load_scenario
 from twin_master.scenario.schema import Scenario
@@ -86,7 +87,7 @@ class Knowledge:
             kind = IdentifiedSensorModel
         elif self.scenario.readings:
             kind = partial(InspectedSensorModel, **_readings(self.scenario, self.model))
-        within = self.model.states.within_interval
+        within = self.model.states.change_within_interval
         return kind(
             self.predicted,
             section.standard_deviation,
@@ -116,7 +117,7 @@ class Knowledge:
         scenario, policy = self.scenario, self.policy
         basis = self.model.transition, self.planning_reward, discounts(scenario)
         if policy is not None and not isinstance(policy, BeliefPolicy):
-            return given_policy(*basis, self.model.policy(policy))
+            return evaluate_policy(*basis, self.model.policy(policy))
         plan = value_iteration(*basis)
         if policy is None and scenario.planner.policy == "qmdp":
             policy = BeliefPolicy(plan.action_value.T, np.arange(len(scenario.control)))
@@ -171,7 +172,7 @@ class Knowledge:
         inner = self.learning or ExactFilter(self.model, self.sensor_model, self.scenario.mission.name)
         if notice is None:
             return inner
-        words = Words.of(self.scenario)
+        words = NoticeWording.of(self.scenario)
         return WatchfulEstimator(inner, self.sensor_model, self.draws.values, notice, words)
 
     @cached_property
@@ -291,7 +292,7 @@ def _readings(scenario: Scenario, model: GraphicalModel) -> dict[str, Any]:
     coordinates = model.states.coordinates
     within = np.zeros_like(coordinates)
     if scenario.observation.between_levels:
-        within = np.einsum("sff->sf", model.states.within_interval(coordinates))
+        within = np.einsum("sff->sf", model.states.change_within_interval(coordinates))
     return {
         "asked_by": asked_by,
         "reading": coordinates[:, places],
@@ -406,7 +407,7 @@ def kept_knowledge(folder: Path, scenario: Scenario, number: int | None = None) 
                 np.asarray(kept[name], dtype=np.float64) for name in ("predicted", "draws", "policy")
             )
             true = np.asarray(kept["true"], dtype=np.float64) if "true" in kept else None
-            on_belief = BeliefPolicy.of(kept, "belief_") if "belief_control" in kept else None
+            on_belief = BeliefPolicy.from_arrays(kept, "belief_") if "belief_control" in kept else None
         calibration = scenario.calibration
         parameter = ParameterDraws(
             calibration.parameter, draws, float(draws.mean()), float(draws.std()), calibration.source

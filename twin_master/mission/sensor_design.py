@@ -88,7 +88,7 @@ def drawn_readings(knowledge: Knowledge) -> tuple[Readings, ...]:
         deviation = sensors.independent_standard_deviation[:, control]
         some = np.arange(states) if states <= SAMPLES else draws.permutation(states)[:SAMPLES]
         state = np.tile(some, round(SAMPLES / len(some)))
-        shown = sensors.sampled(state, control, draws)[:, : sensors.sensor_count]
+        shown = sensors.draw_observations(state, control, draws)[:, : sensors.sensor_count]
         # The draws move all sensors along one direction, as far as they depend on the parameter linearly.
         root = np.sqrt(sensors.draw_weight)[:, None, None] * spread[:, :, control]
         _, size, direction = np.linalg.svd(root.swapaxes(0, 1), full_matrices=False)

@@ -21,7 +21,7 @@ from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import History, Truth, checked_values, decided_to_end
 from twin_master.network.estimator import Notice
 from twin_master.network.inference import filter_many
-from twin_master.network.planner import decision, rationed
+from twin_master.network.planner import decision_probability, ration_controls
 
 IN_FLIGHT = (TwinMasterError, FmuError, FiniteElementError, CalibrationError, OSError)
 """What may end the flight of one asset, and not that of the others."""
@@ -196,14 +196,14 @@ def fly_side_by_side(knowledge: Knowledge, truths: Sequence[Truth], assets: Sequ
         ):
             array[flying, step] = row[flying]
         before = now.log_filtered, control
-        asked = decision(
+        asked = decision_probability(
             model.transition, now.filtered, control, knowledge.plan.policy, on_belief,
             ahead=scenario.planner.decide_on == "predicted",
         )  # fmt: skip
         control = np.argmax(asked, axis=1)
         if budget is not None and on_belief is not None:
             some = np.flatnonzero(flying)
-            control[some] = rationed(
+            control[some] = ration_controls(
                 model.transition, now.filtered[some], before[1][some], control[some], on_belief, inspecting,
                 budget,
             )  # fmt: skip

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reporting.netcdf import NetcdfGroup, Variable
 from reporting.table_file import table_text
-from twin_master.learning.expectation import joined
+from twin_master.learning.expectation import concatenate_expectations
 from twin_master.mission.loop import expected_in
 from twin_master.mission.steps import SensorStatus, Truth
 from twin_master.scenario.observation import ObservationSection
@@ -139,7 +139,7 @@ def _beliefs(result: MissionResult, made: _Groups) -> Iterator[tuple[str, Netcdf
             expected_in(replace(flight, steps=flight.steps[part]), own, name, belief[part])
             for own, part in result.spans
         ]
-        expected = joined([part for part, _ in parts])
+        expected = concatenate_expectations([part for part, _ in parts])
         values = {
             "probability": belief,
             "mean": states.mean(belief),

@@ -19,7 +19,12 @@ from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from twin_master.errors import RunFolderError
-from twin_master.learning.expectation import Expected, LearntExpectation, expected_of, joined
+from twin_master.learning.expectation import (
+    Expectation,
+    LearntExpectation,
+    concatenate_expectations,
+    expectation_of_draws,
+)
 from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
 from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
 from twin_master.network.estimator import Learnt, is_state_believed
@@ -43,7 +48,7 @@ class StepBeliefs(NamedTuple):
         The probability of each state.
     is_believed : (n,) array of bool
         Whether a state is believed. It is not if no state explains the sensors.
-    expected : Expected
+    expected : Expectation
         The expected sensors and rewards, without quantiles. The reward of the error is NaN if
         nothing was observed.
     control_probability : (n, U) array
@@ -53,7 +58,7 @@ class StepBeliefs(NamedTuple):
 
     probability: Float
     is_believed: NDArray[np.bool_]
-    expected: Expected
+    expected: Expectation
     control_probability: Float
 
 
@@ -278,7 +283,7 @@ class Flight:
         return StepBeliefs(
             probability=np.concatenate([part.probability for part in parts]),
             is_believed=np.concatenate([part.is_believed for part in parts]),
-            expected=joined(part.expected for part in parts),
+            expected=concatenate_expectations(part.expected for part in parts),
             control_probability=np.concatenate([part.control_probability for part in parts]),
         )
 
@@ -303,7 +308,7 @@ class Flight:
 
     def _expectation_with_learning(
         self, expectation: LearntExpectation, joint: Float, records: Sequence[StepRecord]
-    ) -> Expected:
+    ) -> Expectation:
         """Return the sensors and rewards that a learning twin expected in each of n steps.
 
         Parameters
@@ -322,8 +327,8 @@ class Flight:
             control = slice(record["control_index"], record["control_index"] + 1)
             learnt = _learnt_quantities(record)
             belief = joint_of_step[None, :, control]  # (1, S, 1)
-            parts.append(expectation.of_marginals(learnt, belief, control, observed))
-        return joined(parts)
+            parts.append(expectation.from_marginals(learnt, belief, control, observed))
+        return concatenate_expectations(parts)
 
     def prediction_after(self, record: StepRecord) -> StepBeliefs:
         """Return what the twin expected after a step in each of the n steps to come."""
@@ -340,7 +345,7 @@ class Flight:
             expected = _expectation_without_learning(knowledge, joint, None)
         else:
             all_controls = slice(None)
-            expected = knowledge.expectation.of_marginals(
+            expected = knowledge.expectation.from_marginals(
                 _learnt_quantities(record), joint, all_controls, None
             )
         return StepBeliefs(
@@ -359,7 +364,7 @@ def _unexplained_probability(record: StepRecord) -> float:
 
 def _expectation_without_learning(
     knowledge: Knowledge, joint: Float, rows: Float | None
-) -> Expected:
+) -> Expectation:
     """Return the sensors and rewards expected under beliefs, by a twin that learns nothing.
 
     Parameters
@@ -371,7 +376,9 @@ def _expectation_without_learning(
     rows : (n, G + I) array or None
         The rows that were observed, SI; None for steps to come.
     """
-    return expected_of(knowledge.sensor_model, knowledge.rewards, joint, rows, quantiles=False)
+    return expectation_of_draws(
+        knowledge.sensor_model, knowledge.rewards, joint, rows, quantiles=False
+    )
 
 
 def _learnt_quantities(record: StepRecord) -> dict[str, Learnt]:

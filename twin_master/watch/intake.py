@@ -15,7 +15,7 @@ from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError
 from twin_master.mission.journal import state_text, step_record
 from twin_master.mission.steps import MissionStep, Reading
-from twin_master.network.estimator import Notice, Words
+from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.network.twin import Twin
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.clock import Clock
@@ -122,7 +122,7 @@ class Intake:
 
     def __init__(self, scenario: Scenario, feed: Feed, rejected: Path | None = None) -> None:
         self._section = scenario.watch
-        self._words = Words.of(scenario)
+        self._words = NoticeWording.of(scenario)
         self._width = scenario.row_width
         self._clock = Clock(scenario.watch)
 
@@ -383,7 +383,7 @@ class Intake:
         unreadable = reading.unreadable
         for sensor in sorted(unreadable.keys() - self._unreadable):
             sentence = (
-                f"{when}: {words.sensors([sensor])} shows no reading, and is left out until "
+                f"{when}: {words.name_sensors([sensor])} shows no reading, and is left out until "
                 f"readings of it come back: {unreadable[sensor]}."
             )
             notices.append(Notice("gauge_left_out", sentence, (sensor + 1,)))
@@ -391,7 +391,7 @@ class Intake:
         for sensor in sorted(self._unreadable - unreadable.keys()):
             if not np.isnan(reading.observed[sensor]):
                 readable_again.add(sensor)
-                name = words.sensors([sensor])
+                name = words.name_sensors([sensor])
                 sentence = f"{when}: the readings of {name} are back, and used again."
                 notices.append(Notice("gauge_back", sentence, (sensor + 1,)))
         self._unreadable = (self._unreadable | unreadable.keys()) - readable_again

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from reporting.words import counted, listing
-from twin_master.network.estimator import Notice, Words
+from twin_master.network.estimator import Notice, NoticeWording
 from twin_master.watch.records import JsonObject
 
 REFUSALS_IN_A_ROW = 3
@@ -34,7 +34,7 @@ class StreamNotices:
 
     Parameters
     ----------
-    words : Words
+    words : NoticeWording
         The words for steps and sensors.
 
     Attributes
@@ -47,7 +47,7 @@ class StreamNotices:
         The reason why the last of them was refused.
     """
 
-    def __init__(self, words: Words) -> None:
+    def __init__(self, words: NoticeWording) -> None:
         self._words = words
         self._pending: list[Notice] = []  # given with the next reading
         self._gap_end = -1  # the step after the last gap that was reported
