@@ -18,6 +18,7 @@ from reporting.files import (
 from reporting.json_file import read_json
 from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
+from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError
 from twin_master.fleet.checks import check_fleet, flies_model, source_of
 from twin_master.fleet.configuration import KIND, group_folder, locked_fleet_folder
@@ -208,10 +209,10 @@ def prepare_kit(scenario: Scenario, folder: Path, *, is_real: bool = False) -> b
     source.prepare(folder, SilentProgress())
     if not (folder / KNOWLEDGE_NAME).is_file():
         keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
-    wing = None
-    if flies_model(scenario) and not is_real:
-        wing = getattr(source, "wing", None)
-    parts = (scenario.portable().to_dict(), read_members(folder), wing)
+    model = None
+    if flies_model(scenario) and not is_real and isinstance(source, ReducedModelSource):
+        model = source.prepared_model
+    parts = (scenario.portable().to_dict(), read_members(folder), model)
     return pickle.dumps(parts, pickle.HIGHEST_PROTOCOL)
 
 
