@@ -9,7 +9,7 @@ import typer
 
 from discrepancy.errors import DiscrepancyError
 from reporting import terminal
-from twin_master.command import guarded
+from twin_master.command import run_command_line
 
 
 def _print_version(requested: bool) -> None:
@@ -108,4 +108,6 @@ app = _application()
 
 def main() -> None:
     """Run `uav-twin`."""
-    guarded(lambda: terminal.with_common_options(app)(prog_name="uav-twin"), DiscrepancyError)
+    run_command_line(
+        lambda: terminal.with_common_options(app)(prog_name="uav-twin"), DiscrepancyError
+    )

@@ -31,8 +31,8 @@ from twin_master.fleet.plan import Fleet, Group, Member, load_fleet
 from twin_master.fleet.shard import Engine, Piece, ShardResult, flown, unflown, with_parameters
 from twin_master.fleet.store import STORE_NAME, check_installed, create_store, sizes_of
 from twin_master.mission.journal import JOURNAL_NAME, JournalFile, records
-from twin_master.mission.preparation import KNOWLEDGE_NAME, keep_knowledge, prepare_knowledge
-from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.mission.preparation import KNOWLEDGE_NAME, prepare_knowledge, save_knowledge
+from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.scenario import reading as scenario_reading
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.feeds import file_feed
@@ -166,7 +166,7 @@ def held_fleet(
         It was begun by another version.
     """
     config = {"kind": kind, "format": 1, "fleet": record}
-    found = None if replace_old else run_folder.folder_config(folder, kind)
+    found = None if replace_old else run_folder.find_config(folder, kind)
     if found is None:
         ready()
         provenance = collect_provenance(record["seed"]).as_dict()
@@ -196,7 +196,7 @@ def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
     RunFolderError
         It holds no fleet.
     """
-    found = run_folder.folder_config(folder, *(kinds or (KIND,)))
+    found = run_folder.find_config(folder, *(kinds or (KIND,)))
     if found is None or "fleet" not in found:
         raise RunFolderError(
             f"{folder} is not the folder of a fleet." if folder.exists() else f"there is no folder {folder}."
@@ -232,13 +232,13 @@ def _check(fleet: Fleet) -> None:
             try:
                 _check_group(group, scenario)
                 source_of(with_parameters(scenario, means), real=bool(group.observations)).check()
-            except IN_FLIGHT as error:
+            except FLIGHT_ERRORS as error:
                 asset = f" {group.members[place].name}" if several else ""
                 wrong.append(f"{group.name}{asset}: {error}")
         for path in [member.file for member in group.members if group.observations]:
             try:
                 file_feed(path or Path(), group.scenarios[0])
-            except IN_FLIGHT as error:
+            except FLIGHT_ERRORS as error:
                 wrong.append(f"{group.name}: {error}")
     if wrong:
         raise FleetError("\n".join([f"{len(wrong)} of the assets cannot fly, so none did:", *wrong]))
@@ -285,7 +285,7 @@ def prepared(scenario: Scenario, folder: Path, *, real: bool = False) -> bytes:
     source = source_of(located, real=real)
     source.prepare(folder, SilentProgress())
     if not (folder / KNOWLEDGE_NAME).is_file():
-        keep_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
+        save_knowledge(folder, prepare_knowledge(located, source, scenario.mission.seed))
     wing = getattr(source, "wing", None) if flies_model(scenario) and not real else None
     packed = scenario.portable().to_dict(), read_members(folder), wing
     return pickle.dumps(packed, pickle.HIGHEST_PROTOCOL)
@@ -319,7 +319,7 @@ def _fly(
             try:
                 packed = kit(number, members[0].place)
                 ready = tuple(_recorded(group, member) for member in members)
-            except IN_FLIGHT as error:
+            except FLIGHT_ERRORS as error:
                 if len(group.scenarios) == 1:
                     raise
                 keep(number, members, unflown(members[0], str(error)))  # of one asset with a file of its own

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from reporting.arrays import Float
 from twin_master.fleet.flight import GROUPS, fleet_config
 from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, WITHIN, has_flown, open_group
-from twin_master.mission.preparation import Knowledge, kept_knowledge
+from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.belief_planning import leaving_probability
 from twin_master.network.estimator import BELIEVED
 from twin_master.scenario.schema import Scenario
@@ -189,7 +189,7 @@ def known_twins(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") ->
     for place in np.unique(places).tolist():
         rows, table = flown[places == place], record["scenarios"][place]
         home = folder / GROUPS / record["name"] / str(place)
-        yield rows, home, kept_knowledge(home, Scenario.model_validate(table).moved(home))
+        yield rows, home, load_knowledge(home, Scenario.model_validate(table).moved(home))
 
 
 def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:

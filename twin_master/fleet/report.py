@@ -38,7 +38,7 @@ from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, has_flo
 from twin_master.fleet.watching import STATE_NAME, counts_of, read_standing
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.report.reading import printed_factors
-from twin_master.run_folder import folder_config
+from twin_master.run_folder import find_config
 from twin_master.scenario.schema import Scenario
 from twin_master.viewer.server import serve_page, text_of
 
@@ -323,7 +323,7 @@ WORST = 50
 
 def is_fleet(folder: Path) -> bool:
     """Return whether a folder is that of a fleet, flown or watched."""
-    return folder_config(folder, KIND, WATCHED_KIND) is not None
+    return find_config(folder, KIND, WATCHED_KIND) is not None
 
 
 def serve_fleet(

@@ -34,9 +34,10 @@ from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.errors import FleetError, said
 from twin_master.fleet.plan import Member
 from twin_master.fleet.store import FAILED, outcomes_of
-from twin_master.mission.loop import BelievedModel, filtered_again, operate
-from twin_master.mission.preparation import Knowledge, kept_knowledge
-from twin_master.mission.side_by_side import IN_FLIGHT, Flights, fly_one_by_one, fly_side_by_side
+from twin_master.mission.loop import operate
+from twin_master.mission.preparation import Knowledge, load_knowledge
+from twin_master.mission.replay import BelievedModel, refilter
+from twin_master.mission.side_by_side import FLIGHT_ERRORS, Flights, fly_one_by_one, fly_side_by_side
 from twin_master.mission.steps import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
@@ -53,7 +54,7 @@ def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Fl
     for number, messages in enumerate(recordings):
         try:
             history = _history(knowledge, messages)
-        except IN_FLIGHT as error:
+        except FLIGHT_ERRORS as error:
             flights.failure[number] = str(error)
             continue
         steps = len(history.steps)
@@ -64,7 +65,7 @@ def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Fl
                 f"it has {steps} steps, and {most} at most are flown: set `steps` of the group."
             )
         else:
-            flights.put(number, history)
+            flights.store_history(number, history)
     return flights
 
 
@@ -80,7 +81,7 @@ def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
         late |= step.reading.revises is not None
         lost += [(at, notice) for notice in intake.notices]
     if late:
-        history = filtered_again(seen, [BelievedModel(0, knowledge)])
+        history = refilter(seen, [BelievedModel(0, knowledge)])
     history.notices += lost
     return history
 
@@ -119,7 +120,7 @@ class Kit:
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         write_members(folder, files)
         self.scenario = Scenario.model_validate(scenario).moved(folder)
-        self.knowledge: Knowledge = kept_knowledge(folder, self.scenario)
+        self.knowledge: Knowledge = load_knowledge(folder, self.scenario)
 
     def told(self, sentence: str) -> str:
         """Return a sentence without the folder of this process, which nobody else knows."""
@@ -176,7 +177,7 @@ def _flown(kit: Kit, members: Sequence[Member]) -> Flights:
     truths = [kit.knowledge.truth(member.seed) for member in members]
     with _Hangar(kit, members) as hangar:
         if kit.scenario.learning is None and kit.scenario.notice is None:
-            with suppress(*IN_FLIGHT):  # which then happens to each of them
+            with suppress(*FLIGHT_ERRORS):  # which then happens to each of them
                 if assets := hangar.together():
                     return fly_side_by_side(kit.knowledge, truths, assets)
         return fly_one_by_one(kit.knowledge, truths, hangar.asset)

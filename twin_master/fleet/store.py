@@ -75,7 +75,7 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
     found: dict[str, Any] = {
         "status": np.where(failed, FAILED, np.where(short, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
-        "observed": flights.row,
+        "observed": flights.observation_rows,
         "control_index": flights.control_index,
         "state": flights.state,
         "mean": mean,

@@ -21,7 +21,7 @@ from twin_master.errors import FleetError, said
 from twin_master.fleet.flight import WATCHED_KIND, held_fleet
 from twin_master.fleet.plan import Fleet, Group, asset_name, recordings
 from twin_master.fleet.reading import attention, severity
-from twin_master.mission.side_by_side import IN_FLIGHT
+from twin_master.mission.side_by_side import FLIGHT_ERRORS
 from twin_master.run_folder import CONFIG_NAME
 from twin_master.watch.feeds import broker_of, file_feed, is_broker
 from twin_master.watch.folder import Watch
@@ -323,7 +323,7 @@ class FleetWatch:
         """Say once why an asset is not watched, and give its folder free; a full disk ends all."""
         if isinstance(error, DiskFullError):
             raise error
-        sentence = str(error) if isinstance(error, IN_FLIGHT) else f"{type(error).__name__}: {error}"
+        sentence = str(error) if isinstance(error, FLIGHT_ERRORS) else f"{type(error).__name__}: {error}"
         before, wait = self._lost.get(key), AGAIN_SECONDS
         if before is not None and before.sentence == sentence:
             wait = min(2.0 * before.wait, LONGEST_AGAIN)

@@ -122,8 +122,8 @@ def learnt_figure(run: Run) -> Figure:
     Of quantities of each sensor the one that departs most from its prior has the band, and beside it stand
     the last values of all sensors.
     """
-    whole = [learnt for learnt in run.learnt if not learnt.of_sensors]
-    of_sensors = [learnt for learnt in run.learnt if learnt.of_sensors]
+    whole = [learnt for learnt in run.learnt if not learnt.is_per_sensor]
+    of_sensors = [learnt for learnt in run.learnt if learnt.is_per_sensor]
     rows = -(-len(whole) // 2) + len(of_sensors)
     labels = iter("abcdefghijklmnopqrstuvwxyz")
     figure, grid = style.panels(
@@ -131,7 +131,7 @@ def learnt_figure(run: Run) -> Figure:
     )
     places = [axes for row in grid for axes in row]
     for axes, learnt in zip(places, whole, strict=False):
-        _course(axes, run, learnt.course, learnt.prior, learnt.truth)
+        _course(axes, run, learnt.posterior, learnt.prior, learnt.truth)
         style.panel_label(axes, next(labels), learnt.label)
     if len(whole) % 2:
         places[len(whole)].remove()
@@ -139,15 +139,15 @@ def learnt_figure(run: Run) -> Figure:
             places[len(whole) - 1].get_gridspec()[len(whole) // 2, :]  # type: ignore[index]
         )
     for (axes, beside), learnt in zip(grid[rows - len(of_sensors) :], of_sensors, strict=True):
-        last = learnt.course[-1]
+        last = learnt.posterior[-1]
         chosen = int(np.nanargmax(np.abs(last[:, 0] - learnt.prior[:, 0]) / last[:, 1]))
-        others = np.delete(learnt.course[:, :, 0], chosen, axis=1)
+        others = np.delete(learnt.posterior[:, :, 0], chosen, axis=1)
         axes.plot(
             run.numbers, others, color=style.REFERENCE, linewidth=0.5, alpha=0.8,
             label=f"other {run.sensors.word}s",
         )  # fmt: skip
         truth = None if learnt.truth is None else learnt.truth[chosen]
-        _course(axes, run, learnt.course[:, chosen], learnt.prior[chosen], truth)
+        _course(axes, run, learnt.posterior[:, chosen], learnt.prior[chosen], truth)
         style.panel_label(axes, next(labels), learnt.label)
         axes.text(
             0.99, 0.97, run.sensors.titles[chosen], transform=axes.transAxes, ha="right", va="top",
@@ -189,7 +189,7 @@ def _last_panel(axes: Axes, run: Run, learnt: LearntQuantity, chosen: int) -> No
         place, learnt.prior[:, 3] - learnt.prior[:, 2], bottom=learnt.prior[:, 2], width=1.0,
         color=style.PAST, alpha=0.12, linewidth=0,
     )  # fmt: skip
-    for index, figures in enumerate(learnt.course[-1][:, [0, 2, 3]]):
+    for index, figures in enumerate(learnt.posterior[-1][:, [0, 2, 3]]):
         color = style.PRESENT if index == chosen else style.OBSERVED
         style.interval(axes, place[index], *figures, color=color, marker="o", markersize=2.6, elinewidth=1.0)
     if learnt.truth is not None:
@@ -208,7 +208,7 @@ def with_interval(figures: Float) -> str:
 
 def sensor_rows(run: Run) -> list[tuple[str, ...]]:
     """Return the last values of what was learnt of each sensor."""
-    own = [learnt.course[-1] for learnt in run.learnt if learnt.of_sensors]
+    own = [learnt.posterior[-1] for learnt in run.learnt if learnt.is_per_sensor]
     rows = zip(run.sensors.titles, *own, strict=True) if own else ()
     return [(title, *map(with_interval, figures)) for title, *figures in rows]
 

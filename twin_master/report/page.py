@@ -24,7 +24,7 @@ from twin_master.report import mission as course
 from twin_master.report import model as tailored
 from twin_master.report.reading import Run, read_run
 from twin_master.report.structure import design_of, mesh_figure, planform_figure, planform_of
-from twin_master.store.summary import another_truth, control_changes, find_fallback
+from twin_master.store.summary import control_changes, find_fallback, truth_mismatch
 from twin_master.store.writing import REPORT_NAME
 
 WORDS = Words("twin_master.report")
@@ -92,7 +92,7 @@ def _belief(run: Run) -> str:
     learnt = next((one for one in run.learnt if one.name == run.scenario.calibration.parameter), None)
     told = None
     if learnt is not None:
-        mean, deviation = learnt.course[-1, :2]
+        mean, deviation = learnt.posterior[-1, :2]
         told = {
             "name": _named(parameter_title(learnt.name)), "mean": mean, "low": mean - 2 * deviation,
             "high": mean + 2 * deviation, "truth": None if learnt.truth is None else float(learnt.truth),
@@ -278,11 +278,11 @@ def render_page(run: Run, drawings: Mapping[str, bytes], figures: Mapping[str, R
     page = Page(mission.title or mission.name, WORDS.say("subtitle", **told), footer=footer)
     lost = np.isnan(run.observed)
     blind = np.flatnonzero(lost.all(axis=1))
-    whole, own = ([one for one in run.learnt if one.of_sensors == each] for each in (False, True))
+    whole, own = ([one for one in run.learnt if one.is_per_sensor == each] for each in (False, True))
     given = run.scenario.transition.probability
     truth, parameter, another = tailored.true_value(run), run.scenario.calibration.parameter, None
     if truth is not None and not any(learnt.name == parameter for learnt in run.learnt):
-        another = another_truth(parameter, truth, *tailored.believed(run))
+        another = truth_mismatch(parameter, truth, *tailored.believed(run))
     asset, model, kept = run.summary.get("asset"), run.summary.get("twin_model"), run.calibration
     told |= {
         "figures": figures, "opening": opening_sentences(run), "another": another,

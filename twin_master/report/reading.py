@@ -19,7 +19,13 @@ from twin_master.run_folder import CONFIG_NAME
 from twin_master.scenario.reading import parse_scenario
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
-from twin_master.store.mission_result import MOMENTS, LearntQuantity, paths_of, printed_learnt, titles_of
+from twin_master.store.mission_result import (
+    MOMENTS,
+    LearntQuantity,
+    printed_unit_of_quantity,
+    quantity_titles,
+    variable_paths,
+)
 from twin_master.store.writing import RUN_NAME, SUMMARY_NAME, open_run
 
 if TYPE_CHECKING:
@@ -240,7 +246,7 @@ class Run:
             name = str(variable).removesuffix(f"_prior_{MOMENTS[0]}")
             if name == variable:
                 continue
-            scale, unit = printed_learnt(name, str(stored.attrs["units"]), self.scenario)
+            scale, unit = printed_unit_of_quantity(name, str(stored.attrs["units"]), self.scenario)
             course, prior = (
                 scale * np.stack([self[f"learnt/{name}{part}_{moment}"] for moment in MOMENTS], axis=-1)
                 for part in ("", "_prior")
@@ -248,7 +254,7 @@ class Run:
             truth = self.get(f"truth/{name}")
             unit = "µε" if unit == "microstrain" else unit
             truth = None if truth is None else scale * truth
-            found.append(LearntQuantity(name, titles_of(name)[1], unit, course, prior, truth))
+            found.append(LearntQuantity(name, quantity_titles(name)[1], unit, course, prior, truth))
         return tuple(found)
 
     def smoothed_until(self, now: int) -> Float:
@@ -273,7 +279,7 @@ def read_run(folder: Path) -> Run:
     with RunFolderError.instead_of(TwinMasterError, after=" The run cannot be shown: fly it again."):
         scenario = parse_scenario(config.get("scenario", {}), str(folder / CONFIG_NAME))
     run = Run(tree, scenario, config, summary, calibration)
-    missing = [path for path in paths_of(scenario.observation.role) if run.get(path) is None]
+    missing = [path for path in variable_paths(scenario.observation.role) if run.get(path) is None]
     if missing:
         raise RunFolderError(said("run_folder.layout", name=RUN_NAME, path=missing[0]))
     return run

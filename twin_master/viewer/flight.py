@@ -29,13 +29,13 @@ from reporting.errors import ReportingError
 from reporting.json_file import plain
 from twin_master.errors import RunFolderError, TwinMasterError, said
 from twin_master.learning.expectation import Expected, expected_of, joined
-from twin_master.mission.journal import JOURNAL_NAME, array_of, records_of
-from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, kept_knowledge
+from twin_master.mission.journal import JOURNAL_NAME, array_from_json, records_in_file
+from twin_master.mission.preparation import KNOWLEDGE_NAME, Knowledge, load_knowledge
 from twin_master.network.estimator import Learnt, is_state_believed
 from twin_master.network.inference import known_control, predict
 from twin_master.report.reading import NORMAL_95, printed_factors, printed_sensors
 from twin_master.report.structure import design_of, planform_of
-from twin_master.run_folder import kept_scenario
+from twin_master.run_folder import read_scenario
 from twin_master.scenario.schema import REWARD_NAMES
 from twin_master.viewer.picture import Picture, picture_of
 
@@ -92,7 +92,7 @@ class Flight:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self._path = folder, folder / JOURNAL_NAME
-        self.scenario = kept_scenario(folder)
+        self.scenario = read_scenario(folder)
         self.number = 0
         self._forget(0)
 
@@ -108,7 +108,7 @@ class Flight:
 
     def _believe(self, place: int) -> None:
         """Take in the next model that is believed, from so many bytes on."""
-        self._models.append((place, kept_knowledge(self.folder, self.scenario, len(self._models))))
+        self._models.append((place, load_knowledge(self.folder, self.scenario, len(self._models))))
 
     @property
     def knowledge(self) -> Knowledge:
@@ -141,7 +141,7 @@ class Flight:
         with suppress(FileNotFoundError), self._path.open("rb") as file:
             if self._begun_anew(found := os.fstat(file.fileno())):
                 self._forget(found.st_ino)
-            for record, begin, behind in islice(records_of(file, self._path, self._end), STEPS_AT_ONCE):
+            for record, begin, behind in islice(records_in_file(file, self._path, self._end), STEPS_AT_ONCE):
                 self._take_in(record, begin)
                 self._end = behind
         return (self.number, self._end) != (number, end)
@@ -183,21 +183,21 @@ class Flight:
 
     def _step(self, file: BinaryIO, step: int) -> Record:
         believed, observed = self._places[step]
-        record = next(records_of(file, self._path, believed))[0]
+        record = next(records_in_file(file, self._path, believed))[0]
         if observed != believed:
-            own = next(records_of(file, self._path, observed))[0]
+            own = next(records_in_file(file, self._path, observed))[0]
             record |= {name: own[name] for name in ("observed", "control_index")}
         return record | {"notices": record.get("notices", []) + self._told.get(step, [])}
 
     def observed(self, steps: Sequence[Record]) -> Float:
         """Return what the sensors said in n steps: (n, G), SI; NaN where lost."""
         sensors = self.scenario.observation.count
-        return np.array([array_of(step["observed"][:sensors]) for step in steps])
+        return np.array([array_from_json(step["observed"][:sensors]) for step in steps])
 
     def truth(self, steps: Sequence[Record]) -> Float:
         """Return the true state of n steps: (n, K), SI; NaN where nobody knows it."""
         unknown = [None] * len(self.scenario.state)
-        return np.array([array_of(step.get("state", unknown)) for step in steps])
+        return np.array([array_from_json(step.get("state", unknown)) for step in steps])
 
     def believed(self, steps: Sequence[Record]) -> Belief:
         """Return what the twin believed of each of n steps when it was flown."""
@@ -217,7 +217,9 @@ class Flight:
         controls = [step["control_index"] for step in steps]
         joint = known_control(filtered, controls, len(known.model.controls))
         if (learns := known.expectation) is None:
-            expected = _expected(known, joint, np.array([array_of(step["observed"]) for step in steps]))
+            expected = _expected(
+                known, joint, np.array([array_from_json(step["observed"]) for step in steps])
+            )
         else:
             parts = []
             for step, own, seen in zip(steps, joint, self.observed(steps), strict=True):
@@ -231,10 +233,10 @@ class Flight:
     def predicted(self, step: Record) -> Belief:
         """Return what the twin expected after a step of the H steps to come."""
         known, horizon = self._known_in(step), self.scenario.mission.prediction_steps
-        flown, learns = (array_of(step["filtered"]), step["control_index"]), known.expectation
+        flown, learns = (array_from_json(step["filtered"]), step["control_index"]), known.expectation
         coming = predict(known.model, *flown, known.plan.policy, horizon).predicted
         none = _unexplained(step)
-        joint = coming[..., None] * known.asked(none)
+        joint = coming[..., None] * known.policy_with_doubt(none)
         if learns is None:
             expected = _expected(known, joint, None)
         else:

@@ -22,7 +22,7 @@ from reporting.errors import DamagedFileError
 from reporting.former_names import warn_of_former_names
 from reporting.netcdf import read_groups
 from twin_master.errors import MissionInputError, said
-from twin_master.mission.journal import JOURNAL_NAME, array_of, whole_record
+from twin_master.mission.journal import JOURNAL_NAME, array_from_json, record_of_line
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.intake import GIVEN, MISSING, Feed
 from twin_master.watch.lines import GrowingFile, Pipe, Place, first_line, found, holds, rotated
@@ -304,14 +304,14 @@ class FolderFeed(RecordedFeed):
 
     def content(self, line: bytes, begin: int) -> Content | None:
         """Return the observation of a line; None where it is of none, or was cut off by a kill."""
-        record = whole_record(line, self.path)
+        record = record_of_line(line, self.path)
         if record is None and line.endswith(b"\n"):
             number = self.path.read_bytes()[:begin].count(b"\n") + 1
             return Refused(f"line {number} of {self.path.name} was changed or is damaged")
         if record is None or "observed" not in record:
             return None
         try:
-            observed, control = array_of(record["observed"]), int(record["control_index"])
+            observed, control = array_from_json(record["observed"]), int(record["control_index"])
             step, told = int(record.get("observation_step", record["step"])), GIVEN
             if "intake" in record:
                 told = int(record["intake"]["given"][step - int(record["step"]) - 1])

@@ -16,6 +16,7 @@ from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError, said
+from twin_master.mission.decision_record import decision_from_line
 from twin_master.mission.journal import (
     JOURNAL_NAME,
     JournalFile,
@@ -23,15 +24,16 @@ from twin_master.mission.journal import (
     last_step,
     records_backwards,
 )
-from twin_master.mission.loop import BelievedModel, journalled_decision, operate, replay
-from twin_master.mission.preparation import keep_knowledge, prepare_knowledge, share_knowledge
+from twin_master.mission.loop import operate
+from twin_master.mission.preparation import link_knowledge, prepare_knowledge, save_knowledge
+from twin_master.mission.replay import BelievedModel, replay
 from twin_master.mission.steps import MissionStep
 from twin_master.network.estimator import Notice
 from twin_master.network.twin import Twin
-from twin_master.run_folder import PICTURE, TEACHING, VERDICT, tidy, with_inputs
+from twin_master.run_folder import PICTURE, TEACHING, VERDICT, record_inputs, remove_half_written_files
 from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
-from twin_master.store.summary import Told
+from twin_master.store.summary import FigureGroup
 from twin_master.store.writing import store_flight
 from twin_master.watch.intake import REJECTED_NAME, Counts, Feed, Intake, listening
 from twin_master.watch.teaching import Outcome, Teaching, both_patches, judged, patched_model
@@ -82,21 +84,21 @@ class Watch:
         like: "Watch | None" = None,
     ) -> None:  # fmt: skip
         self.folder, self.scenario, self._progress = folder, scenario, progress
-        tidy(folder)
+        remove_half_written_files(folder)
         self._source: AssetSource = believed_source(scenario) if like is None else like._source
         prepared = self._source.prepare(folder, progress) if like is None else like._inputs
         self._inputs: Mapping[str, str] = prepared
-        self._config = with_inputs(folder, config, self._inputs)
+        self._config = record_inputs(folder, config, self._inputs)
         self.models: list[BelievedModel] = [self._prepared() if like is None else like.models[0]]
         self._path = folder / JOURNAL_NAME
         self._hash = hash_record(self._config)
         self._take_up()
         if like is not None and len(self.models) == len(like.models) == 1:
-            share_knowledge(like.folder, folder)
+            link_knowledge(like.folder, folder)
         else:
-            keep_knowledge(folder, self.models[-1].knowledge)
+            save_knowledge(folder, self.models[-1].knowledge)
         for number, model in enumerate(self.models[:-1]):
-            keep_knowledge(folder, model.knowledge, number)
+            save_knowledge(folder, model.knowledge, number)
 
     def _prepared(self) -> BelievedModel:
         """Calibrate and plan."""
@@ -199,7 +201,7 @@ class Watch:
 
     def decision_of(self, line: Mapping[str, Any]) -> dict[str, Any]:
         """Return what the operator is told with a line of the journal; nothing where it tells no decision."""
-        return journalled_decision(line, self.scenario, self.models[-1].knowledge.model)
+        return decision_from_line(line, self.scenario, self.models[-1].knowledge.model)
 
     def _kept(self, step: MissionStep) -> dict[str, Any]:
         """Write down a reading and what became of it; return the line."""
@@ -211,7 +213,7 @@ class Watch:
         if told:
             record["notices"] = record.get("notices", []) + told
         self._append(record)
-        self.filtered, self.is_quiet, self._heard = step.concluded.filtered, False, time.monotonic()
+        self.filtered, self.is_quiet, self._heard = step.twin_step.filtered, False, time.monotonic()
         return record
 
     def write(self, **record: Any) -> None:
@@ -299,8 +301,8 @@ class Watch:
             **({"verdict": verdict} if verdict else {}),
         }  # fmt: skip
         # Before viewers read the line; they show earlier steps as they were told.
-        keep_knowledge(self.folder, self.models[-2].knowledge, len(self.models) - 2)
-        keep_knowledge(self.folder, outcome.model.knowledge)
+        save_knowledge(self.folder, self.models[-2].knowledge, len(self.models) - 2)
+        save_knowledge(self.folder, outcome.model.knowledge)
         self.write(model=model)
         gaps = [
             f"{name.replace('_', ' ')} {value:.4g} before, {model['after'][name]:.4g} after"
@@ -335,7 +337,7 @@ class Watch:
         """Return the last of so many steps, as a mission."""
         first = max(0, steps - last)
         found, _ = replay(self._path, self.models, None, first_step=first)
-        flight = replace(found.behind(first - found.first_step), notices=self.told(first))
+        flight = replace(found.without_first(first - found.first_step), notices=self.told(first))
         return MissionResult(self.scenario, self.models[-1].knowledge, flight, models=self.models)
 
     def told(self, first: int) -> list[tuple[int, Notice]]:
@@ -353,12 +355,12 @@ class Watch:
             told.setdefault(known.sentence, (step, known))
         return [*told.values()]
 
-    def _figures(self, counts: Counts, steps: int) -> list[Told]:
+    def _figures(self, counts: Counts, steps: int) -> list[FigureGroup]:
         """Return what the summary tells of a watch."""
         step = {"step": self.scenario.mission.step_name, "file": REJECTED_NAME}
         came = [steps, counts.missing, counts.late, counts.duplicates, counts.rejected]
-        told: list[Told] = [("watch", step, came)]
+        told = [FigureGroup("watch", step, came)]
         for model in self.teaching.adopted:
             gaps = [model["before"]["rms_residual"], model["after"]["rms_residual"]]
-            told.append(("patch", step | {"first": model["from_step"]}, gaps))
+            told.append(FigureGroup("patch", step | {"first": model["from_step"]}, gaps))
         return told

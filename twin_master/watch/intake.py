@@ -17,7 +17,7 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text, explained_write_errors
 from reporting.words import counted, one_line
 from twin_master.errors import TwinMasterError, said
-from twin_master.mission.journal import state_text, step_record
+from twin_master.mission.journal import encode_state, step_record
 from twin_master.mission.steps import MissionStep, Reading
 from twin_master.network.estimator import Notice, Words
 from twin_master.network.twin import Twin
@@ -179,7 +179,7 @@ class Intake:
 
     def line(self, step: MissionStep, twin: Twin) -> dict[str, Any]:
         """Return what a line of the journal says of the last reading and what became of it."""
-        concluded = step.concluded
+        concluded = step.twin_step
         record = step_record(step) | {
             "observation_step": self.observation_step,
             "control_index": twin.control_of(self.observation_step),
@@ -188,7 +188,7 @@ class Intake:
         if step.reading.revises is not None:
             record["control_in_force"] = concluded.control_index
         elif (concluded.step + 1) % SNAPSHOT_STEPS == 0 and (settled := twin.settled()):
-            record["settled"] = {"step": settled[0], "state": state_text(settled[1])}
+            record["settled"] = {"step": settled[0], "state": encode_state(settled[1])}
         known = {(notice.kind, notice.sensors) for notice in concluded.notices}
         if told := [n.as_record() for n in self.notices if (n.kind, n.sensors) not in known]:
             record["notices"] = record.get("notices", []) + told
@@ -333,7 +333,7 @@ class Intake:
             yield Notice("gauge_back", sentence, (g + 1,))
         self._unreadable = (self._unreadable | came.keys()) - back
 
-    def impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
+    def replace_impossible(self, reading: Reading, error: TwinMasterError) -> Reading:
         """Refuse an observation that no state allows; its step is predicted through, or stays as it was."""
         self.stream.restore(self._stream_before)
         self._useful -= 1

@@ -40,7 +40,7 @@ def begun_watch(
     resolved: Scenario, file: Mapping[str, str], folder: Path, progress: Progress, *,
     replace_run: bool = False, like: Watch | None = None,
 ) -> Iterator[Watch]:  # fmt: skip
-    """Make the folder of a watch of a resolved scenario, and hold it; see `begun_folder` and `Watch`."""
+    """Make the folder of a watch of a resolved scenario, and hold it; see `new_run_folder` and `Watch`."""
     # A watch that takes the place of another ends its session at the broker: it comes under the same name.
     files = {
         path.name: path.read_bytes().partition(b"\n")[0] + f"\n{BEGIN_ANEW}\n".encode()
@@ -49,7 +49,7 @@ def begun_watch(
     source = believed_source(resolved)
     source.check()
     files = source.files() | files
-    opened = run_folder.begun_folder(resolved, file, folder, files, replace=replace_run, watched=True)
+    opened = run_folder.new_run_folder(resolved, file, folder, files, replace=replace_run, watched=True)
     with opened as (config, located):
         yield Watch(folder, config, located, progress, like)
 
@@ -67,7 +67,7 @@ def resumed_watch(
     """
     if not run_folder.read_config(folder).get("watched"):
         raise NotResumableError(said("watch.run", folder=folder))
-    with run_folder.resumed_folder(folder, loaded) as (config, scenario):
+    with run_folder.hold_run_folder(folder, loaded) as (config, scenario):
         try:
             run_folder.check_versions(folder, config, scenario.mission.seed)
             watched = Watch(folder, config, scenario, progress, like)
@@ -113,7 +113,7 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
         shutil.copytree(folder / "asset", copy / "asset")
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
-        Watch(copy, config, run_folder.kept_scenario(folder).moved(copy), progress).store(
+        Watch(copy, config, run_folder.read_scenario(folder).moved(copy), progress).store(
             Counts(), report=False
         )
         yield copy
@@ -155,7 +155,7 @@ def stored(folder: Path) -> bool:
 
 def _config(folder: Path) -> dict[str, Any] | None:
     """Return the configuration of a watch; None where the folder holds something else."""
-    config = run_folder.folder_config(folder)
+    config = run_folder.find_config(folder)
     return config if config is not None and config.get("watched") else None
 
 
@@ -287,7 +287,7 @@ def _read(
     """Return the folder of a watch, and the scenario by which observations are read."""
     if loaded is None:
         folder = Path(str(folder))
-        scenario = run_folder.kept_scenario(folder).moved(folder)
+        scenario = run_folder.read_scenario(folder).moved(folder)
     else:
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
         scenario = loaded.scenario.moved(loaded.path.parent)

@@ -21,9 +21,10 @@ from reporting.progress import Progress
 from twin_master.assets.asset_source import AssetSource
 from twin_master.assets.design_source import DesignBelief
 from twin_master.errors import MissionInputError, TwinMasterError, said
-from twin_master.mission.journal import damaged, records_backwards
-from twin_master.mission.loop import BelievedModel, gap_of, replay
-from twin_master.mission.preparation import Knowledge, prepared_alone
+from twin_master.mission.journal import damaged_line_error, records_backwards
+from twin_master.mission.preparation import Knowledge, prepare_without_folder
+from twin_master.mission.replay import BelievedModel, replay
+from twin_master.mission.residuals import residual_summary
 from twin_master.scenario.schema import Scenario
 from twin_master.scenario.section import printed_state
 
@@ -44,8 +45,8 @@ class Outcome:
     gained : float
         Log evidence of the steps that were compared, with the patch less without [nats].
     record : dict
-        For the journal: `before` and `after`, the gap of the steps from that of the patch on (`gap_of`), and
-        `policy_change`, how the policy changes, in a sentence; empty where it stays.
+        For the journal: `before` and `after`, the gap of the steps from that of the patch on (see
+        `residual_summary`), and `policy_change`, how the policy changes, in a sentence; empty where it stays.
     """
 
     patch: bytes
@@ -68,7 +69,7 @@ def patched_model(
         raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
     scenario = scenario.having("belief", patch=str(file))
     source: AssetSource = scenario.belief.source(scenario, None)
-    return BelievedModel(from_step, prepared_alone(scenario, source, progress), file)
+    return BelievedModel(from_step, prepare_without_folder(scenario, source, progress), file)
 
 
 def judged(
@@ -108,12 +109,12 @@ def judged(
         for question in (None, model)
     )
     evidence = [
-        sum(step.concluded.log_evidence for step in found.steps[begin - found.first_step :][:count])
+        sum(step.twin_step.log_evidence for step in found.steps[begin - found.first_step :][:count])
         for found in (before, after)
     ]
     record = {
-        "before": gap_of(before, from_step, models),
-        "after": gap_of(after, from_step, [*models, model]),
+        "before": residual_summary(before, from_step, models),
+        "after": residual_summary(after, from_step, [*models, model]),
         "policy_change": policy_change(models[-1].knowledge, model.knowledge),
     }
     return Outcome(patch, model, float(evidence[1] - evidence[0]), record)
@@ -230,7 +231,7 @@ class Teaching:
         for record, begin, end in records_backwards(path):
             length, last = length or end, last or record
             if begin and record["standing"]["begin"] != begin:
-                raise damaged(path, begin, "lines before it are missing, or not its own")
+                raise damaged_line_error(path, begin, "lines before it are missing, or not its own")
             if length - begin > CHECKED:
                 break
         if "standing" in last:

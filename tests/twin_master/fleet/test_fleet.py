@@ -36,7 +36,7 @@ from twin_master.fleet.reading import Outcomes, group_figures
 from twin_master.fleet.report import write_fleet_report
 from twin_master.fleet.shard import Engine, unflown
 from twin_master.fleet.store import ENDED, FLOWN, _fallbacks, in_credible_set, outcomes_of
-from twin_master.fleet_command import engine_of
+from twin_master.fleet_command import choose_engine
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
 from twin_master.mission.preparation import Knowledge
@@ -266,8 +266,8 @@ def test_the_command_line(library_file, tmp_path):
 
 def test_all_processors_fly_unless_the_user_says_how_many():
     cores = len(os.sched_getaffinity(0))
-    assert [engine_of(workers, None).workers for workers in (None, 0, 3)] == [cores, 0, 3]
-    assert engine_of(None, "tcp://127.0.0.1:9") == Engine(cluster="tcp://127.0.0.1:9")
+    assert [choose_engine(workers, None).workers for workers in (None, 0, 3)] == [cores, 0, 3]
+    assert choose_engine(None, "tcp://127.0.0.1:9") == Engine(cluster="tcp://127.0.0.1:9")
 
 
 def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[Knowledge, StatelessAsset]:
@@ -381,5 +381,5 @@ def test_damage_grows_as_the_model_says(library_file):
     growth, uniform = DamageGrowth(model), (np.arange(2000) + 0.5) / 2000
     for control in (0, 1):
         row = model.transition.row(control, 6)
-        found = growth.following(np.full(len(uniform), control), np.full(len(uniform), 6), uniform)
+        found = growth.next_states(np.full(len(uniform), control), np.full(len(uniform), 6), uniform)
         np.testing.assert_allclose(np.bincount(found, minlength=25) / 2000, row, atol=1.5 / 2000)

@@ -16,7 +16,7 @@ from twin_master.errors import ImpossibleObservation, InvalidModelError, Invalid
 from twin_master.learning import rivals
 from twin_master.learning.learning_filter import LearningFilter
 from twin_master.learning.rivals import Shares
-from twin_master.mission.journal import line_of, step_record
+from twin_master.mission.journal import encode_line, step_record
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.steps import MissionStep, Reading
 from twin_master.network.estimator import Words
@@ -255,7 +255,7 @@ def test_any_finite_numbers_are_weighed_or_refused_and_the_twin_goes_on(rows, la
             if step.suspicion is not None:
                 assert 0.0 <= step.suspicion.none_of_these + step.suspicion.gauge_off <= 1.0 + 1e-12
             record = MissionStep(Reading(np.full(2, np.nan)), step)
-            line_of(step_record(record))  # which holds no NaN and no infinity
+            encode_line(step_record(record))  # which holds no NaN and no infinity
 
 
 def test_an_absurd_gauge_is_left_out_with_a_word_also_where_it_comes_late():
@@ -361,10 +361,10 @@ def test_belief_and_decision_follow_what_holds_now(between):
 
 def test_the_safest_control_is_the_one_with_the_least_load_or_the_one_that_is_named():
     wing = prepare_twin(changed_scenario("paper_level_turns", FEW))
-    assert wing.scenario.control_names[wing.safest] == "2g"
+    assert wing.scenario.control_names[wing.safest_control] == "2g"
     planner = wing.scenario.planner.model_copy(update={"safest": "3g"})
     named = replace(wing, scenario=wing.scenario.model_copy(update={"planner": planner}))
-    assert named.scenario.control_names[named.safest] == "3g"
+    assert named.scenario.control_names[named.safest_control] == "3g"
     model, sensors = small()
     twin = Twin("t", model, sensors, np.ones((3, 1)), estimator=watchful())
     steps = [twin.step(row) for row in drawn(np.random.default_rng(1), 6) * [0.5, 1.5, 2.0]]
