@@ -9,6 +9,7 @@ import time
 import traceback
 import webbrowser
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -63,11 +64,7 @@ def run(
     if seeds is not None:
         has_other_options = resume is not None or seed is not None or policy is not None or view
         if scenario is None or has_other_options:
-            raise typer.BadParameter(
-                "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy "
-                "nor --view.",
-                param_hint="--seeds",
-            )
+            raise _wrong_use_of_seeds()
         fleet = parts.ensemble(scenario, parts.seed_range(seeds), overrides)
         engine = choose_engine(workers, cluster)
         fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
@@ -78,39 +75,67 @@ def run(
             param_hint="--workers" if cluster is None else "--cluster",
         )
     loaded = None if scenario is None else parts.load_scenario(scenario)
+    has_changes = out is not None or policy is not None or overrides != parts.Overrides()
+    if resume is not None and (replace or has_changes):
+        raise _wrong_use_of_resume()
     if resume is not None:
-        if out is not None or replace or policy is not None or overrides != parts.Overrides():
-            raise typer.BadParameter(
-                "a run is continued with what its folder holds: give nothing beside it that would change it.",
-                param_hint="--resume",
-            )
+        fly_mission = partial(parts.resume, resume, loaded)
         folder = resume
-    elif loaded is None:
-        raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
-    else:
+    elif loaded is not None:
         folder = out if out is not None else Path("runs") / loaded.scenario.mission.name
+        fly_mission = partial(parts.fly, loaded, folder, overrides, policy=policy, replace=replace)
+    else:
+        raise typer.BadParameter("a scenario or --resume is needed.", param_hint="SCENARIO")
+    _fly_and_print_mission(fly_mission, folder, report=not no_report, view=view, json=json)
+
+
+def _wrong_use_of_seeds() -> typer.BadParameter:
+    """Return the error that options do not go together with --seeds."""
+    return typer.BadParameter(
+        "many seeds need a scenario, and neither --resume (repeat the command), --seed, --policy nor --view.",
+        param_hint="--seeds",
+    )
+
+
+def _wrong_use_of_resume() -> typer.BadParameter:
+    """Return the error that options do not go together with --resume."""
+    return typer.BadParameter(
+        "a run is continued with what its folder holds: give nothing beside it that would change it.",
+        param_hint="--resume",
+    )
+
+
+def _fly_and_print_mission(
+    fly_mission: "Callable[..., parts.RunOutcome]",
+    folder: Path,
+    *,
+    report: bool,
+    view: bool,
+    json: bool,
+) -> None:
+    """Fly a mission, and print its outcome.
+
+    Parameters
+    ----------
+    fly_mission : callable
+        `workflow.fly` or `workflow.resume` with its arguments, except `progress`, `report` and `begun`.
+    folder : Path
+        The run folder.
+    report : bool
+        Whether to write the report.
+    view : bool
+        Whether to show the mission in the browser.
+    json : bool
+        Whether to print JSON.
+    """
 
     def explain_interruption() -> str:
         if (folder / "config.json").is_file():
             return f"nothing is lost: continue with `uav-twin run --resume {folder}`"
         return "nothing is lost: no run was begun"
 
-    report = not no_report
-    progress = terminal.progress()
     with view_beside(view) as begun, terminal.interruptible(explain_interruption):
-        if loaded is None or resume is not None:
-            outcome = parts.resume(folder, loaded, progress=progress, report=report, begun=begun)
-        else:
-            outcome = parts.fly(
-                loaded,
-                folder,
-                overrides,
-                policy=policy,
-                replace=replace,
-                progress=progress,
-                report=report,
-                begun=begun,
-            )
+        outcome = fly_mission(progress=terminal.progress(), report=report, begun=begun)
         if json:
             terminal.print_json(_outcome_record(outcome))
         else:
@@ -309,10 +334,14 @@ def watch(
         _write_to_output("", flush=True)
         if not terminal.loudness.quiet:
             _print_end_of_watch(folder, watches[0], report=not no_report)
-    complaint = watches[0].intake.complaint()
+    _exit_on_complaint(watches[0])
+
+
+def _exit_on_complaint(watched: "parts.Watch") -> None:
+    """End the command with exit code 1 if the observations of a watch were not in order."""
+    complaint = watched.intake.complaint()
     if complaint:
-        typer.secho(complaint, fg="red", err=True)
-        raise typer.Exit(1)
+        raise terminal.error_exit(complaint)
 
 
 def _print_end_of_watch(folder: Path, watched: "parts.Watch", *, report: bool) -> None:

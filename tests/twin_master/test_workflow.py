@@ -182,7 +182,7 @@ def test_a_finished_run_says_so_and_is_made_whole_where_something_is_missing(flo
         (folder / "report.html").write_text("report", encoding="utf-8")
         return folder / "report.html"
 
-    monkeypatch.setattr(workflow, "_report", report)
+    monkeypatch.setattr(workflow, "_write_report", report)
     with monkeypatch.context() as patch:
         patch.setattr(workflow, "_run", None)  # nothing is done again
         notes = noted(patch)
