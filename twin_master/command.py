@@ -1,4 +1,4 @@
-"""Commands of one asset: `run`, which is `python -m twin_master`, `watch`, `view`, `scenario check`."""
+"""Commands of one asset: `run`, also as `python -m twin_master`, `watch`, `view`, `scenario check`."""
 
 import json
 import os
@@ -118,7 +118,8 @@ def _fly_and_print_mission(
     Parameters
     ----------
     fly_mission : callable
-        `workflow.fly` or `workflow.resume` with its arguments, except `progress`, `report` and `begun`.
+        `workflow.fly` or `workflow.resume` with its arguments, except `progress`, `report` and
+        `begun`.
     folder : Path
         The run folder.
     report : bool
@@ -145,7 +146,8 @@ def _fly_and_print_mission(
 def _scenario_and_ssp(scenario: str | None, with_scenario: str | None) -> tuple[str | None, Path | None]:
     """Return the scenario, and the SSP file that is flown instead of its asset.
 
-    An SSP file in the place of the scenario is flown; the option --scenario then names the scenario.
+    An SSP file in the place of the scenario is flown; the option --scenario then names the
+    scenario.
     """
     if scenario is not None and Path(scenario).suffix.lower() == ".ssp":
         if with_scenario is None:
@@ -205,7 +207,7 @@ def _numbers_of_sources(outcome: "parts.RunOutcome") -> dict[str, int]:
 
 
 def _timing_rows(outcome: "parts.RunOutcome") -> list[list[str]]:
-    """Return the rows of the table that tell the time of asset, twin and checkpoints, and of all."""
+    """Return the rows of the table with the time of asset, twin and checkpoints, and of all."""
     rows = []
     for part in ("asset", "twin", "checkpoint"):
         seconds = outcome.timing.get(f"{part}_seconds")
@@ -379,8 +381,8 @@ def _write_to_output(text: str, *, flush: bool) -> bool:
         if flush:
             sys.stdout.flush()
     except BrokenPipeError:
-        # The reader has ended, as in `watch | head`. Python would complain at its end that it cannot
-        # write the rest of the buffer, so the rest goes to the null device.
+        # The reader has ended, as in `watch | head`. Python would complain at its end that it
+        # cannot write the rest of the buffer, so the rest goes to the null device.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return False
     return True

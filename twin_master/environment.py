@@ -1,7 +1,8 @@
 """A scenario as an environment of gymnasium (extra `uav-twin[gym]`), for reinforcement learning.
 
-An action is a control of the scenario, an observation is that of its sensors. The reward is that of the
-scenario for the true state: eqs. (9) and (10) of Kapteyn et al. 2021 with the scenario's weights.
+An action is a control of the scenario, an observation is that of its sensors. The reward is that of
+the scenario for the true state: eqs. (9) and (10) of Kapteyn et al. 2021 with the scenario's
+weights.
 """
 
 from collections.abc import Mapping
@@ -33,8 +34,9 @@ except ImportError:
 class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     """The asset of a scenario, its damage and its sensors, step by step.
 
-    `reset` flies the first step of the mission, under the scenario's first control. An episode has as
-    many steps as the mission, and then is truncated. A lost sensor shows zero; `info` has NaN for it.
+    `reset` flies the first step of the mission, under the scenario's first control. An episode has
+    as many steps as the mission, and then is truncated. A lost sensor shows zero; `info` has NaN
+    for it.
 
     Parameters
     ----------
@@ -89,8 +91,8 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self.scenario = resolve_scenario(load_scenario(scenario), overrides)
         if self.scenario.observation.role == "modes":
             raise MissionInputError(
-                f"the scenario {self.scenario.mission.name} observes modes with a covariance, which "
-                "are no vector of sensors: take a scenario that observes sensors."
+                f"the scenario {self.scenario.mission.name} observes modes with a covariance, "
+                "which are no vector of sensors: take a scenario that observes sensors."
             )
         source = source_of(self.scenario)
         source.check()
@@ -156,10 +158,10 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     def step(self, action: np.int64 | int) -> tuple[Float, float, bool, bool, dict[str, Any]]:
         """Fly one step under a control.
 
-        The episode is terminated if an action ends the mission, or if the asset ends its simulation by
-        itself; then `info["ended"]` holds the sentence. In the latter case the observation is that of
-        the step before, and the reward is zero. After the last step of the mission the episode is
-        truncated.
+        The episode is terminated if an action ends the mission, or if the asset ends its simulation
+        by itself; then `info["ended"]` holds the sentence. In the latter case the observation is
+        that of the step before, and the reward is zero. After the last step of the mission the
+        episode is truncated.
 
         Parameters
         ----------

@@ -13,7 +13,7 @@ class TwinMasterError(StandsForOthersError):
 
 
 class InvalidModelError(TwinMasterError, ValueError):
-    """State space, controls, sensors or rewards do not fit, or a distribution does not sum to one."""
+    """States, controls, sensors or rewards do not fit, or probabilities do not sum to one."""
 
 
 class InvalidObservationError(TwinMasterError, ValueError):
@@ -21,7 +21,7 @@ class InvalidObservationError(TwinMasterError, ValueError):
 
 
 class PlanningError(TwinMasterError, RuntimeError):
-    """There is no policy: the problem has no solution, value iteration failed, or a file is wrong."""
+    """There is no plan: no policy solves the problem, or the file of a policy is wrong."""
 
 
 class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the name says it all
@@ -47,8 +47,8 @@ class ImpossibleObservation(TwinMasterError, RuntimeError):  # noqa: N818 - the 
             sensors = f" (worst residuals {', '.join(residuals)})"
         super().__init__(
             f"twin {twin!r}, step {step}: the observation has probability zero in every state that "
-            f"the belief still allows{sensors}; check these sensors, or the transitions and the prior "
-            "that rule out the true state"
+            f"the belief still allows{sensors}; check these sensors, or the transitions and the "
+            "prior that rule out the true state"
         )
 
     def __reduce__(

@@ -78,7 +78,8 @@ def watch(
 class _Console:
     """The output of a watched fleet.
 
-    A program gets decisions as lines of JSON; people see a table. Both get notices as lines of text.
+    A program gets decisions as lines of JSON; people see a table. Both get notices as lines of
+    text.
 
     Attributes
     ----------
@@ -137,7 +138,7 @@ def _table_of_worst_assets(standing: Mapping[str, Any]) -> "parts.Table":
             assets[name] = asset
 
     def urgency(name: str) -> tuple[int, float]:
-        """Return alarms and severity; an asset for which no state is believed is the most severe."""
+        """Return alarms and severity, which is infinite for an asset whose state is not believed."""
         severity = assets[name]["severity"]
         return assets[name]["alarms"], inf if severity is None else severity
 
@@ -151,7 +152,8 @@ def _table_of_worst_assets(standing: Mapping[str, Any]) -> "parts.Table":
         health = parts.health_in_words(last)
         cells = [health.get(state, "") for state in states]
         alarms = str(assets[name]["alarms"] or "")
-        rows.append([name, str(last["step"]), last["control"], *cells, last["next_control"], alarms])
+        row = [name, str(last["step"]), last["control"], *cells, last["next_control"], alarms]
+        rows.append(row)
     headings = ["asset", "step", "control", *states, "next", "alarms"]
     table = terminal.console_table(headings, rows, terminal.console().width)
     table.title = _heading(standing)
@@ -302,8 +304,8 @@ class ViewServer:
     is_ready : callable
         Takes a folder; returns whether it can be shown yet.
     serve : callable
-        Takes a folder, a port, a function that is called with the address, and one that returns whether
-        to go on; serves the page until then.
+        Takes a folder, a port, a function that is called with the address, and one that returns
+        whether to go on; serves the page until then.
     """
 
     is_ready: Callable[[Path], bool]
@@ -324,7 +326,8 @@ def view_beside(wanted: bool, server: ViewServer | None = None) -> Iterator[Call
     Yields
     ------
     callable
-        To be called with the folder of the mission once it exists; it does nothing if `wanted` is false.
+        To be called with the folder of the mission once it exists; it does nothing if `wanted` is
+        false.
     """
     if not wanted:
         yield lambda _folder: None
@@ -355,7 +358,8 @@ def _serve_mission(folder: Path, mission_process: int, server: ViewServer | None
     """Show a mission once it is prepared, until the process that flies it ends."""
     if server is None:
         server = ViewServer(parts.is_prepared, parts.serve)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the mission, which ends this process
+    # Ctrl-C is for the mission, which then ends this process.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(_NICENESS_OF_VIEW)
 
     def is_mission_alive() -> bool:

@@ -1,4 +1,4 @@
-"""Commands `uav-twin plan` and `uav-twin design`: decisions by the belief, and choices of sensors."""
+"""Commands `uav-twin plan` and `uav-twin design`: plans on the belief, choices of sensors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -264,7 +264,7 @@ def design(
 
 
 def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]:
-    """Return the titles in the option --among, which are different ones of all titles; all by default."""
+    """Return the titles that the option --among names; all titles if it is not given."""
     if among is None:
         return titles
     candidates = tuple(among.split(","))
@@ -280,7 +280,7 @@ def _candidate_titles(titles: Sequence[str], among: str | None) -> Sequence[str]
 def _compare_returns(
     knowledge: "parts.Knowledge", chosen: Sequence[str], candidates: Sequence[str]
 ) -> dict[str, list[float]]:
-    """Return the expected return, and its half width, with the chosen sensors and all candidates."""
+    """Return the returns with the chosen sensors and with all candidates, as mean and half width."""
     titles = _sensor_titles(knowledge.scenario)
     not_chosen = [title for title in titles if title not in chosen]
     no_candidates = [title for title in titles if title not in candidates]
@@ -306,7 +306,7 @@ def _print_design(record: Mapping[str, Any], candidates: int) -> None:
 
 
 def _levels_in_words(knowledge: "parts.Knowledge", factor_name: str, level: int) -> str:
-    """Return two neighbouring levels of a state factor in words, given the index of the lower one."""
+    """Return a level of a state factor, given by its index, and the next one in words."""
     index = knowledge.scenario.state_names.index(factor_name)
     factor = knowledge.scenario.state[index]
     scale, unit = parts.printed_state(factor.unit)
@@ -353,7 +353,7 @@ def _write_design_picture(
 
 
 def _find_gauges(scenario: "parts.Scenario") -> _GaugePlaces:
-    """Return where the gauges of a scenario are, from the structure file or the design of a wing."""
+    """Return where the gauges are, from the structure file or the design of a wing."""
     import numpy as np
 
     files = scenario.belief.all_files()

@@ -35,7 +35,7 @@ missing force, if motion was observed."""
 KIND = "uav-twin run"
 """The value of `kind` in the `config.json` of a run folder."""
 HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twin", "matplotlib"})
-"""A run may be resumed after a change of these packages, because no stored figure depends on them."""
+"""Packages that may change before a run is resumed, because no stored figure depends on them."""
 
 
 def to_json(record: Mapping[str, Any]) -> str:
@@ -84,8 +84,8 @@ def create_run_folder(
     Raises
     ------
     RunFolderError
-        If the folder exists and is not to be replaced, or is no run folder, or if another process is
-        flying in the folder that is to be replaced.
+        If the folder exists and is not to be replaced, or is no run folder, or if another process
+        is flying in the folder that is to be replaced.
     FileNotWrittenError
         If the disk is full or the folder cannot be written.
     """
@@ -98,8 +98,8 @@ def create_run_folder(
         )
     if is_occupied and not replace:
         raise RunFolderError(
-            f"{folder} holds a run already: choose another --out, go on with it by --resume, or give "
-            "--replace."
+            f"{folder} holds a run already: choose another --out, go on with it by --resume, or "
+            "give --replace."
         )
     with ExitStack() as locks:
         with whole_folder(folder, lock_run_folder, locks) as new_folder:
@@ -195,8 +195,8 @@ def check_versions(folder: Path, config: Mapping[str, Any], seed: int) -> None:
         names = sorted(changed - HARMLESS_PACKAGES)
         if names:
             raise NotResumableError(
-                f"{folder} was begun with another version of {', '.join(names)}, so its results could "
-                "not be the same: fly the mission again with --replace."
+                f"{folder} was begun with another version of {', '.join(names)}, so its results "
+                "could not be the same: fly the mission again with --replace."
             )
 
 
@@ -277,8 +277,8 @@ def new_run_folder(
     folder : Path
         The folder to create.
     files : mapping of str to bytes
-        The contents of the files that belong to asset and belief, and of further ones, by their paths
-        in the folder.
+        The contents of the files that belong to asset and belief, and of further ones, by their
+        paths in the folder.
     replace : bool
         Whether to replace an existing run folder.
     watched : bool

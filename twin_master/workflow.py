@@ -1,7 +1,7 @@
 """The whole chain: design -> reduced model -> FMU -> calibration -> mission -> store -> report.
 
-`check_scenario` checks a scenario before: it reads only the scenario and the small files beside it, which
-takes no time.
+`check_scenario` checks a scenario before: it reads only the scenario and the small files beside it,
+which takes no time.
 """
 
 import time
@@ -41,7 +41,7 @@ from twin_master.store.summary import truth_mismatch
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
 
 POLICY_NAME = "policy.npy"
-"""The file of a run folder with the policy that was given in place of a plan, (S, U) or on the belief."""
+"""The file of a run folder with the policy that is flown instead of a plan."""
 
 
 Begun = Callable[[Path], None]
@@ -68,11 +68,12 @@ def fly(
     folder : Path or str, optional
         The run folder to make; ``runs/NAME`` by default.
     overrides : Overrides or mapping, optional
-        What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu": "wing.fmu"}``.
+        What differs from the file: the fields of `Overrides`, such as ``{"seed": 3, "fmu":
+        "wing.fmu"}``.
     policy : (S, U) array, BeliefPolicy or Path, optional
         The policy that is flown instead of a plan: p(U | D), row-stochastic, states in the order of
-        `Knowledge.model.states`, controls in that of the scenario; or a policy on the belief, or its
-        file. The run folder keeps it.
+        `Knowledge.model.states`, controls in that of the scenario; or a policy on the belief, or
+        its file. The run folder keeps it.
     replace : bool
         Whether to replace an existing run folder.
     report : bool
@@ -231,8 +232,8 @@ def _prepare_knowledge(
         mismatch = truth_mismatch(draws.name, truth, draws.mean, draws.standard_deviation)
         if mismatch is not None:
             progress.note(
-                f"{mismatch} To fly the calibrated asset, leave {draws.name} out of `parameters` in the "
-                "scenario's table `asset`."
+                f"{mismatch} To fly the calibrated asset, leave {draws.name} out of `parameters` in "
+                "the scenario's table `asset`."
             )
     calibrated = calibrated_with(
         draws.record or {}, source.origin.asset, source.origin.model, config["inputs"]
@@ -266,8 +267,8 @@ def _advice_on_error(folder: Path) -> Iterator[None]:
     except Exception as error:
         if (folder / JOURNAL_NAME).exists():
             error.add_note(
-                f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, where the "
-                "scenario itself is to be changed, fly the changed one with --replace."
+                f"What was flown is kept: continue with `uav-twin run --resume {folder}`, or, where "
+                "the scenario itself is to be changed, fly the changed one with --replace."
             )
         else:
             error.add_note("Nothing was flown yet: once this is mended, fly again with --replace.")
@@ -302,7 +303,7 @@ def _fly(
 
 
 def _model_misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
-    """Return the difference of the predicted to the true observations (S, U, G), relative to the latter.
+    """Return the relative difference of predicted to true observations (S, U, G).
 
     None is returned if asset and model are not known to differ.
     """
@@ -366,9 +367,9 @@ def check_scenario(
     Returns
     -------
     dict
-        What is flown and believed, in words, and the size of the twin: the number of `levels` of each
-        factor, of joint `states` and of `sensors`, the `controls`, and the `memory` of all arrays in
-        bytes.
+        What is flown and believed, in words, and the size of the twin: the number of `levels` of
+        each factor, of joint `states` and of `sensors`, the `controls`, and the `memory` of all
+        arrays in bytes.
 
     Raises
     ------

@@ -5,7 +5,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -215,13 +214,23 @@ def _true_transition_factor(scenario: Scenario) -> Float | None:
     """
     if not scenario.truth.probability:
         return np.asarray(1.0)
-    pairs = list(product(scenario.control_names, scenario.state_names))
-    true = np.array([probability_of(scenario.truth.probability, *pair) for pair in pairs])
-    assumed = np.array([probability_of(scenario.transition.probability, *pair) for pair in pairs])
+    true = _worsening_probabilities(scenario, scenario.truth.probability)
+    assumed = _worsening_probabilities(scenario, scenario.transition.probability)
     factor = true.sum() / max(assumed.sum(), np.finfo(float).tiny)
     if np.allclose(true, factor * assumed, rtol=1e-9, atol=0.0):
         return np.asarray(factor)
     return None
+
+
+def _worsening_probabilities(
+    scenario: Scenario, table: Mapping[str, float | Mapping[str, float]]
+) -> Float:
+    """Return the probability to worsen of each control and state factor, in one array (U F,)."""
+    probabilities = []
+    for control in scenario.control_names:
+        for state in scenario.state_names:
+            probabilities.append(probability_of(table, control, state))
+    return np.array(probabilities)
 
 
 def printed_unit_of_quantity(name: str, unit: str, scenario: Scenario) -> tuple[float, str]:
