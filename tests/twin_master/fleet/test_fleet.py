@@ -281,7 +281,7 @@ def known(name: str, library_file: Path, decide_on: str = "filtered") -> tuple[K
 
 
 def same(first: Flights, second: Flights) -> bool:
-    names = ("row", "control_index", "state", "filtered", "log_evidence")
+    names = ("observation_rows", "control_index", "state", "filtered", "log_evidence")
     pairs = ((getattr(first, name), getattr(second, name)) for name in names)
     told = (first.failure, first.ended) == (second.failure, second.ended)
     return told and all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
