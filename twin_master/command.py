@@ -24,6 +24,9 @@ from twin_master import parts
 from twin_master.errors import TwinMasterError
 from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
 
+Decision = Mapping[str, Any]
+"""The decision of a twin in a step, as `decision_from_line` returns it."""
+
 
 def run(
     scenario: str | None = None,
@@ -300,7 +303,7 @@ def watch(
     comes_from_broker = parts.is_broker(observations or "")
     is_live = follow or observations is None or observations == "-" or comes_from_broker
 
-    def print_decision(decision: Mapping[str, Any]) -> None:
+    def print_decision(decision: Decision) -> None:
         has_reader = _print_decision(watches[0], decision, flush=is_live)
         time.sleep(pace)
         if not has_reader and not comes_from_broker:
@@ -358,7 +361,7 @@ def _print_end_of_watch(folder: Path, watched: "parts.Watch", *, report: bool) -
         typer.echo(f"Report: {folder / parts.REPORT_NAME}", err=True)
 
 
-def _print_decision(watched: "parts.Watch", decision: Mapping[str, Any], *, flush: bool) -> bool:
+def _print_decision(watched: "parts.Watch", decision: Decision, *, flush: bool) -> bool:
     """Print a decision and its notices; return whether the output still has a reader."""
     # Notices go to the error stream, so that people see them also if a program reads the decisions.
     for notice in decision["notices"]:
@@ -388,7 +391,7 @@ def _write_to_output(text: str, *, flush: bool) -> bool:
     return True
 
 
-def decision_line(scenario: "parts.Scenario", decision: Mapping[str, Any]) -> str:
+def decision_line(scenario: "parts.Scenario", decision: Decision) -> str:
     """Return a decision as a line of text for people."""
     health = "no state is believed"
     if decision.get("state_believed", True):

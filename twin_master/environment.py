@@ -30,6 +30,9 @@ try:
 except ImportError:
     raise MissionInputError("a ScenarioEnvironment needs gymnasium: pip install 'uav-twin[gym]'.") from None
 
+Info = dict[str, Any]
+"""What is known of a step beside its observation, see `ScenarioEnvironment`."""
+
 
 class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
     """The asset of a scenario, its damage and its sensors, step by step.
@@ -111,14 +114,12 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         self._seed = 0
         self._control = 0
         self._last_observation: Float = np.empty(0)
-        self._last_info: dict[str, Any] = {}
+        self._last_info: Info = {}
         values = self.scenario.observation.count + len(self.scenario.readings)
         self.action_space = gymnasium.spaces.Discrete(len(self.scenario.control))
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (values,), np.float64)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Float, Info]:
         """Begin a mission, and fly its first step under the first control of the scenario.
 
         Parameters
@@ -155,7 +156,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         observation, _reward, info = self._fly(first_control, None)
         return observation, info
 
-    def step(self, action: np.int64 | int) -> tuple[Float, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64 | int) -> tuple[Float, float, bool, bool, Info]:
         """Fly one step under a control.
 
         The episode is terminated if an action ends the mission, or if the asset ends its simulation
@@ -223,7 +224,7 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
             self._asset.close()
         self._asset = None
 
-    def _fly(self, control: int, previous_control: int | None) -> tuple[Float, float, dict[str, Any]]:
+    def _fly(self, control: int, previous_control: int | None) -> tuple[Float, float, Info]:
         """Fly one step under a control; return the observation (G,), the reward and `info`."""
         assert self._plant is not None
         reading = self._plant.fly_step(control, previous_control)

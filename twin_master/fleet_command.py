@@ -22,6 +22,8 @@ from twin_master.errors import TwinMasterError
 
 WORDS = "twin_master.fleet"
 """The package whose words are printed."""
+Standing = Mapping[str, Any]
+"""How each asset of a watched fleet stands, as `FleetWatch.standing` tells it."""
 ROWS = 20
 """The number of assets in the table on the console, the worst first."""
 
@@ -90,7 +92,7 @@ class _Console:
     def __init__(self) -> None:
         self._is_for_people = sys.stdout.isatty()
         self._live = parts.Live(console=parts.Console(), auto_refresh=False, transient=False)
-        self._last_standing: Mapping[str, Any] = {}
+        self._last_standing: Standing = {}
         self.live_display: AbstractContextManager[object] = nullcontext()
         if self._is_for_people and not terminal.loudness.quiet:
             self.live_display = self._live
@@ -116,7 +118,7 @@ class _Console:
         else:
             typer.echo(text, err=True)
 
-    def refresh(self, standing: Mapping[str, Any]) -> None:
+    def refresh(self, standing: Standing) -> None:
         """Show the table if it has changed; pass on the printed decisions to a program."""
         if not self._is_for_people:
             sys.stdout.flush()
@@ -125,12 +127,12 @@ class _Console:
             self._live.update(_table_of_worst_assets(standing), refresh=True)
 
 
-def _heading(standing: Mapping[str, Any]) -> str:
+def _heading(standing: Standing) -> str:
     """Return how many assets are watched, with their steps and alarms, in words."""
     return parts.Words(WORDS).say("heading", counts=parts.counts_of(standing))
 
 
-def _table_of_worst_assets(standing: Mapping[str, Any]) -> "parts.Table":
+def _table_of_worst_assets(standing: Standing) -> "parts.Table":
     """Return the table of the assets with the most alarms and the most severe damage."""
     assets = {}
     for name, asset in standing["assets"].items():

@@ -1,6 +1,6 @@
 """Commands `uav-twin plan` and `uav-twin design`: plans on the belief, choices of sensors."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,6 +11,9 @@ from reporting.files import atomic_write_bytes
 from reporting.words import comma_list
 from twin_master import parts
 from twin_master.errors import MissionInputError
+
+Record = dict[str, Any]
+"""The result of a command, as it is printed as JSON."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ def plan(
         atomic_write_bytes(out, parts.encode_policy(planned.plan.policy, knowledge.model))
     if picture is not None:
         _write_picture(picture, parts.plan_figure(planned.plan.policy, knowledge.model))
-    record: dict[str, Any] = {
+    record: Record = {
         "lower": planned.plan.lower,
         "upper": planned.plan.upper,
         "simulated": planned.simulated.mean,
@@ -76,7 +79,7 @@ def plan(
         _print_plan(record)
 
 
-def _print_plan(record: Mapping[str, Any]) -> None:
+def _print_plan(record: Record) -> None:
     """Print the returns of the rules, the bounds of the plan, and the value of an information."""
     rows = []
     for rule, (mean, half_width) in record["rules"].items():
@@ -245,7 +248,7 @@ def design(
     for (factor, level), separation in separations.items():
         if separation < 1.0:
             not_separated.append(_levels_in_words(knowledge, factor, level))
-    record: dict[str, Any] = {
+    record: Record = {
         "sensors": chosen_titles,
         "information": list(choice.information),
         "of_all": choice.of_all,
@@ -294,7 +297,7 @@ def _compare_returns(
     return {name: [returns.mean, returns.half_width] for name, returns in compared.items()}
 
 
-def _print_design(record: Mapping[str, Any], candidates: int) -> None:
+def _print_design(record: Record, candidates: int) -> None:
     """Print the chosen sensors with their information, and what no candidate separates."""
     for sensor, information in zip(record["sensors"], record["information"], strict=True):
         terminal.say(f"{sensor}: {information:.3f} bit with those before it.")

@@ -38,7 +38,7 @@ HARMLESS_PACKAGES = frozenset({"discrepancy", "reporting", "scenarios", "uav_twi
 """Packages that may change before a run is resumed, because no stored figure depends on them."""
 
 
-def to_json(record: Mapping[str, Any]) -> str:
+def to_json(record: Mapping[str, object]) -> str:
     """Return a record as JSON text; equal records give equal texts."""
     text = json.dumps(record, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
     return text + "\n"
@@ -61,7 +61,7 @@ def find_config(folder: Path, *kinds: str) -> JsonObject | None:
 @contextmanager
 def create_run_folder(
     folder: Path,
-    config: Mapping[str, Any],
+    config: JsonObject,
     files: Mapping[str, bytes] | None = None,
     *,
     replace: bool = False,
@@ -74,7 +74,7 @@ def create_run_folder(
     ----------
     folder : Path
         The folder; it must be absent or empty unless `replace` is given.
-    config : mapping of str to object
+    config : dict
         The content of `config.json`.
     files : mapping of str to bytes, optional
         The contents of further files, by their paths in the folder.
@@ -165,14 +165,14 @@ def remove_half_written_files(folder: Path) -> None:
         remove_leftovers(directory)
 
 
-def check_versions(folder: Path, config: Mapping[str, Any], seed: int) -> None:
+def check_versions(folder: Path, config: JsonObject, seed: int) -> None:
     """Refuse to continue a run with other code than it was begun with.
 
     Parameters
     ----------
     folder : Path
         The run folder.
-    config : mapping of str to object
+    config : dict
         The content of its `config.json`.
     seed : int
         The seed of the run.

@@ -121,7 +121,7 @@ def step_record(step: MissionStep) -> JsonObject:
 
 
 def reading_from_line(record: JsonObject) -> Reading:
-    """Return the reading that a step of the journal assimilated.
+    """Return the reading in a line of the journal; that of a simulated asset has its ground truth.
 
     Raises
     ------

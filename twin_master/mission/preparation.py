@@ -155,7 +155,10 @@ class Knowledge:
 
     @cached_property
     def problem(self) -> DecisionProblem:
-        """The decision problem; its observations are sampled and joined to classes."""
+        """The decision problem of the mission.
+
+        It needs finitely many observations: those that are sampled here are joined to classes.
+        """
         random_numbers = generator(self.scenario.mission.seed, "planning")
         return DecisionProblem(
             self.model.transition,
@@ -329,7 +332,8 @@ def _inspected_sensor_model(
     coordinates = model.states.coordinates  # (S, F)
     within_level = np.zeros_like(coordinates)
     if scenario.observation.between_levels:
-        # The standard deviation of each factor inside the interval that its level stands for.
+        # The standard deviation of each factor inside the interval that its level stands for: the
+        # last two axes of the changes are the factor that changes and the factor that is moved.
         within_level = np.einsum("sff->sf", model.states.within_interval(coordinates))
     return partial(
         InspectedSensorModel,

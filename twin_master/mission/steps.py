@@ -332,7 +332,7 @@ class Truth:
         Its random numbers have the shape (T, B, ...). Script, drift and losses are those of the
         scenario, the same in all missions.
         """
-        stacked = copy(truths[0])
+        stacked = copy(truths[0])  # its script, drift and losses are those of all
         for name in ("noise", "uniform", "reading_noise"):
             setattr(stacked, name, np.stack([getattr(truth, name) for truth in truths], axis=1))
         return stacked
