@@ -184,10 +184,10 @@ def _run(
     with timed("asset"):
         hashes = dict(source.prepare(folder, progress))
         policy = None
-        policy_file = folder / POLICY_NAME
-        if policy_file.is_file():
-            hashes["policy"] = hash_file(policy_file)
-            policy = read_policy(policy_file, build_graphical_model(scenario))
+        policy_path = folder / POLICY_NAME
+        if policy_path.is_file():
+            hashes["policy"] = hash_file(policy_path)
+            policy = read_policy(policy_path, build_graphical_model(scenario))
     config = run_folder.record_inputs(folder, locked.config, hashes)
     with timed("calibration"), progress.stage("Calibrating and planning"):
         knowledge = _prepare_knowledge(folder, config, scenario, source, policy, progress)
