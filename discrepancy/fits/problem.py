@@ -364,6 +364,27 @@ class Problem:
         misfits = channel_misfits(self.freedom, self.counts, sums)
         return float(misfits[self.counts > 0].sum())
 
+    def recorded_misfit(self, sums: FloatArray) -> float:
+        """Return -ln L if the noise is exactly as recorded, up to a constant [nat].
+
+        Its constant is that of the evidence with a missing force, where the noise is taken as
+        recorded too, and where readings are counted in units of the noise's standard deviation. A
+        whitened reading has a smaller standard deviation, that of the innovations of the noise.
+
+        Parameters
+        ----------
+        sums : (channels,) array
+            The sum of squared standardised residuals of each channel.
+        """
+        log_determinant = 0.0
+        for data in self.trials:
+            static_deviation = data.trial.noise_factor * np.array(
+                [noise.static_deviation for noise in data.noise]
+            )
+            log_ratio = np.log(data.deviation / static_deviation)
+            log_determinant += float((data.weight * log_ratio).sum())
+        return 0.5 * float(sums.sum()) + log_determinant
+
     def precisions(self, sums: FloatArray) -> FloatArray:
         """Return the expected noise precision of each channel over the recorded 1 / s0^2.
 

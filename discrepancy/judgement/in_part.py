@@ -59,8 +59,9 @@ def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
         The verdict. If the gap is unexplained, its fit is that of the best hypothesis that the
         sentence mentions.
     """
-    if search.force_search is not None and search.force_hypotheses:
-        return _verdict_by_comparison(ForceComparison(search, search.force_search), first)
+    force_search = search.force_search if search.force_hypotheses else None
+    if force_search is not None and not _missing_force_vanishes(search):
+        return _verdict_by_comparison(ForceComparison(search, force_search), first)
     compare_under_wide_noise(search)
     comparison = SimulationComparison(search)
     outcome = verdict_under_coloured_noise(comparison)
@@ -68,6 +69,22 @@ def verdict_in_part(search: Search, first: Verdict) -> VerdictOutcome:
         return outcome
     comparison.add_families()
     return _verdict_by_comparison(comparison, first)
+
+
+def _missing_force_vanishes(search: Search) -> bool:
+    """Return whether a simulation is more probable than every hypothesis with a missing force.
+
+    A simulation is the limit of an estimate whose missing force is zero. It is compared with the
+    other estimates on the same readings and under the same noise. This is possible only if all
+    trials are in motion, as trials at rest show no missing force, and if every channel has a noise
+    record.
+    """
+    if not search.is_all_in_motion or not np.all(search.problem.freedom > 0.0):
+        return False
+    simulations = [fit for fit in search.exact_fits.values() if fit.candidate.terms]
+    scores = [search.score_under_recorded_noise(fit) for fit in simulations]
+    best_with_force = max(search.score(hypothesis) for hypothesis in search.force_hypotheses)
+    return max(scores, default=-np.inf) > best_with_force
 
 
 def verdict_by_laws_alone(search: Search, first: Verdict) -> VerdictOutcome | None:

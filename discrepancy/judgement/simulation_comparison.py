@@ -182,15 +182,23 @@ class SimulationComparison(Comparison[CandidateFit]):
     def failed_check(self, hypothesis: CandidateFit) -> str:
         """Return the reason why a hypothesis fails the test of consistency or of held-out trials.
 
-        It is empty if it fails neither, or if its residuals are more than noise anyway.
+        It is empty if it fails neither, or if its residuals are more than noise anyway. In held-out
+        trials they may be more than noise too if the hypothesis explains nearly all of the gap
+        there: what remains is then told with its size.
         """
         if hypothesis.residual_process is not None:
             return ""
-        gates = (
-            check_consistency(self.problem, hypothesis),
-            check_held_out(self.residuals(hypothesis)),
-        )
+        gates = [check_consistency(self.problem, hypothesis)]
+        if not self._explains_nearly_all_held_out(hypothesis):
+            gates.append(check_held_out(self.residuals(hypothesis)))
         return next((gate.reason for gate in gates if gate.passed is False), "")
+
+    def _explains_nearly_all_held_out(self, hypothesis: CandidateFit) -> bool:
+        """Return whether a hypothesis surely explains nearly all of the gap in held-out trials."""
+        if not self.has_held_out:
+            return False
+        low_end, _ = self.share(hypothesis, held_out=True).interval
+        return low_end > SEARCH.nearly_all
 
     def _simulation(self, hypothesis: CandidateFit) -> CandidateFit:
         """Return the hypothesis, which is a simulation itself."""

@@ -54,6 +54,17 @@ class FittedCandidates:
         """Return ln (evidence times prior) of a hypothesis, up to a constant [nat]."""
         return fit.log_evidence + self.log_prior(fit.candidate)
 
+    def score_under_recorded_noise(self, fit: CandidateFit) -> float:
+        """Return ln (evidence times prior) of a simulation if the noise is as recorded [nat].
+
+        The evidence of a fit averages over the variance of the noise, which its record leaves
+        uncertain. Hypotheses with a missing force take the recorded variance as exact; with this
+        score a simulation can be compared with them.
+        """
+        averaged_misfit = self.problem.misfit(fit.sums)
+        recorded_misfit = self.problem.recorded_misfit(fit.sums)
+        return self.score(fit) + averaged_misfit - recorded_misfit
+
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
         """Return the fit of every candidate by which it is compared.
 

@@ -97,9 +97,9 @@ class Excitation:
     release: ReleasePoint | None = None
 
     @property
-    def edges(self) -> list[float]:
-        """Times at which a load jumps, begins or ends [s]."""
-        return [edge for load in self.loads for edge in load.history.edges]
+    def edges(self) -> FloatArray:
+        """Times at which a load jumps, begins or ends, (J,) [s]."""
+        return np.concatenate([np.zeros(0), *(load.history.edges for load in self.loads)])
 
     @property
     def is_smooth(self) -> bool:

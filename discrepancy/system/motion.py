@@ -375,7 +375,7 @@ def _advance_in_steps(
     modal = system.modal
     follows_curve = excitation.is_smooth or bool(excitation.prescribed_motions)
     least_parts = SMOOTH_PARTS if follows_curve else 1
-    edges = (*laws.switching_times, *excitation.edges)
+    edges = np.concatenate((laws.switching_times, excitation.edges))
     boundaries = step_boundaries(modal, laws, stamps, refinement, least_parts, edges)
     # displacements of the ports under loads in the modes without inertia
     port_displacements = np.zeros((len(boundaries.time), len(laws)))

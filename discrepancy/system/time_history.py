@@ -25,8 +25,8 @@ class LoadHistory(Protocol):
         """How the load is interpolated between samples."""
 
     @property
-    def edges(self) -> tuple[float, ...]:
-        """Times at which the load jumps, begins or ends [s]."""
+    def edges(self) -> FloatArray:
+        """Times at which the load jumps, begins or ends, (J,) [s]."""
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the values (N,) at times, or a time derivative of them."""
@@ -55,11 +55,11 @@ class RecordedHistory:
     motion_order: int | None = None
 
     @property
-    def edges(self) -> tuple[float, ...]:
-        """Times at which the history jumps or has a corner [s]."""
+    def edges(self) -> FloatArray:
+        """Times at which the history jumps or has a corner, (J,) [s]."""
         if self.hold is Hold.SMOOTH:
-            return ()
-        return tuple(self.time.tolist())
+            return np.zeros(0)
+        return self.time
 
     @cached_property
     def _spline(self) -> PPoly:
@@ -107,9 +107,9 @@ class FormulaHistory:
     hold: ClassVar[Hold | None] = Hold.SMOOTH
 
     @property
-    def edges(self) -> tuple[float, ...]:
-        """Times at which the load begins or ends [s]."""
-        return tuple(edge for span in self.spans for edge in span if isfinite(edge))
+    def edges(self) -> FloatArray:
+        """Times at which the load begins or ends, (J,) [s]."""
+        return np.array([edge for span in self.spans for edge in span if isfinite(edge)])
 
     def values_at(self, time: FloatArray, derivative: int = 0) -> FloatArray:
         """Return the values (N,) at times; a formula is never differentiated."""

@@ -70,7 +70,7 @@ def step_boundaries(
     time: FloatArray,
     refinement: int = 1,
     least: int = 1,
-    switching_times: Sequence[float] = (),
+    switching_times: Sequence[float] | FloatArray = (),
 ) -> Boundaries:
     """Return time steps between stamps that are short enough for the laws.
 
@@ -86,12 +86,15 @@ def step_boundaries(
         Factor on the number of steps.
     least : int
         Least number of steps in each interval, before refinement.
-    switching_times : sequence of float
+    switching_times : sequence or array of float
         Times at which a load or a law begins or ends, so that a step has to end there [s].
     """
-    inside = [moment for moment in switching_times if time[0] < moment < time[-1]]
-    if inside:
-        all_times = np.union1d(time, inside)
+    moments = np.asarray(switching_times, dtype=np.float64)
+    moments = moments[(moments > time[0]) & (moments < time[-1])]
+    # most are stamps, as a sampled load has a corner at each of its samples
+    between_stamps = moments[time[np.searchsorted(time, moments)] != moments]
+    if len(between_stamps):
+        all_times = np.union1d(time, between_stamps)
         boundaries = step_boundaries(system, laws, all_times, refinement, least)
         samples = boundaries.sample_boundary[np.searchsorted(all_times, time)]
         return replace(boundaries, sample_boundary=samples)
