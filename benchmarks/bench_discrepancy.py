@@ -54,7 +54,7 @@ def run() -> list[Measurement]:
         )
     problem = _problem(model, cases["compliant root hidden"], SEED)
     usable = tuple(effect for effect in library() if effect.unavailable(problem.setting) is None)
-    scan = Search(problem, usable, fit(problem, Candidate(), problem.start(Candidate())))
+    scan = Search(problem, usable, fit(problem, Candidate(), problem.prior_mean_point(Candidate())))
     begin = time.perf_counter()
     scan.fit_pairs()
     pairs = len(usable) * (len(usable) - 1) // 2
@@ -87,7 +87,7 @@ def _one_ringdown(model: WingModel) -> float:
     )
     data = problem.trials[number]
     patch = ModelPatch((PowerDamping("planform", 2.0, 2.0, 0.0, 1.0, 1.0),))
-    point = problem.start(Candidate())
+    point = problem.prior_mean_point(Candidate())
     conditions = data.unknowns.conditions(
         data.trial, problem.shared.parameters(point.shared), point.local[number]
     )

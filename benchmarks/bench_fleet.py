@@ -12,7 +12,7 @@ from fe.reduction.model_cache import reduced_model
 from reporting.files import atomic_write_text
 from scenarios import scenario_files
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.evidence import Worsening, scaled_likelihood, transition_evidence
+from twin_master.fleet.evidence import TransitionFamily, scaled_likelihood, transition_evidence
 from twin_master.fleet.flight import fly_fleet
 from twin_master.fleet.plan import ensemble
 from twin_master.mission.preparation import prepare_knowledge
@@ -39,7 +39,7 @@ def run() -> list[Measurement]:
     observations = flown.observation_rows, flown.control_index
     sensors = knowledge.sensor_model
     likelihood = cpu_seconds(lambda: scaled_likelihood(sensors, *observations)) / steps
-    worsening = Worsening.of(scenario)
+    worsening = TransitionFamily.learnable(scenario)
     scaled = scaled_likelihood(sensors, *observations)[0]
     points = np.full((POINTS, 2), 0.1)
     transition_evidence(worsening, points[:1], scaled[:1], flown.control_index[:1])

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from discrepancy.missing_force.events import Events, events
-from discrepancy.missing_force.windows import pattern_of_residuals
+from discrepancy.missing_force.events import Events, find_events
+from discrepancy.missing_force.windows import strongest_pattern
 
 FloatArray = NDArray[np.float64]
 
@@ -67,10 +67,8 @@ def record(
 
 def found_in(time: FloatArray, values: FloatArray) -> Events:
     """Return the events of a record."""
-    force, _ = pattern_of_residuals(
-        "record", time, values[:, None], np.ones((len(values), 1), bool)
-    )
-    return events(force.view, 0, force.processes[0])
+    force, _ = strongest_pattern("record", time, values[:, None], np.ones((len(values), 1), bool))
+    return find_events(force.linear_trials, 0, force.processes[0])
 
 
 def main() -> None:
@@ -86,7 +84,7 @@ def main() -> None:
         counts: dict[str, int] = defaultdict(int)
         for _ in range(arguments.count):
             time, values, truth = record(generator, kind)
-            moments = found_in(time, values).moments(0)
+            moments = found_in(time, values).change_times(0)
             for true in truth:
                 counts["moments"] += 1
                 if not len(moments):

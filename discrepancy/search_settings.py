@@ -43,7 +43,7 @@ class SearchSettings:
     """The same grid for four or more of them: its size grows exponentially with their number."""
     largest_start: float = 2.5
     """Largest scaled magnitude at which fits begin; farther out, scales mean little."""
-    linear: float = 0.05
+    small_magnitude: float = 0.05
     """Signed magnitudes are tried at one prior deviation and at this fraction of it.
 
     An effect that shifts phases (clock, drift) is nonlinear at one deviation, before nuisances can
@@ -51,9 +51,9 @@ class SearchSettings:
     first_order: float = 25.0
     """Squared change of all readings [noise variances] to which an effect is reduced, so that its
     direction can be computed to first order."""
-    padded: int = 4
+    zero_padding: int = 4
     """Factor of zero padding of spectra, because lines lie between the frequencies of a record."""
-    peaks: int = 3
+    most_peaks: int = 3
     """Peaks of a spectrum that are tried."""
     starts: int = 2
     """Starts of the fit of each effect, if the model is close to the data."""

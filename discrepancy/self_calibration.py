@@ -321,7 +321,7 @@ def _investigated(
     outcome = outcome_of(identifier, verdict.kind, named, verdict.group)
     covered: list[Covered] = []
     if outcome == "right" and hidden is not None:
-        true_values = hidden.term.values(hidden.normal)
+        true_values = hidden.term.physical_values(hidden.normal)
         for effect in verdict.effects:
             if effect.place != place:
                 continue
@@ -351,7 +351,7 @@ def outcome_of(
     Parameters
     ----------
     hidden : str
-        Identifier of the hidden effect, or `NOTHING`.
+        Identifier of the hidden effect, or `NO_EFFECTS`.
     kind : VerdictKind
         Kind of the verdict.
     named, group : tuple of str

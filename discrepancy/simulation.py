@@ -63,10 +63,10 @@ class Simulator:
         self.model = model
         self.setting = Setting(campaign, model, model.scales(campaign))
         problem = Problem(campaign, model, self.setting)
-        self.fitted = fit(problem, Candidate(), problem.start(Candidate()))
+        self.fitted = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
         # nuisances of all trials, held-out ones too, with the parameters of that fit
         self.problem = problem.with_trials(campaign.trials)
-        zeros = tuple(np.zeros(data.unknowns.size) for data in self.problem.trials)
+        zeros = tuple(np.zeros(data.unknowns.unknown_count) for data in self.problem.trials)
         start = replace(self.fitted.point, local=zeros)
         self.nuisances = fit(self.problem, Candidate(), start, local_only=True).point
 
@@ -77,7 +77,9 @@ class Simulator:
         """
         predicted = as_predicted(self.campaign, self.model, self.setting)
         problem = Problem(predicted, self.model, self.setting)
-        return Screen(problem, fit(problem, Candidate(), problem.start(Candidate()), iterations=1))
+        return Screen(
+            problem, fit(problem, Candidate(), problem.prior_mean_point(Candidate()), iterations=1)
+        )
 
     def draw_effect(
         self, effect: Effect, screen: Screen, generator: np.random.Generator
@@ -98,7 +100,7 @@ class Simulator:
             term = EffectTerm(effect, places[int(generator.integers(len(places)))])
             normal = generator.standard_normal(len(term.parameters))
             try:
-                distance = screen.change(term, normal).squared_size
+                distance = screen.change_by_effect(term, normal).squared_size
             except DiscrepancyError:  # the structure cannot carry an effect of this size
                 continue
             if distance >= DETECTED:
@@ -134,7 +136,7 @@ class Simulator:
             if has_free_initial_state(
                 trial
             ):  # the prior has no information: the state stays as fitted
-                initial_state = slice(*data.unknowns.ends[:2])
+                initial_state = slice(*data.unknowns.ends_by_kind[:2])
                 local[initial_state] = fitted_local[initial_state]
             effect_acts = trial.kind in candidate.acts_on
             response, _ = problem.response(
@@ -144,7 +146,7 @@ class Simulator:
             point = Point(shared, (*earlier_trials, local), np.empty(0))
             values = problem.prediction(number, point, response).copy()
             for column, name in enumerate(trial.channels):
-                noise = _noise(data.noise[column], trial, generator)
+                noise = _noise(data.noise_models[column], trial, generator)
                 values[:, column] += noise_ratios[name] * trial.noise_factor * noise
             trials.append(replace(trial, values=values))
         name = f"{self.campaign.name} (simulated)"
@@ -156,7 +158,7 @@ class Simulator:
         A record with n degrees of freedom estimates the variance by chi-squared over n times the
         true one.
         """
-        freedom = self.problem.noise[name].degrees_of_freedom
+        freedom = self.problem.noise_models[name].degrees_of_freedom
         if isinf(freedom) or freedom <= 0.0:
             return 1.0
         return float(np.sqrt(freedom / generator.chisquare(freedom)))

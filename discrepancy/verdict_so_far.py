@@ -66,7 +66,9 @@ class SearchInProgress:
             return ()
         probabilities = list(self.search.set_probabilities().items())[:MOST_HYPOTHESES]
         return tuple(
-            hypothesis_record(self.search.problem, self.search.best_of(identifiers), probability)
+            hypothesis_record(
+                self.search.problem, self.search.best_fit_of_set(identifiers), probability
+            )
             for identifiers, probability in probabilities
         )
 

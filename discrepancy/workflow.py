@@ -24,7 +24,7 @@ from discrepancy.fits.candidate import Candidate
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.fitting import fit as fit_to
 from discrepancy.fits.gates import time_step_error
-from discrepancy.fits.predictive import held_out_fit, residual_set
+from discrepancy.fits.predictive import fit_held_out, residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.judgement.conclusion import calibrated_parameters
 from discrepancy.judgement.exact_sensors import exact_sensor_remarks
@@ -34,8 +34,8 @@ from discrepancy.judgement.proof import prove
 from discrepancy.judgement.remarks import NO_GAP, look_alike_remark, with_date, with_untested
 from discrepancy.location.locate import Location, locate, outlier_remarks
 from discrepancy.location.residuals import ResidualSet
-from discrepancy.missing_force.port_force import MissingForce, seen_force
-from discrepancy.missing_force.windows import gap_windows, residual_windows, sized_windows
+from discrepancy.missing_force.port_force import MissingForce, missing_force_of_verdict
+from discrepancy.missing_force.windows import add_window_sizes, gap_windows, windows_of_residuals
 from discrepancy.model_choice import load_model
 from discrepancy.proof_record import Proof
 from discrepancy.search.starts import OnProgress
@@ -188,13 +188,15 @@ def investigate(
             location = locate(before, seed=seed)
             windows = gap_windows(problem, fit, before, seed=seed)
             if after is not before:
-                windows += residual_windows(after, seed=seed, with_effect=True)
-            windows = sized_windows(windows, before, after)
+                windows += windows_of_residuals(after, seed=seed, with_effect=True)
+            windows = add_window_sizes(windows, before, after)
             remarks += [text for text in location.remarks if text not in remarks]
             remarks += outlier_remarks(after)  # a wrong reading stays far out whatever is added
     if thorough and verdict.kind not in NO_GAP and not verdict.unfitted:
         with stage("Seeing the missing force", "force"):
-            missing = seen_force(problem, search.force_search, search.force_hypotheses, fit)
+            missing = missing_force_of_verdict(
+                problem, search.force_search, search.force_hypotheses, fit
+            )
     if fit.candidate.terms:
         with stage("Proving on held-out trials", "prove"):
             proof = prove(before, after, effects=added_effects(fit), seed=seed)
@@ -321,11 +323,11 @@ def without_wrong_ends(campaign: Campaign, model: Model) -> Problem:
     reading is reported by a remark.
     """
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    from_start = fit_to(problem, Candidate(), problem.start(Candidate()))
+    from_start = fit_to(problem, Candidate(), problem.prior_mean_point(Candidate()))
     none = refit_from_first_readings(problem, from_start)
     fits = [(problem, none)]
     if problem.campaign.held_out:
-        fits.append(held_out_fit(problem, none))
+        fits.append(fit_held_out(problem, none))
     trials = {trial.name: trial for trial in problem.campaign.trials}
     new_remarks: list[str] = []
     for problem_of_trials, fitted in fits:
@@ -363,7 +365,9 @@ def _accepts_outliers(campaign: Campaign, trial: Trial) -> BoolArray:
 def open_hypotheses(search: Search, count: int = 5) -> list[tuple[CandidateFit, float]]:
     """Return the most probable sets of effects: the best fit and the probability of each."""
     ranked = list(search.set_probabilities().items())[:count]
-    return [(search.best_of(identifiers), probability) for identifiers, probability in ranked]
+    return [
+        (search.best_fit_of_set(identifiers), probability) for identifiers, probability in ranked
+    ]
 
 
 def patch_draws(
@@ -394,7 +398,7 @@ def patch_draws(
     if fit.draws is not None:
         draws = generator.choice(fit.draws, count)
     else:
-        size = fit.candidate.size
+        size = fit.candidate.parameter_count
         # covariance = L L^T, so that L times a standard normal vector has this covariance; the
         # diagonal is raised slightly, in case the matrix is singular to rounding
         factor = np.linalg.cholesky(fit.effect_covariance + 1e-15 * np.eye(size))

@@ -55,8 +55,8 @@ LONGEST_FUNCTION = 60
 
 LONGER: dict[str, str] = {
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
-    "discrepancy/missing_force/backward.py:backward": "One compiled loop over the samples of a record.",
-    "discrepancy/missing_force/kalman.py:forward": "One compiled loop over the samples of a record.",
+    "discrepancy/missing_force/backward.py:filter_backward": "One compiled loop over a record's samples.",
+    "discrepancy/missing_force/kalman.py:filter_forward": "One compiled loop over a record's samples.",
 }
 """What may be longer, each with its reason."""
 

@@ -20,7 +20,7 @@ from reporting.words import comma_list
 from twin_master.assets.asset_source import Asset
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError
-from twin_master.fleet.flight import source_of
+from twin_master.fleet.checks import source_of
 from twin_master.mission.preparation import prepare_knowledge
 from twin_master.mission.steps import Plant, sentence_of_ending_action
 from twin_master.scenario.reading import LoadedScenario, load_scenario
@@ -144,9 +144,9 @@ class ScenarioEnvironment(gymnasium.Env[Float, np.int64]):
         if asset_draws_by_itself:
             # Such an asset takes its seed when it is opened.
             self._close_asset()
-            scenario = self.scenario.under(self._seed)
+            scenario = self.scenario.with_seed(self._seed)
             source = scenario.asset.source(scenario)
-            source.use(self._folder)
+            source.use_prepared_folder(self._folder)
             self._asset = source.open()
         else:
             self._asset.restore_state(self._initial_state)

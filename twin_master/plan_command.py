@@ -192,7 +192,7 @@ def _without_information(knowledge: "parts.Knowledge", names: Sequence[str]) -> 
     for action in scenario.action:
         changes = blind_inspection if action.name in names else {}
         actions.append(action.model_copy(update=changes))
-    blind_scenario = scenario.having("observation", standard_deviation=tuple(deviation.tolist()))
+    blind_scenario = scenario.with_changes("observation", standard_deviation=tuple(deviation.tolist()))
     blind_scenario = blind_scenario.model_copy(update={"action": tuple(actions)})
     return replace(knowledge, scenario=blind_scenario)
 

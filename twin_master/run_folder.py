@@ -296,7 +296,7 @@ def new_run_folder(
     config["scenario_file"] = dict(file)
     config["provenance"] = collect_provenance(resolved.mission.seed).as_dict()
     with create_run_folder(folder, config, files, replace=replace):
-        yield LockedRun(config, resolved.portable().moved(folder))
+        yield LockedRun(config, resolved.portable().with_paths_from(folder))
 
 
 @contextmanager
@@ -327,7 +327,7 @@ def hold_run_folder(folder: Path, loaded: LoadedScenario | None) -> Iterator[Loc
             f"{loaded.path}: resume it without naming a scenario."
         )
     with closing_lock(lock_run_folder(folder)):
-        yield LockedRun(config, scenario.moved(folder))
+        yield LockedRun(config, scenario.with_paths_from(folder))
 
 
 def restore(folder: Path, progress: Progress) -> None:

@@ -18,7 +18,7 @@ from reporting.arrays import Float
 from reporting.files import atomic_write_text, hash_file, hash_record
 from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
-from twin_master.assets.asset_source import AssetSource, calibrated_with, shown_without_noise
+from twin_master.assets.asset_source import AssetSource, calibration_sentence, noise_free_observations
 from twin_master.assets.resolution import (
     Overrides,
     asset_source,
@@ -34,8 +34,9 @@ from twin_master.mission.preparation import Knowledge, prepare_knowledge, save_k
 from twin_master.mission.steps import History
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.consistency import WATCHED_KIND
 from twin_master.scenario.reading import LoadedScenario, load_scenario
-from twin_master.scenario.schema import WATCHED_KIND, Scenario
+from twin_master.scenario.schema import Scenario
 from twin_master.store.mission_result import MissionResult
 from twin_master.store.summary import truth_mismatch
 from twin_master.store.writing import TIMING_NAME, RunOutcome, finished_run, read_outcome, store_flight
@@ -235,7 +236,7 @@ def _prepare_knowledge(
                 f"{mismatch} To fly the calibrated asset, leave {draws.name} out of `parameters` in "
                 "the scenario's table `asset`."
             )
-    calibrated = calibrated_with(
+    calibrated = calibration_sentence(
         draws.record or {}, source.origin.asset, source.origin.model, config["inputs"]
     )
     if calibrated is not None:
@@ -312,7 +313,7 @@ def _model_misfit(knowledge: Knowledge, source: AssetSource) -> Float | None:
         return None
     states = knowledge.model.states.coordinates
     with closing(source.open()) as asset:
-        observation = shown_without_noise(knowledge.scenario, states, asset)
+        observation = noise_free_observations(knowledge.scenario, states, asset)
     observation[observation == 0.0] = np.nan
     return np.asarray((knowledge.sensor_model.mean - observation) / observation)
 
@@ -385,7 +386,7 @@ def check_scenario(
     source = believed_source(scenario) if is_watched else asset_source(scenario)
     source.check()
     mission = scenario.mission
-    origin_of_draws, draws = source.uncertain()
+    origin_of_draws, draws = source.draw_summary()
     levels = {factor.name: len(factor.levels) for factor in scenario.state}
     return {
         "name": mission.name,

@@ -95,7 +95,9 @@ def draw_effect() -> Drawing:
 def draw_missing_force() -> Drawing:
     """Draw the missing force of the same releases, with the law through it."""
     investigation = notebook("name_an_effect", "investigate(").names["found"]
-    force = np.concatenate([course.force for course in investigation.missing.courses])
+    force = np.concatenate(
+        [force_of_trial.force for force_of_trial in investigation.missing.courses]
+    )
     with publication_style():
         png = to_png(missing_force_figure(investigation.missing), 110.0)
     return Drawing(png, {"step": float(np.median(np.abs(force)))})

@@ -20,10 +20,10 @@ from benchmarks.browser import open_browser
 from benchmarks.pictures.notebooks import folder_until_exit, notebook
 from benchmarks.pictures.picture import Drawing
 from reporting.figures import to_png
-from twin_master.fleet.flight import KIND, fleet_config
+from twin_master.fleet.configuration import KIND, fleet_config
+from twin_master.fleet.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import last_steps
-from twin_master.fleet.report import course_figure, map_figure
-from twin_master.fleet.store import FAILED, has_flown, open_group
+from twin_master.fleet.store import FAILED, flown_rows, open_group
 from twin_master.scenario.schema import Scenario
 
 RESOLUTION = 150.0
@@ -91,7 +91,7 @@ def draw_fleet() -> Drawing:
     scenario = Scenario.model_validate(record["scenarios"][0])
     group = open_group(folder, record["name"])
     status = group["status"].values
-    assets = has_flown(status)
+    assets = flown_rows(status)
     mean = group["mean"].values
     last_mean = mean[assets, last_steps(group)[assets]]
     failed = int(np.sum(status == FAILED))

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from fe.reduction.model_cache import reduced_model
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.fleet.evidence import Worsening, scaled_likelihood, transition_evidence
+from twin_master.fleet.evidence import TransitionFamily, scaled_likelihood, transition_evidence
 from twin_master.fleet.plan import Member
-from twin_master.fleet.posterior import Grid, refined, shared
-from twin_master.fleet.store import outcomes_of
+from twin_master.fleet.posterior import LikelihoodGrid, likelihood_grid, shared_posterior
+from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_side_by_side
 from twin_master.network.inference import predict
@@ -57,9 +57,9 @@ def flights(known: Knowledge, first: int, count: int) -> Flights:
     return fly_side_by_side(known, truths, [asset] * count)
 
 
-def learnt(known: Knowledge, flown: Flights) -> Grid:
+def learnt(known: Knowledge, flown: Flights) -> LikelihoodGrid:
     """Return the likelihood of the probabilities to worsen."""
-    worsening = Worsening.of(known.scenario)
+    worsening = TransitionFamily.learnable(known.scenario)
     likelihood, _ = scaled_likelihood(
         known.sensor_model, flown.observation_rows, flown.control_index
     )
@@ -68,7 +68,7 @@ def learnt(known: Knowledge, flown: Flights) -> Grid:
         evidence = transition_evidence(worsening, points, likelihood, flown.control_index)
         return np.asarray(evidence.sum(axis=0))
 
-    return refined(log_likelihood, len(worsening.names))
+    return likelihood_grid(log_likelihood, len(worsening.names))
 
 
 def coverage(fleets: int, twins: int) -> None:
@@ -117,7 +117,10 @@ def groups(fleets: int, twins: int) -> None:
                 )
             )
             rates.append(true)
-        marginals_of = {"alone": [grid.marginals for grid in grids], "shared": shared(grids)[1]}
+        marginals_of = {
+            "alone": [grid.marginals for grid in grids],
+            "shared": shared_posterior(grids).groups,
+        }
         for way, posteriors in marginals_of.items():
             for true, marginals in zip(rates, posteriors, strict=True):
                 for rate, marginal in zip(true.tolist(), marginals, strict=True):
@@ -143,7 +146,7 @@ def half(twins: int) -> None:
         twin_knowledge = knowledge(true, believed, fixed=False)
         later = flights(twin_knowledge, 100_000, twins)
         members = [Member(row, "", 0, {}) for row in range(twins)]
-        early = float(outcomes_of(twin_knowledge, later, members)["early"].mean())
+        early = float(stored_variables(twin_knowledge, later, members)["early"].mean())
         scores[twin] = score(twin_knowledge, later)
         print(
             f"| {twin} | {100 * early:.1f} ± {error(early, twins):.1f} % "

@@ -246,7 +246,7 @@ def fly_mission(
     with create_run_folder(folder, config, source.files()):
         pass
     source.prepare(folder, SilentProgress())
-    return _fly(folder, portable.moved(folder), source, seed)
+    return _fly(folder, portable.with_paths_from(folder), source, seed)
 
 
 def _fly(folder: Path, scenario: Scenario, source: AssetSource, seed: int) -> MissionErrors:

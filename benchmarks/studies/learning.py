@@ -293,8 +293,8 @@ def study_notices(knowledge: Knowledge, wing: ReducedModel, seeds: range) -> boo
 
 def print_row(name: str, result: TwinResult) -> None:
     """Print a row of the table of twins."""
-    early = result.outcomes.early
-    within = result.outcomes.within
+    early = result.outcomes.early_fallbacks
+    within = result.outcomes.prompt_fallbacks
     z1, z2 = result.outcomes.rms
     coverage = result.coverage
     cells = [
@@ -314,8 +314,8 @@ def reaches_targets(result: TwinResult) -> bool:
     """Return whether a twin reaches every target."""
     outcome = result.outcomes
     return (
-        outcome.early.value <= MOST_EARLY
-        and outcome.within.value >= LEAST_WITHIN
+        outcome.early_fallbacks.value <= MOST_EARLY
+        and outcome.prompt_fallbacks.value >= LEAST_WITHIN
         and outcome.rms[0].value <= MOST_RMS["z1"]
         and outcome.rms[1].value <= MOST_RMS["z2"]
         and COVERAGE[0] <= result.coverage.value <= COVERAGE[1]

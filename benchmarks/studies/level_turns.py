@@ -77,7 +77,7 @@ class Row:
     def cells(self) -> list[tuple[str, bool]]:
         """Return the figures as printed, each with whether it reaches its target."""
         study = self.study
-        within, early = study.within, study.early
+        within, early = study.prompt_fallbacks, study.early_fallbacks
         cells = [
             (percent(within), within.value >= WITHIN_TARGET),
             (percent(early), early.value <= EARLY_TARGET),
@@ -87,9 +87,9 @@ class Row:
             for factor, target in enumerate(RMS_TARGETS)
         ]
         cells += [(signed(study.bias[factor]), True) for factor in range(len(RMS_TARGETS))]
-        evidence = study.evidence
+        evidence = study.log_evidence
         cells.append((f"{evidence.value:.2f} ± {evidence.error:.2f}", True))
-        cells.append((percent(study.credible), True))
+        cells.append((percent(study.credible_coverage), True))
         return cells
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twin_master.assets.asset_source import Asset, shown_without_noise
+from twin_master.assets.asset_source import Asset, noise_free_observations
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.scenario.schema import Scenario
@@ -89,7 +89,7 @@ def find_misfit(
     asset : Asset
         What is flown.
     """
-    observation = shown_without_noise(scenario, model.states.coordinates, asset)
+    observation = noise_free_observations(scenario, model.states.coordinates, asset)
     return Misfit(sensor_model.mean - observation, observation, _gain(model, sensor_model))
 
 

@@ -43,7 +43,7 @@ from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
 from discrepancy.location.locate import locate
 from discrepancy.model_choice import load_model
-from discrepancy.search.wide_noise import residual_process_of
+from discrepancy.search.wide_noise import estimate_residual_process
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 from discrepancy.system.sensing import observe
@@ -354,10 +354,10 @@ def draw_campaign(generator: np.random.Generator, model: Model) -> tuple[Campaig
 def findings(campaign: Campaign, model: Model, seed: int) -> list[str]:
     """Return what the fit and `locate` find wrong with a campaign, or that it is nothing."""
     problem = Problem(campaign, model, Setting(campaign, model, model.scales(campaign)))
-    best = fit(problem, Candidate(), problem.start(Candidate()))
+    best = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
     location = locate(residual_set(problem, best), seed=seed)
     gate = check_absolute_fit(
-        problem, replace(best, residual_process=residual_process_of(problem, best))
+        problem, replace(best, residual_process=estimate_residual_process(problem, best))
     )
     is_found = {
         "not explained": gate.passed is False,

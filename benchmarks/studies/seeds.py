@@ -6,7 +6,7 @@ from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.errors import FleetError
 from twin_master.fleet.plan import Member
 from twin_master.fleet.reading import Outcomes
-from twin_master.fleet.store import outcomes_of
+from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.side_by_side import Flights, fly_one_by_one, fly_side_by_side
 from twin_master.scenario.schema import Scenario
@@ -17,7 +17,7 @@ def outcomes(knowledge: Knowledge, flights: Flights) -> Outcomes:
     for sentence in filter(None, flights.failure):
         raise FleetError(sentence)
     members = [Member(row, str(row), row, {}) for row in range(len(flights.failure))]
-    return Outcomes.of(outcomes_of(knowledge, flights, members))
+    return Outcomes.from_store(stored_variables(knowledge, flights, members))
 
 
 def fly_seeds(

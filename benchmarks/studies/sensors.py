@@ -16,7 +16,7 @@ from fe.reduction.model_cache import reduced_model
 from fe.wing.design import load_design
 from twin_master.assets.reduced_model import ReducedModelSource
 from twin_master.fleet.plan import Member
-from twin_master.fleet.store import outcomes_of
+from twin_master.fleet.store import stored_variables
 from twin_master.mission.preparation import Knowledge, prepare_knowledge
 from twin_master.mission.sensor_design import choose_sensors, draw_readings
 from twin_master.mission.side_by_side import fly_side_by_side
@@ -40,7 +40,7 @@ def flown(chosen: tuple[int, ...], missions: int) -> tuple[NDArray[np.float64], 
     flights = fly_side_by_side(knowledge, truths, [source.open()] * missions)
     mean = knowledge.model.states.mean(flights.filtered)
     members = [Member(seed, str(seed), seed, {}) for seed in range(missions)]
-    early = outcomes_of(knowledge, flights, members)["early"]
+    early = stored_variables(knowledge, flights, members)["early"]
     return 100.0 * np.sqrt(((mean - flights.state) ** 2).mean(axis=(0, 1))), float(
         np.mean(early > 0)
     )

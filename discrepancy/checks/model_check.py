@@ -49,7 +49,7 @@ def posterior_over_prior(campaign: Campaign, model: Model) -> dict[str, float]:
     at_prior = fit(problem, Candidate(), prior_point_with_initial_states(problem), iterations=0)
     information = normal_equations(problem, at_prior, Candidate(), channel_weights).matrix
     covariance = np.linalg.pinv(information, hermitian=True)
-    count = problem.shared.count
+    count = problem.shared.parameter_count
     # the unknowns are scaled by their prior standard deviations, so that these are ratios already
     ratios = np.sqrt(np.diag(covariance)[:count])
     prior_deviations = problem.shared.scale[:count]

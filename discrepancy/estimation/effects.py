@@ -1,4 +1,4 @@
-"""The effects of a hypothesis as forces at ports and errors of sensors along a trajectory."""
+"""The effects of a hypothesis along a trajectory: forces at ports and errors of sensors."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -9,17 +9,17 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import DiscrepancyError
 from discrepancy.fits.candidate import Candidate, EffectTerm, with_step
 from discrepancy.missing_force.hypotheses import ColumnBuilder
-from discrepancy.missing_force.trial import SeenTrial
-from discrepancy.missing_force.view import TrialMotion
+from discrepancy.missing_force.linear_trials import TrialMotion
+from discrepancy.missing_force.trial import PortedTrial
 from fe.runtime.errors import InvalidPatchError
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
-from .laws import ForceAlong, force_along
-from .linearised import Forces, SensorReadings, Trajectory
+from .laws import LawForce, force_and_tangents
+from .linearised import LinearisedForce, LinearisedSensorErrors, Trajectory
 
-STEP = 0.02
-"""Half the difference of a standard normal unknown in derivatives by it."""
+HALF_DIFFERENCE = 0.02
+"""Half the difference of an unknown in a derivative by it; unknowns are standard normal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,42 +28,42 @@ class EffectLaws:
 
     Attributes
     ----------
-    columns : ColumnBuilder
-        The builder of the changes of readings by errors of sensors.
-    trials : tuple of SeenTrial
+    column_builder : ColumnBuilder
+        The object that computes the changes of readings by errors of sensors.
+    trials : tuple of PortedTrial
         The dynamic trials.
     candidate : Candidate
         The effects at their places.
-    own_laws : callable
-        The function that takes shared unknowns (K,), and returns the model's own laws.
-    adjustable : tuple of int
+    evaluate_model_laws : callable
+        The function that takes the shared unknowns (K,) and returns the model's own laws at ports.
+    unknowns_of_model_laws : tuple of int
         The numbers of the shared unknowns that change the model's own laws.
     """
 
-    columns: ColumnBuilder
-    trials: tuple[SeenTrial, ...]
+    column_builder: ColumnBuilder
+    trials: tuple[PortedTrial, ...]
     candidate: Candidate
-    own_laws: Callable[[FloatArray], ModelPatch]
-    adjustable: tuple[int, ...]
+    evaluate_model_laws: Callable[[FloatArray], ModelPatch]
+    unknowns_of_model_laws: tuple[int, ...]
 
     @property
-    def size(self) -> int:
+    def effect_unknown_count(self) -> int:
         """The number E of unknowns of the effects."""
-        return self.candidate.size
+        return self.candidate.parameter_count
 
-    def along(
+    def linearise_along_trajectory(
         self,
-        number: int,
+        trial_index: int,
         trajectory: Trajectory,
         effect: FloatArray,
         shared: FloatArray,
-        smoothing: float,
-    ) -> tuple[Mapping[int, Forces], SensorReadings] | None:
+        speed_window: float,
+    ) -> tuple[Mapping[int, LinearisedForce], LinearisedSensorErrors] | None:
         """Return forces at ports and changes of readings along a trajectory, and derivatives.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         trajectory : Trajectory
             The motion of the trial.
@@ -71,34 +71,34 @@ class EffectLaws:
             The values of the effects' unknowns.
         shared : (K,) array
             The values of the shared unknowns.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
         -------
-        (mapping of int to Forces, SensorReadings) or None
+        (mapping of int to LinearisedForce, LinearisedSensorErrors) or None
             The forces by the number of the port, and the changes of the readings; None if an effect
             is not possible at these values.
         """
         try:
-            forces = self._forces(number, trajectory, effect, shared, smoothing)
-            return forces, self._readings(number, trajectory, effect)
+            forces = self._linearised_forces(trial_index, trajectory, effect, shared, speed_window)
+            return forces, self._linearised_sensor_errors(trial_index, trajectory, effect)
         except (DiscrepancyError, InvalidPatchError):
             return None
 
-    def forces(
+    def forces_along_trajectory(
         self,
-        number: int,
+        trial_index: int,
         trajectory: Trajectory,
         effect: FloatArray,
         shared: FloatArray,
-        smoothing: float,
-    ) -> Mapping[int, ForceAlong] | None:
+        speed_window: float,
+    ) -> Mapping[int, LawForce] | None:
         """Return the forces of all laws at ports along a trajectory, not their derivatives.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         trajectory : Trajectory
             The motion of the trial.
@@ -106,174 +106,186 @@ class EffectLaws:
             The values of the effects' unknowns.
         shared : (K,) array
             The values of the shared unknowns.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
         -------
-        mapping of int to ForceAlong or None
+        mapping of int to LawForce or None
             The forces by the number of the port; None if an effect is not possible at these values.
         """
         try:
-            return self._forces_at(number, trajectory, effect, shared, smoothing)
+            return self._checked_forces(trial_index, trajectory, effect, shared, speed_window)
         except (DiscrepancyError, InvalidPatchError):
             return None
 
     # ------------------------------------------------------------ laws
 
-    def _forces_at(
+    def _checked_forces(
         self,
-        number: int,
+        trial_index: int,
         trajectory: Trajectory,
         effect: FloatArray,
         shared: FloatArray,
-        smoothing: float,
-    ) -> dict[int, ForceAlong]:
-        """Return the forces of all laws as `forces` does, but raise if one is not possible."""
-        patch = self.own_laws(shared) + self._patch(number, effect).of(PortForce)
-        return self._along(number, trajectory, patch, smoothing)
+        speed_window: float,
+    ) -> dict[int, LawForce]:
+        """Return the forces of all laws, by port; raise an error if an effect is not possible."""
+        patch = self.evaluate_model_laws(shared) + self._patch_in_trial(trial_index, effect).of(
+            PortForce
+        )
+        return self._forces_of_patch(trial_index, trajectory, patch, speed_window)
 
-    def _forces(
+    def _linearised_forces(
         self,
-        number: int,
+        trial_index: int,
         trajectory: Trajectory,
         effect: FloatArray,
         shared: FloatArray,
-        smoothing: float,
-    ) -> dict[int, Forces]:
-        """Return the forces of all laws, by port, with their central differences by unknowns.
+        speed_window: float,
+    ) -> dict[int, LinearisedForce]:
+        """Return the forces of all laws, by port, with their derivatives by unknowns.
 
-        The parameters are those of `along`. Unknowns are numbered with the K shared ones first,
-        then those of the effects.
+        The parameters are those of `linearise_along_trajectory`. The derivatives are central
+        differences. The K shared unknowns are numbered first, then those of the effects.
         """
 
-        def at(values: FloatArray, parameters: FloatArray) -> dict[int, ForceAlong]:
-            return self._forces_at(number, trajectory, values, parameters, smoothing)
+        def forces_at(effect_values: FloatArray, shared_values: FloatArray) -> dict[int, LawForce]:
+            return self._checked_forces(
+                trial_index, trajectory, effect_values, shared_values, speed_window
+            )
 
-        forces = at(effect, shared)
-        slopes_by_port: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
-        for k in range(self.size):
-            above, below = (
-                at(with_step(effect, k, STEP), shared),
-                at(with_step(effect, k, -STEP), shared),
-            )
-            self._take_slopes(slopes_by_port, len(shared) + k, above, below)
-        for k in self.adjustable:
-            above, below = (
-                at(effect, with_step(shared, k, STEP)),
-                at(effect, with_step(shared, k, -STEP)),
-            )
-            self._take_slopes(slopes_by_port, k, above, below)
+        forces = forces_at(effect, shared)
+        derivatives: dict[int, dict[int, FloatArray]] = {port: {} for port in forces}
+        for k in range(self.effect_unknown_count):
+            above = forces_at(with_step(effect, k, HALF_DIFFERENCE), shared)
+            below = forces_at(with_step(effect, k, -HALF_DIFFERENCE), shared)
+            self._store_derivatives(derivatives, len(shared) + k, above, below)
+        for k in self.unknowns_of_model_laws:
+            above = forces_at(effect, with_step(shared, k, HALF_DIFFERENCE))
+            below = forces_at(effect, with_step(shared, k, -HALF_DIFFERENCE))
+            self._store_derivatives(derivatives, k, above, below)
         return {
-            port: Forces(force_at_port, slopes_by_port[port])
+            port: LinearisedForce(force_at_port, derivatives[port])
             for port, force_at_port in forces.items()
         }
 
     @staticmethod
-    def _take_slopes(
-        slopes: Mapping[int, dict[int, FloatArray]],
+    def _store_derivatives(
+        derivatives: Mapping[int, dict[int, FloatArray]],
         unknown: int,
-        above: Mapping[int, ForceAlong],
-        below: Mapping[int, ForceAlong],
+        above: Mapping[int, LawForce],
+        below: Mapping[int, LawForce],
     ) -> None:
-        """Store the derivatives of forces by an unknown in `slopes`, unless they are zero.
+        """Store the derivatives of the forces at ports by one unknown, unless they are zero.
 
         Parameters
         ----------
-        slopes : mapping of int to dict of int to (F,) array
-            The derivatives by port and unknown, which are extended.
+        derivatives : mapping of int to dict of int to (F,) array
+            The derivatives by port and unknown, to which those of the unknown are added.
         unknown : int
             The number of the unknown.
-        above, below : mapping of int to ForceAlong
-            The forces with the unknown `STEP` above and below its value, by port.
+        above, below : mapping of int to LawForce
+            The forces with the unknown `HALF_DIFFERENCE` above and below its value, by port.
         """
-        for port, slopes_at_port in slopes.items():
+        for port, slopes_at_port in derivatives.items():
             if port in above and port in below:
-                slope = (above[port].force - below[port].force) / (2.0 * STEP)
+                slope = (above[port].force - below[port].force) / (2.0 * HALF_DIFFERENCE)
                 if np.any(slope):
                     slopes_at_port[unknown] = slope
 
-    def _patch(self, number: int, effect: FloatArray) -> ModelPatch:
+    def _patch_in_trial(self, trial_index: int, effect: FloatArray) -> ModelPatch:
         """Return the change of the model by the effects (E,) in a trial, given by its index."""
-        trial = self.columns.problem.trials[self.columns.numbers[number]].trial
+        problem = self.column_builder.problem
+        trial = problem.trials[self._index_in_problem(trial_index)].trial
         patch = ModelPatch()
-        for term, term_values in self.candidate.split(effect):
+        for term, term_values in self.candidate.split_by_term(effect):
             if trial.kind in term.effect.acts_on:
-                patch = patch + term.patch(self.columns.problem.setting, term_values).in_trial(
-                    trial.name
-                )
+                patch = patch + term.patch(problem.setting, term_values).in_trial(trial.name)
         return patch
 
-    def _along(
-        self, number: int, trajectory: Trajectory, patch: ModelPatch, smoothing: float
-    ) -> dict[int, ForceAlong]:
+    def _index_in_problem(self, trial_index: int) -> int:
+        """Return the index in the problem, which has static trials too, of a dynamic trial."""
+        return self.column_builder.trial_indices[trial_index]
+
+    def _forces_of_patch(
+        self, trial_index: int, trajectory: Trajectory, patch: ModelPatch, speed_window: float
+    ) -> dict[int, LawForce]:
         """Return the forces of a patch's laws along a trajectory, summed by the number of the port.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         trajectory : Trajectory
             The motion of the trial.
         patch : ModelPatch
             The patch; what is not a law at a port is left out.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
         """
-        trial = self.trials[number]
-        forces: dict[int, ForceAlong] = {}
-        for law in self.columns.problem.model.at_ports(patch):
+        trial = self.trials[trial_index]
+        forces: dict[int, LawForce] = {}
+        for law in self.column_builder.problem.model.at_ports(patch):
             if not isinstance(law, PortForce):
                 continue
             port = trial.system.ports.index(law.port)
-            force = force_along(
+            force = force_and_tangents(
                 law,
                 trial.fine_time,
                 trajectory.positions[:, port],
                 trajectory.speeds[:, port],
-                smoothing,
+                speed_window,
             )
             forces[port] = force.plus(forces[port]) if port in forces else force
         return forces
 
     # ------------------------------------------------------------ sensors
 
-    def _readings(self, number: int, trajectory: Trajectory, effect: FloatArray) -> SensorReadings:
+    def _linearised_sensor_errors(
+        self, trial_index: int, trajectory: Trajectory, effect: FloatArray
+    ) -> LinearisedSensorErrors:
         """Return the changes of a trial's readings by errors of sensors, with their derivatives.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         trajectory : Trajectory
             The motion of the trial.
         effect : (E,) array
             The values of the effects' unknowns.
         """
-        trial = self.trials[number]
-        change = np.zeros_like(trial.residual)
-        slopes: dict[int, FloatArray] = {}
-        first_unknown = len(trial.shared)
-        motion = seen_motion(trajectory)
-        for term, term_values in self.candidate.split(effect):
-            # an effect without a law at a port changes readings only
-            if not len(term.patch(self.columns.problem.setting, term_values).of(PortForce)):
-                change = change + self._shown(number, motion, term, term_values)
-                for k in range(len(term_values)):
-                    above = self._shown(number, motion, term, with_step(term_values, k, STEP))
-                    below = self._shown(number, motion, term, with_step(term_values, k, -STEP))
-                    slopes[first_unknown + k] = (above - below) / (2.0 * STEP)
-            first_unknown += len(term_values)
-        return SensorReadings(change, slopes)
+        trial = self.trials[trial_index]
+        setting = self.column_builder.problem.setting
+        motion = motion_for_columns(trajectory)
 
-    def _shown(
-        self, number: int, motion: TrialMotion, term: EffectTerm, values: FloatArray
+        def change_by_effect(term: EffectTerm, values: FloatArray) -> FloatArray:
+            return self._readings_change_by_effect(trial_index, motion, term, values)
+
+        change = np.zeros_like(trial.residual)
+        derivatives: dict[int, FloatArray] = {}
+        # the unknowns of effects follow the shared ones
+        first_unknown = len(trial.shared_derivatives)
+        for term, values in self.candidate.split_by_term(effect):
+            has_law = bool(len(term.patch(setting, values).of(PortForce)))
+            # an effect without a law at a port changes readings only
+            if not has_law:
+                change = change + change_by_effect(term, values)
+                for k in range(len(values)):
+                    above = change_by_effect(term, with_step(values, k, HALF_DIFFERENCE))
+                    below = change_by_effect(term, with_step(values, k, -HALF_DIFFERENCE))
+                    derivatives[first_unknown + k] = (above - below) / (2.0 * HALF_DIFFERENCE)
+            first_unknown += len(values)
+        return LinearisedSensorErrors(change, derivatives)
+
+    def _readings_change_by_effect(
+        self, trial_index: int, motion: TrialMotion, term: EffectTerm, values: FloatArray
     ) -> FloatArray:
         """Return the change (N, C) of a trial's readings by one effect, divided by the noise.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         motion : TrialMotion
             The motion that the sensors measure.
@@ -282,23 +294,29 @@ class EffectLaws:
         values : array
             The values of its unknowns.
         """
-        patch = term.patch(self.columns.problem.setting, values)
-        column = self.columns.part(self.trials[number], motion, number, patch, term.effect.acts_on)
+        patch = term.patch(self.column_builder.problem.setting, values)
+        column = self.column_builder.column_in_trial(
+            self.trials[trial_index],
+            motion,
+            self._index_in_problem(trial_index),
+            patch,
+            term.effect.acts_on,
+        )
         return column.readings
 
 
-def seen_motion(trajectory: Trajectory) -> TrialMotion:
-    """Return the motion that sensors measure along a trajectory, for the columns of sensor errors.
+def motion_for_columns(trajectory: Trajectory) -> TrialMotion:
+    """Return a trajectory in the form in which `ColumnBuilder` takes the motion of a trial.
 
-    All that laws and missing forces add counts as explained here, since it is part of the
-    trajectory.
+    All that laws and missing forces add counts as explained: it is part of the trajectory, so that
+    sensors measure it.
     """
     return TrialMotion(
-        added=trajectory.added,
+        added_state=trajectory.added_state,
         forces=trajectory.forces,
-        left={},
-        explained=trajectory.added,
+        unexplained_forces={},
+        explained_state=trajectory.added_state,
         positions=trajectory.positions,
         speeds=trajectory.speeds,
-        deviations={},
+        deviations_by_port={},
     )

@@ -1,11 +1,11 @@
 """The joint estimate of trajectory, missing force and unknowns of a hypothesis, with its evidence.
 
-It is Gauss-Newton on the trajectory: the trials are linearised along the last trajectory, and one
-filter and one smoother give the next one, until nothing changes. This is the iterated Kalman
-smoother (Bell 1994, SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson 2020, ICASSP). It
-begins with a large missing force, with which the trajectory follows the readings whatever the law,
-and lowers that force in steps (continuation). The innovations at the end give the evidence by
-Laplace's approximation, and the size of the missing force is that with the largest evidence.
+The estimator is Gauss-Newton's method on the trajectory: the trials are linearised along the last
+trajectory, and one filter and one smoother give the next one, until nothing changes. This is the
+iterated Kalman smoother (Bell 1994, SIAM J. Optimization 4, 626-636; damped: Särkkä and Svensson
+2020, ICASSP). It begins with a large missing force, with which the trajectory follows the readings
+whatever the law is, and lowers that force in steps (continuation). The innovations at the end give
+the evidence by Laplace's approximation. The missing force with the largest evidence is returned.
 """
 
 from collections.abc import Mapping
@@ -22,57 +22,63 @@ from discrepancy.missing_force.filtered import (
     Process,
     Regression,
     Solution,
-    without,
+    integrate_out_last,
 )
 from discrepancy.missing_force.process_search import prior_log_density
-from discrepancy.missing_force.trial import SeenTrial
+from discrepancy.missing_force.trial import PortedTrial
 
-from .laws import ForceAlong
-from .linearised import Forces, LinearisedTrial, SensorReadings, SmoothedTrial, Trajectory
+from .laws import LawForce
+from .linearised import (
+    LinearisedForce,
+    LinearisedSensorErrors,
+    LinearisedTrial,
+    SmoothedTrial,
+    Trajectory,
+)
 
-SHARES_OF_SIZE = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
-"""Standard deviations of the missing force, over the first one, through which it is lowered."""
-SMOOTHINGS = (0.1, 0.02, 0.005)
+DEVIATION_FRACTIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003, 0.001)
+"""Standard deviations of the missing force in turn, over the one at the start."""
+SPEED_WINDOWS = (0.1, 0.02, 0.005)
 """Half windows of speeds over which laws of the speed are averaged, over the rms speed. They become
-narrower from one estimate to the next."""
-ITERATIONS = 12
+narrower from one estimate to the next, so that the jump of dry friction is introduced gradually."""
+MOST_ITERATIONS = 12
 """Largest number of linearisations at one size of the missing force."""
-SETTLED = 0.02
+CONVERGED_STEP = 0.02
 """Step of an unknown, in posterior standard deviations, below which the iteration has converged."""
-LEVEL = 0.05
+CONVERGED_EVIDENCE = 0.05
 """Change of the log evidence below which the iteration has converged [nat]."""
 STEP_FRACTIONS = (1.0, 0.5, 0.25, 0.125, 0.0625)
 """Fractions of a step that are tried in turn."""
 LONGEST_STEP = 2.0
 """Longest step of the unknown of an effect, in prior standard deviations."""
-FACTORS = (3.0, 1.7, 1.3)
+PATTERN_FACTORS = (3.0, 1.7, 1.3)
 """Factors on size and time of a missing force in the search for its most probable values, in
 turn."""
-DECLINE = 12.0
-"""Difference of log evidence to the best size of the missing force, from which on smaller sizes are
-not tried [nat]."""
+LARGEST_DECLINE = 12.0
+"""Difference to the largest log evidence above which still smaller missing forces are not tried
+[nat]."""
 
 
 class HypothesisLaws(Protocol):
     """The laws and sensor errors of a hypothesis, as the estimator needs them."""
 
     @property
-    def size(self) -> int:
+    def effect_unknown_count(self) -> int:
         """The number E of unknowns of its effects, each with a standard normal prior."""
 
-    def along(
+    def linearise_along_trajectory(
         self,
-        number: int,
+        trial_index: int,
         trajectory: Trajectory,
         effect: FloatArray,
         shared: FloatArray,
-        smoothing: float,
-    ) -> tuple[Mapping[int, Forces], SensorReadings] | None:
+        speed_window: float,
+    ) -> tuple[Mapping[int, LinearisedForce], LinearisedSensorErrors] | None:
         """Return forces at ports and changes of readings along a trajectory, and derivatives.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         trajectory : Trajectory
             The motion of the trial.
@@ -80,29 +86,29 @@ class HypothesisLaws(Protocol):
             The values of the effects' unknowns.
         shared : (K,) array
             The values of the shared unknowns.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
         -------
-        (mapping of int to Forces, SensorReadings) or None
+        (mapping of int to LinearisedForce, LinearisedSensorErrors) or None
             The forces by the number of the port, and the changes of the readings; None if an effect
             is not possible at these values.
         """
 
-    def forces(
+    def forces_along_trajectory(
         self,
-        number: int,
+        trial_index: int,
         trajectory: Trajectory,
         effect: FloatArray,
         shared: FloatArray,
-        smoothing: float,
-    ) -> Mapping[int, ForceAlong] | None:
+        speed_window: float,
+    ) -> Mapping[int, LawForce] | None:
         """Return the forces of all laws at ports along a trajectory, not their derivatives.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         trajectory : Trajectory
             The motion of the trial.
@@ -110,12 +116,12 @@ class HypothesisLaws(Protocol):
             The values of the effects' unknowns.
         shared : (K,) array
             The values of the shared unknowns.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
         -------
-        mapping of int to ForceAlong or None
+        mapping of int to LawForce or None
             The forces by the number of the port; None if an effect is not possible at these values.
         """
 
@@ -162,12 +168,12 @@ class Linearisation:
     ----------
     trials : tuple of LinearisedTrial
         The trials.
-    precision : (K + E,) ndarray
+    prior_precision : (K + E,) ndarray
         The prior precisions of the shared unknowns, and of those of the effects.
     """
 
     trials: tuple[LinearisedTrial, ...]
-    precision: FloatArray
+    prior_precision: FloatArray
 
     def solve(self) -> tuple[Solution, list[FloatArray]]:
         """Return the most probable values of all unknowns.
@@ -179,41 +185,46 @@ class Linearisation:
         local : list of (L,) array
             The unknowns of each trial alone.
         """
-        sum_of_products = np.zeros((1 + len(self.precision),) * 2)
+        # normal equations of the shared and effect unknowns, summed over the trials
+        sum_of_products = np.zeros((1 + len(self.prior_precision),) * 2)
         half_log_determinant = 0.0
         for linear_trial in self.trials:
-            products, half_of_trial = linear_trial.products
-            local_precision = linear_trial.trial.local_precision
-            without_local, half_without_local = without(
-                products, np.asarray(half_of_trial), local_precision
+            products, half_of_trial = linear_trial.whitened_products
+            products_without_local, half_without_local = integrate_out_last(
+                products, np.asarray(half_of_trial), linear_trial.trial.local_precision
             )
-            sum_of_products += without_local
+            sum_of_products += products_without_local
             half_log_determinant += float(half_without_local)
-        solution = Regression(sum_of_products, half_log_determinant).solve(
-            range(len(self.precision)), self.precision
-        )
-        return solution, [self._local(linear_trial, solution.mean) for linear_trial in self.trials]
+        regression = Regression(sum_of_products, half_log_determinant)
+        all_unknowns = range(len(self.prior_precision))
+        solution = regression.solve(all_unknowns, self.prior_precision)
+        local = [self._local_unknowns(linear_trial, solution.mean) for linear_trial in self.trials]
+        return solution, local
 
-    def beside(self, processes: Mapping[int, Process]) -> "Linearisation":
+    def with_processes(self, processes: Mapping[int, Process]) -> "Linearisation":
         """Return the same linear trials with other missing forces."""
         trials = tuple(replace(trial, processes=processes) for trial in self.trials)
-        return Linearisation(trials, self.precision)
+        return Linearisation(trials, self.prior_precision)
 
-    def _local(self, linear_trial: LinearisedTrial, known: FloatArray) -> FloatArray:
+    def _local_unknowns(
+        self, linear_trial: LinearisedTrial, shared_and_effect: FloatArray
+    ) -> FloatArray:
         """Return the most probable unknowns (L,) of a trial alone, given the others.
 
         Parameters
         ----------
         linear_trial : LinearisedTrial
             The trial.
-        known : (K + E,) array
+        shared_and_effect : (K + E,) array
             The values of the shared unknowns, and of those of effects.
         """
-        # the last rows of the normal equations, with the known values on the right side
-        products, _ = linear_trial.products
-        first_local = 1 + len(known)
+        # the rows of the local unknowns in the normal equations, with the others on the right side
+        products, _ = linear_trial.whitened_products
+        first_local = 1 + len(shared_and_effect)
         precision = np.maximum(linear_trial.trial.local_precision, LEAST_PRECISION)
-        right_side = products[first_local:, 0] - products[first_local:, 1:first_local] @ known
+        right_side = (
+            products[first_local:, 0] - products[first_local:, 1:first_local] @ shared_and_effect
+        )
         return np.linalg.solve(
             products[first_local:, first_local:] + np.diag(precision), right_side
         )
@@ -239,7 +250,7 @@ class EstimatorStart:
     processes: Mapping[int, Process]
 
 
-def start_after(estimate: MotionEstimate) -> EstimatorStart:
+def start_from_estimate(estimate: MotionEstimate) -> EstimatorStart:
     """Return the start of an estimate that continues from the result of another one."""
     return EstimatorStart(
         estimate.effect,
@@ -255,17 +266,17 @@ class MotionEstimator:
 
     Attributes
     ----------
-    trials : tuple of SeenTrial
+    trials : tuple of PortedTrial
         The dynamic trials.
     shared_precision : (K,) ndarray
         The prior precisions of the shared unknowns.
-    usual : mapping of int to Process
+    prior_medians : mapping of int to Process
         The prior medians of the missing forces, by the number of the port.
     """
 
-    trials: tuple[SeenTrial, ...]
+    trials: tuple[PortedTrial, ...]
     shared_precision: FloatArray
-    usual: Mapping[int, Process]
+    prior_medians: Mapping[int, Process]
 
     def estimate(self, laws: HypothesisLaws, start: EstimatorStart) -> MotionEstimate | None:
         """Return a hypothesis at its most probable values.
@@ -284,15 +295,15 @@ class MotionEstimator:
         """
         current = start
         # with wide windows of speeds first, so that a jump of a law does not stop the iteration
-        for smoothing in SMOOTHINGS[:-1]:
-            smoothed = self._iterated(laws, current, smoothing)
+        for speed_window in SPEED_WINDOWS[:-1]:
+            smoothed = self._iterate_gauss_newton(laws, current, speed_window)
             if smoothed is None:
                 return None
-            current = start_after(smoothed)
-        estimate = self._with_smaller_missing_forces(laws, current)
-        return None if estimate is None else self._tuned(laws, estimate)
+            current = start_from_estimate(smoothed)
+        estimate = self._lower_missing_forces(laws, current)
+        return None if estimate is None else self._tune_processes(laws, estimate)
 
-    def _with_smaller_missing_forces(
+    def _lower_missing_forces(
         self, laws: HypothesisLaws, start: EstimatorStart
     ) -> MotionEstimate | None:
         """Return the estimate with the most probable of several sizes of the missing force.
@@ -314,26 +325,28 @@ class MotionEstimator:
         """
         best: MotionEstimate | None = None
         current = start
-        for fraction in SHARES_OF_SIZE:
+        for fraction in DEVIATION_FRACTIONS:
             processes = {
-                port: replace(process, size=fraction * process.size)
+                port: replace(process, standard_deviation=fraction * process.standard_deviation)
                 for port, process in start.processes.items()
             }
-            estimate = self._iterated(laws, replace(current, processes=processes), SMOOTHINGS[-1])
+            estimate = self._iterate_gauss_newton(
+                laws, replace(current, processes=processes), SPEED_WINDOWS[-1]
+            )
             if estimate is None:
                 break
             if best is None or estimate.log_evidence > best.log_evidence:
                 best = estimate
-            elif estimate.log_evidence < best.log_evidence - DECLINE:
+            elif estimate.log_evidence < best.log_evidence - LARGEST_DECLINE:
                 break
-            current = start_after(estimate)
+            current = start_from_estimate(estimate)
         return best
 
-    def _tuned(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
+    def _tune_processes(self, laws: HypothesisLaws, estimate: MotionEstimate) -> MotionEstimate:
         """Return an estimate with the most probable sizes and times of its missing forces.
 
-        A pattern search with decreasing factors. In it the trials stay linear along one trajectory;
-        the result is then estimated anew, and returned if it is more probable.
+        This is a pattern search with decreasing factors, in which the trials stay linear along one
+        trajectory. The result is then estimated anew, and returned if it is more probable.
 
         Parameters
         ----------
@@ -342,33 +355,37 @@ class MotionEstimator:
         estimate : MotionEstimate
             The estimate with the present sizes and times.
         """
-        start = start_after(estimate)
-        linear = self.linearised(laws, start, SMOOTHINGS[-1])
+        start = start_from_estimate(estimate)
+        linear = self.linearise(laws, start, SPEED_WINDOWS[-1])
         if linear is None:
             return estimate
         processes = dict(start.processes)
-        largest_evidence = self._evidence_beside(linear, processes)
-        for factor in FACTORS:
-            for port, quantity in product(tuple(processes), ("size", "time")):
+        largest_evidence = self._evidence_with_processes(linear, processes)
+        for factor in PATTERN_FACTORS:
+            for port, quantity in product(
+                tuple(processes), ("standard_deviation", "correlation_time")
+            ):
                 # the first of a larger and a smaller value that is more probable is kept
                 for ratio in (factor, 1.0 / factor):
                     value = ratio * getattr(processes[port], quantity)
                     changed_processes = processes | {
                         port: replace(processes[port], **{quantity: value})
                     }
-                    evidence = self._evidence_beside(linear, changed_processes)
+                    evidence = self._evidence_with_processes(linear, changed_processes)
                     if evidence > largest_evidence:
                         processes, largest_evidence = changed_processes, evidence
                         break
-        tuned = self._iterated(laws, replace(start, processes=processes), SMOOTHINGS[-1])
-        return (
-            tuned if tuned is not None and tuned.log_evidence > estimate.log_evidence else estimate
+        tuned = self._iterate_gauss_newton(
+            laws, replace(start, processes=processes), SPEED_WINDOWS[-1]
         )
+        if tuned is None or tuned.log_evidence <= estimate.log_evidence:
+            return estimate
+        return tuned
 
-    def _iterated(
-        self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
+    def _iterate_gauss_newton(
+        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> MotionEstimate | None:
-        """Return the estimate with given missing forces, by damped Gauss-Newton steps.
+        """Return the estimate under given missing forces, by damped Gauss-Newton steps.
 
         Parameters
         ----------
@@ -376,7 +393,7 @@ class MotionEstimator:
             The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The values and trajectories to begin with, and the missing forces.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
@@ -388,45 +405,72 @@ class MotionEstimator:
         current = start
         last_evidence = -inf
         estimate: MotionEstimate | None = None
-        for _ in range(ITERATIONS):
-            linear = self.linearised(laws, current, smoothing)
+        for _ in range(MOST_ITERATIONS):
+            linear = self.linearise(laws, current, speed_window)
             if linear is None:
                 return estimate
-            solution, local = linear.solve()
-            if not np.isfinite(solution.evidence):
+            new_estimate = self._estimate_of_linearisation(linear, current, last_evidence)
+            if new_estimate is None:
                 return estimate
-            shared_count = len(self.shared_precision)
-            unknowns = solution.mean
-            smoothed = tuple(
-                trial.smoothed(np.concatenate((unknowns, local_unknowns)))
-                for trial, local_unknowns in zip(linear.trials, local, strict=True)
-            )
-            evidence = solution.evidence + self._log_prior(start.processes)
-            # converged if neither an unknown, in posterior deviations, nor the evidence changes
-            last_unknowns = np.concatenate((current.shared, current.effect))
-            deviations = np.sqrt(np.diag(solution.covariance))
-            largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
-            is_settled = largest_step < SETTLED and abs(evidence - last_evidence) < LEVEL
-            estimate = MotionEstimate(
-                effect=unknowns[shared_count:],
-                shared=unknowns[:shared_count],
-                local=tuple(local),
-                covariance=solution.covariance,
-                processes=start.processes,
-                log_evidence=evidence,
-                trials=smoothed,
-                converged=is_settled,
-            )
-            last_evidence = evidence
-            next_start = (
-                None if is_settled else self._stepped(laws, current, estimate, linear, smoothing)
-            )
+            estimate = new_estimate
+            if estimate.converged:
+                return estimate
+            last_evidence = estimate.log_evidence
+            next_start = self._take_step(laws, current, estimate, linear, speed_window)
             if next_start is None:
                 return estimate
             current = next_start
         return estimate
 
-    def _evidence_beside(self, linear: Linearisation, processes: Mapping[int, Process]) -> float:
+    def _estimate_of_linearisation(
+        self, linear: Linearisation, start: EstimatorStart, last_evidence: float
+    ) -> MotionEstimate | None:
+        """Return the estimate of linear trials, after a whole Gauss-Newton step from a start.
+
+        Parameters
+        ----------
+        linear : Linearisation
+            The trials, linear about the start.
+        start : EstimatorStart
+            The values and trajectories about which they are linear.
+        last_evidence : float
+            The log evidence of the previous estimate [nat]. The iteration has converged if neither
+            the evidence nor an unknown changes notably.
+
+        Returns
+        -------
+        MotionEstimate or None
+            The estimate; None if its evidence is not finite.
+        """
+        solution, local = linear.solve()
+        if not np.isfinite(solution.log_evidence):
+            return None
+        unknowns = solution.mean
+        smoothed = tuple(
+            trial.smooth(np.concatenate((unknowns, local_unknowns)))
+            for trial, local_unknowns in zip(linear.trials, local, strict=True)
+        )
+        evidence = solution.log_evidence + self._log_prior(start.processes)
+        # the change of each unknown in posterior standard deviations
+        last_unknowns = np.concatenate((start.shared, start.effect))
+        deviations = np.sqrt(np.diag(solution.covariance))
+        largest_step = float(np.max(np.abs(unknowns - last_unknowns) / deviations, initial=0.0))
+        evidence_change = abs(evidence - last_evidence)
+        shared_count = len(self.shared_precision)
+        return MotionEstimate(
+            effect=unknowns[shared_count:],
+            shared=unknowns[:shared_count],
+            local=tuple(local),
+            covariance=solution.covariance,
+            processes=start.processes,
+            log_evidence=evidence,
+            trials=smoothed,
+            converged=largest_step < CONVERGED_STEP and evidence_change < CONVERGED_EVIDENCE,
+        )
+
+    def _evidence_with_processes(
+        self, linear: Linearisation, processes: Mapping[int, Process]
+    ) -> float:
         """Return log evidence plus log prior of missing forces, with the linearisation kept [nat].
 
         Parameters
@@ -436,11 +480,11 @@ class MotionEstimator:
         processes : mapping of int to Process
             The missing forces, by the number of the port.
         """
-        solution, _ = linear.beside(processes).solve()
-        return solution.evidence + self._log_prior(processes)
+        solution, _ = linear.with_processes(processes).solve()
+        return solution.log_evidence + self._log_prior(processes)
 
-    def linearised(
-        self, laws: HypothesisLaws, start: EstimatorStart, smoothing: float
+    def linearise(
+        self, laws: HypothesisLaws, start: EstimatorStart, speed_window: float
     ) -> Linearisation | None:
         """Return all trials with a hypothesis' laws, linearised along trajectories.
 
@@ -450,7 +494,7 @@ class MotionEstimator:
             The laws and sensor errors of the hypothesis.
         start : EstimatorStart
             The trajectories, the values of unknowns and the missing forces.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
@@ -459,42 +503,42 @@ class MotionEstimator:
             The linear trials; None if the laws are not possible in one of them.
         """
         linear_trials = []
-        for number, trial in enumerate(self.trials):
-            forces_and_sensors = laws.along(
-                number, start.trajectories[number], start.effect, start.shared, smoothing
+        for trial_index, trial in enumerate(self.trials):
+            trajectory = start.trajectories[trial_index]
+            forces_and_sensor_errors = laws.linearise_along_trajectory(
+                trial_index, trajectory, start.effect, start.shared, speed_window
             )
-            if forces_and_sensors is None:
+            if forces_and_sensor_errors is None:
                 return None
-            forces, sensors = forces_and_sensors
-            linear_trials.append(
-                LinearisedTrial(
-                    trial,
-                    start.processes,
-                    start.trajectories[number],
-                    forces,
-                    sensors,
-                    start.effect,
-                    start.shared,
-                )
+            forces, sensor_errors = forces_and_sensor_errors
+            linear_trial = LinearisedTrial(
+                trial=trial,
+                processes=start.processes,
+                trajectory=trajectory,
+                forces=forces,
+                sensor_errors=sensor_errors,
+                effect=start.effect,
+                shared=start.shared,
             )
+            linear_trials.append(linear_trial)
         # the unknowns of effects have standard normal priors, of precision one
-        precision = np.concatenate((self.shared_precision, np.ones(laws.size)))
+        precision = np.concatenate((self.shared_precision, np.ones(laws.effect_unknown_count)))
         return Linearisation(tuple(linear_trials), precision)
 
-    def _stepped(
+    def _take_step(
         self,
         laws: HypothesisLaws,
         current: EstimatorStart,
         estimate: MotionEstimate,
         linear: Linearisation,
-        smoothing: float,
+        speed_window: float,
     ) -> EstimatorStart | None:
-        """Return the start of the next iteration: the longest admissible fraction of a step.
+        """Return the start of the next iteration, after the longest admissible fraction of a step.
 
-        The linear laws differ from the true ones at the end of a step. That difference acts like a
-        further missing force, which the smoother does not know. The rms difference must not be
-        larger than the standard deviation of the missing force. If no fraction of `STEP_FRACTIONS`
-        satisfies this, the smallest one at which the laws are possible is taken.
+        At the end of a step the linear laws differ from the true ones. This difference acts like a
+        further missing force, which is not part of the smoother's model. A fraction is admissible
+        if the rms difference is at most the standard deviation of the missing force. If no fraction
+        of `STEP_FRACTIONS` is, the smallest one at which the laws are possible is taken.
 
         Parameters
         ----------
@@ -503,10 +547,10 @@ class MotionEstimator:
         current : EstimatorStart
             The values and trajectories before the step.
         estimate : MotionEstimate
-            Those at the end of the whole step.
+            The values and trajectories at the end of the whole step.
         linear : Linearisation
             The trials, linear about `current`.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
@@ -521,18 +565,17 @@ class MotionEstimator:
         next_start: EstimatorStart | None = None
         for fraction in STEP_FRACTIONS:
             fraction_taken = min(fraction, largest_fraction)
-            stepped = EstimatorStart(
-                current.effect + fraction_taken * change,
-                current.shared + fraction_taken * (estimate.shared - current.shared),
-                tuple(
-                    trajectory.toward(smoothed.trajectory, fraction_taken)
-                    for trajectory, smoothed in zip(
-                        current.trajectories, estimate.trials, strict=True
-                    )
-                ),
-                current.processes,
+            trajectories = tuple(
+                trajectory.interpolate(smoothed.trajectory, fraction_taken)
+                for trajectory, smoothed in zip(current.trajectories, estimate.trials, strict=True)
             )
-            error = self._error_of_laws(laws, current, stepped, linear, smoothing)
+            stepped = EstimatorStart(
+                effect=current.effect + fraction_taken * change,
+                shared=current.shared + fraction_taken * (estimate.shared - current.shared),
+                trajectories=trajectories,
+                processes=current.processes,
+            )
+            error = self._linearisation_error(laws, current, stepped, linear, speed_window)
             if error is None:
                 continue
             next_start = stepped
@@ -540,15 +583,15 @@ class MotionEstimator:
                 break
         return next_start
 
-    def _error_of_laws(
+    def _linearisation_error(
         self,
         laws: HypothesisLaws,
         current: EstimatorStart,
         stepped: EstimatorStart,
         linear: Linearisation,
-        smoothing: float,
+        speed_window: float,
     ) -> float | None:
-        """Return the largest rms error of the linear laws, over the deviation of the missing force.
+        """Return the rms error of the linear laws after a step, over the missing force's deviation.
 
         Parameters
         ----------
@@ -558,7 +601,7 @@ class MotionEstimator:
             The values and trajectories before and after a step.
         linear : Linearisation
             The trials, linear about `current`.
-        smoothing : float
+        speed_window : float
             Half the window of speeds over which laws of the speed are averaged, over the rms speed.
 
         Returns
@@ -567,34 +610,30 @@ class MotionEstimator:
             The largest ratio of all trials and ports; None if the laws are not possible after the
             step.
         """
+        unknowns_change = np.concatenate(
+            (stepped.shared - current.shared, stepped.effect - current.effect)
+        )
+        largest_deviation = max(
+            process.standard_deviation for process in stepped.processes.values()
+        )
         largest_ratio = 0.0
-        for number, trial in enumerate(linear.trials):
-            forces_after = laws.forces(
-                number, stepped.trajectories[number], stepped.effect, stepped.shared, smoothing
+        for trial_index, trial in enumerate(linear.trials):
+            trajectory = stepped.trajectories[trial_index]
+            true_forces = laws.forces_along_trajectory(
+                trial_index, trajectory, stepped.effect, stepped.shared, speed_window
             )
-            if forces_after is None:
+            if true_forces is None:
                 return None
-            unknowns_change = np.concatenate(
-                (stepped.shared - current.shared, stepped.effect - current.effect)
-            )
-            for port, forces in trial.forces.items():
-                position_change = (
-                    stepped.trajectories[number].positions[:, port]
-                    - trial.trajectory.positions[:, port]
+            for port, linearised_force in trial.forces.items():
+                linear_force = linearised_force.extrapolate(
+                    trajectory.positions[:, port] - trial.trajectory.positions[:, port],
+                    trajectory.speeds[:, port] - trial.trajectory.speeds[:, port],
+                    unknowns_change,
                 )
-                speed_change = (
-                    stepped.trajectories[number].speeds[:, port] - trial.trajectory.speeds[:, port]
-                )
-                # the force that the linear law has after the step
-                linear_force = forces.along.force + forces.along.by_position * position_change
-                linear_force = linear_force + forces.along.by_speed * speed_change
-                for unknown, slope in forces.by_unknown.items():
-                    linear_force = linear_force + unknowns_change[unknown] * slope
-                error = float(np.sqrt(np.mean((forces_after[port].force - linear_force) ** 2)))
-                largest_deviation = max(process.size for process in stepped.processes.values())
+                error = float(np.sqrt(np.mean((true_forces[port].force - linear_force) ** 2)))
                 largest_ratio = max(largest_ratio, error / largest_deviation)
         return largest_ratio
 
     def _log_prior(self, processes: Mapping[int, Process]) -> float:
         """Return the logarithm of the prior of missing forces [nat], up to a constant."""
-        return prior_log_density(self.usual, processes)
+        return prior_log_density(self.prior_medians, processes)

@@ -1,11 +1,11 @@
-"""Compiled loops of the estimator: steps with laws in them, a Kalman filter, and its smoother.
+"""Compiled loops of the estimator: substeps with laws, a Kalman filter, and its smoother.
 
 The system of a trial is linear along a trajectory and changes in time:
 
     z[j + 1] = transition[j] z[j] + drift[j] weights + process noise,
     columns weights = rows z + noise of variance one.
 
-The first of the W weights is one and stands for what is known; the others are the unknowns of the
+The first of the W weights is one, that of the constant part; the others are the unknowns of the
 hypothesis. The filter carries the response of the state to each weight along with the state (de
 Jong 1991, Annals of Statistics 19, 1073-1083). Unknowns that are constant in time then follow from
 one regression after one pass, and need not be states.
@@ -34,41 +34,41 @@ def multiply(left: FloatArray, right: FloatArray, product: FloatArray) -> None:
 
 
 @callable_when_compiled
-def carry(
-    transition: FloatArray, covariance: FloatArray, room: FloatArray, carried: FloatArray
+def propagate_covariance(
+    transition: FloatArray, covariance: FloatArray, work: FloatArray, propagated: FloatArray
 ) -> None:
-    """Fill `carried` (n, n) with transition @ covariance @ transition.T, exactly symmetric.
+    """Fill `propagated` (n, n) with transition @ covariance @ transition.T, exactly symmetric.
 
-    `room` (n, n) is overwritten as working memory.
+    `work` (n, n) is overwritten as working memory.
     """
     size = len(transition)
-    multiply(transition, covariance, room)
+    multiply(transition, covariance, work)
     for i in range(size):
         for k in range(i + 1):
             element = 0.0
             for j in range(size):
-                element += room[i, j] * transition[k, j]
-            carried[i, k] = element
-            carried[k, i] = element
+                element += work[i, j] * transition[k, j]
+            propagated[i, k] = element
+            propagated[k, i] = element
 
 
 @compiled
-def step_matrices(
-    parts: int,
-    step_kind: IntArray,
+def substep_matrices_with_laws(
+    substeps: int,
+    interval_of_sample: IntArray,
     free_transition: FloatArray,
     free_noise: FloatArray,
-    push_at_begin: FloatArray,
-    push_at_end: FloatArray,
-    tangents: FloatArray,
-    pushes: FloatArray,
+    by_force_at_begin: FloatArray,
+    by_force_at_end: FloatArray,
+    force_by_state: FloatArray,
+    force_by_weight: FloatArray,
     drift: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return transitions and process noises of fine steps with laws, and fill `drift`.
+    """Return transitions and process noises of substeps with laws, and fill `drift`.
 
-    The force of the laws is linear in time over a step. As it depends on the state at the end, the
-    step is implicit: with the matrices b and e of forces at its start and end, tangents T and
-    pushes u,
+    The force of the laws is linear in time over a substep. As it depends on the state at the end,
+    the substep is implicit. With b and e for `by_force_at_begin` and `by_force_at_end`, T for
+    `force_by_state` and u for `force_by_weight`,
 
         (I - e T[j + 1]) z[j + 1] = (Phi + b T[j]) z[j] + d weights + noise,
         d = b u[j] + e u[j + 1] + drift[j].
@@ -77,47 +77,50 @@ def step_matrices(
 
     Parameters
     ----------
-    parts : int
-        The number of fine steps between two samples.
-    step_kind : (N,) ndarray of int
-        The kind of step that leads to each sample; steps of one kind have one length.
+    substeps : int
+        The number of substeps between two samples.
+    interval_of_sample : (N,) ndarray of int
+        The index of the length of the interval that ends at each sample.
     free_transition, free_noise : (K, n, n) ndarray
-        The transition Phi and the process noise of a fine step without laws, by kind.
-    push_at_begin, push_at_end : (K, n, P) ndarray
-        The change of the state over a fine step for a unit force at a port, at the start and at the
+        The transition Phi and the process noise of a substep without laws, for each length.
+    by_force_at_begin, by_force_at_end : (K, n, P) ndarray
+        The change of the state over a substep for a unit force at a port, at the start and at the
         end of the step.
-    tangents : (F, P, n) ndarray
+    force_by_state : (F, P, n) ndarray
         The derivative of the laws' force at a port by the state.
-    pushes : (F, P, W) ndarray
+    force_by_weight : (F, P, W) ndarray
         The laws' force at a port at state zero, for a unit of each weight.
     drift : (F - 1, n, W) ndarray
-        The state that each weight adds in a fine step without laws; filled with that with laws.
+        The state that each weight adds in a substep without laws; filled with that with laws.
 
     Returns
     -------
     transition, noise : (F - 1, n, n) ndarray
-        The transition and the covariance of the process noise of each fine step.
+        The transition and the covariance of the process noise of each substep.
     """
-    steps, ports, states = len(tangents) - 1, tangents.shape[1], tangents.shape[2]
+    steps, ports, states = len(force_by_state) - 1, force_by_state.shape[1], force_by_state.shape[2]
     transition = np.empty((steps, states, states))
     noise = np.empty((steps, states, states))
     inverse, explicit, work = np.empty((3, states, states))
     coupling = np.empty((ports, ports))
     explicit_drift = np.empty((states, drift.shape[2]))
     for j in range(steps):
-        kind = step_kind[j // parts + 1]
-        begin, end = push_at_begin[kind], push_at_end[kind]
+        interval = interval_of_sample[j // substeps + 1]
+        begin, end = by_force_at_begin[interval], by_force_at_end[interval]
         # right side: the laws' force at the start of the step, and all drift
-        multiply(begin, tangents[j], explicit)
-        explicit += free_transition[kind]
+        multiply(begin, force_by_state[j], explicit)
+        explicit += free_transition[interval]
         for i in range(states):
             for w in range(drift.shape[2]):
                 element = drift[j, i, w]
                 for p in range(ports):
-                    element += begin[i, p] * pushes[j, p, w] + end[i, p] * pushes[j + 1, p, w]
+                    element += (
+                        begin[i, p] * force_by_weight[j, p, w]
+                        + end[i, p] * force_by_weight[j + 1, p, w]
+                    )
                 explicit_drift[i, w] = element
         # inverse of the left side: (I - end tangent)^-1 = I + end (I - tangent end)^-1 tangent
-        tangent = tangents[j + 1]
+        tangent = force_by_state[j + 1]
         multiply(tangent, end, coupling)
         if ports == 1:
             inverse_tangent = tangent / (1.0 - coupling[0, 0])
@@ -128,19 +131,19 @@ def step_matrices(
             inverse[i, i] += 1.0
         multiply(inverse, explicit, transition[j])
         multiply(inverse, explicit_drift, drift[j])
-        carry(inverse, free_noise[kind], work, noise[j])
+        propagate_covariance(inverse, free_noise[interval], work, noise[j])
     return transition, noise
 
 
 @callable_when_compiled
-def take_reading(
+def update_by_reading(
     covariance: FloatArray,
     mean: FloatArray,
-    row: FloatArray,
+    output_row: FloatArray,
     innovation: FloatArray,
     gain: FloatArray,
 ) -> float:
-    """Take one reading into covariance (n, n) and means (n, W) in place, and return its variance.
+    """Update covariance and means of the state in place by one reading, and return its variance.
 
     Parameters
     ----------
@@ -148,21 +151,21 @@ def take_reading(
         The covariance of the state.
     mean : (n, W) ndarray
         The mean of the state for a unit of each weight.
-    row : (n,) ndarray
+    output_row : (n,) ndarray
         The reading for a unit of each state.
     innovation : (W,) ndarray
         The reading minus its prediction, for a unit of each weight.
     gain : (n,) ndarray
         The gain of the reading, which is filled.
     """
-    states = len(row)
+    states = len(output_row)
     covariance_row = np.empty(states)
     variance = 1.0
     for i in range(states):
         covariance_row[i] = 0.0
         for j in range(states):
-            covariance_row[i] += covariance[i, j] * row[j]
-        variance += row[i] * covariance_row[i]
+            covariance_row[i] += covariance[i, j] * output_row[j]
+        variance += output_row[i] * covariance_row[i]
     for i in range(states):
         gain[i] = covariance_row[i] / variance
     # Joseph form (I - g h^T) C (I - g h^T)^T + g g^T, one factor after the other: a rounding error
@@ -173,7 +176,7 @@ def take_reading(
     for i in range(states):
         covariance_row[i] = 0.0
         for j in range(states):
-            covariance_row[i] += covariance[i, j] * row[j]
+            covariance_row[i] += covariance[i, j] * output_row[j]
     for i in range(states):
         for j in range(states):
             covariance[i, j] += (gain[i] - covariance_row[i]) * gain[j]
@@ -185,11 +188,11 @@ def take_reading(
 
 @compiled
 def filter_record(
-    parts: int,
-    transition: FloatArray,
-    noise: FloatArray,
-    drift: FloatArray,
-    rows: FloatArray,
+    substeps: int,
+    transitions: FloatArray,
+    noises: FloatArray,
+    drifts: FloatArray,
+    output_rows: FloatArray,
     columns: FloatArray,
     used: BoolArray,
     covariance: FloatArray,
@@ -199,11 +202,11 @@ def filter_record(
 
     Parameters
     ----------
-    parts : int
-        The number of fine steps between two samples.
-    transition, noise, drift : (F - 1, n, n), (F - 1, n, n), (F - 1, n, W) ndarray
-        The matrices of each fine step, see `step_matrices`.
-    rows, columns : (N, C, n), (N, C, W) ndarray
+    substeps : int
+        The number of substeps between two samples.
+    transitions, noises, drifts : (F - 1, n, n), (F - 1, n, n), (F - 1, n, W) ndarray
+        The matrices of each substep, see `substep_matrices_with_laws`.
+    output_rows, columns : (N, C, n), (N, C, W) ndarray
         The readings for a unit of each state, and the residuals for a unit of each weight, divided
         by the deviation of the noise.
     used : (N, C) ndarray of bool
@@ -221,7 +224,7 @@ def filter_record(
     gains, variances : (N, C, n), (N, C) ndarray
         The gain of each reading, and the variance of its innovation.
     """
-    stamps, states, width = len(transition) + 1, mean.shape[0], mean.shape[1]
+    stamps, states, width = len(transitions) + 1, mean.shape[0], mean.shape[1]
     samples, channels = columns.shape[0], columns.shape[1]
     means = np.empty((stamps, states, width))
     covariances = np.empty((stamps, states, states))
@@ -234,33 +237,33 @@ def filter_record(
         means[j] = mean
         covariances[j] = covariance
         # every `parts`-th fine stamp is a sample: take in its readings
-        if j % parts == 0:
-            k = j // parts
+        if j % substeps == 0:
+            k = j // substeps
             for c in range(channels):
                 if used[k, c]:
                     for w in range(width):
                         innovations[k, c, w] = columns[k, c, w]
                         for i in range(states):
-                            innovations[k, c, w] -= rows[k, c, i] * mean[i, w]
-                    variances[k, c] = take_reading(
-                        covariance, mean, rows[k, c], innovations[k, c], gains[k, c]
+                            innovations[k, c, w] -= output_rows[k, c, i] * mean[i, w]
+                    variances[k, c] = update_by_reading(
+                        covariance, mean, output_rows[k, c], innovations[k, c], gains[k, c]
                     )
-        # predict over the fine step
+        # predict over the substep
         if j < stamps - 1:
             filtered_mean = mean.copy()
-            multiply(transition[j], filtered_mean, mean)
-            mean += drift[j]
+            multiply(transitions[j], filtered_mean, mean)
+            mean += drifts[j]
             filtered_covariance = covariance.copy()
-            carry(transition[j], filtered_covariance, work, covariance)
-            covariance += noise[j]
+            propagate_covariance(transitions[j], filtered_covariance, work, covariance)
+            covariance += noises[j]
     return means, covariances, innovations, gains, variances
 
 
 @compiled
 def smooth_record(
-    parts: int,
-    transition: FloatArray,
-    rows: FloatArray,
+    substeps: int,
+    transitions: FloatArray,
+    output_rows: FloatArray,
     used: BoolArray,
     states: FloatArray,
     covariances: FloatArray,
@@ -290,7 +293,7 @@ def smooth_record(
         The state given all readings, and the variance of each of its entries.
     """
     stamps, size = states.shape
-    channels = rows.shape[1]
+    channels = output_rows.shape[1]
     smoothed = np.empty((stamps, size))
     variance = np.empty((stamps, size))
     adjoint = np.zeros(size)
@@ -298,19 +301,19 @@ def smooth_record(
     work, carried = np.empty((2, size, size))
     information_gain = np.empty(size)
     for j in range(stamps - 1, -1, -1):
-        # carry both back over the fine step
+        # carry both back over the substep
         if j < stamps - 1:
-            backward = np.ascontiguousarray(transition[j].T)
+            backward = np.ascontiguousarray(transitions[j].T)
             adjoint = backward @ adjoint
-            carry(backward, information, work, carried)
+            propagate_covariance(backward, information, work, carried)
             information[:] = carried
         # take in the readings of a sample, in reverse order
-        if j % parts == 0:
-            k = j // parts
+        if j % substeps == 0:
+            k = j // substeps
             for c in range(channels - 1, -1, -1):
                 if not used[k, c]:
                     continue
-                row, gain = rows[k, c], gains[k, c]
+                row, gain = output_rows[k, c], gains[k, c]
                 row_information, later_correction = 1.0 / variances[k, c], 0.0
                 for i in range(size):
                     information_gain[i] = 0.0

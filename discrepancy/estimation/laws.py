@@ -11,18 +11,20 @@ from fe.compilation import compiled, law_functions
 from fe.runtime.arrays import FIRST_ELEMENT, POSITION
 from fe.runtime.laws import LAWS, advance, force_and_slope
 from fe.runtime.laws.interface import PARAMETERS, PortForce
-from fe.runtime.laws.speed import steady_force
+from fe.runtime.laws.speed import POSITION_EXPONENT, steady_force
 
-NODES = 8
+WINDOW_NODES = 8
 """Number of speeds in the window over which a law of the speed is averaged."""
-NUDGE = 1e-4
-"""Half the difference of the position in the tangent of a law of the speed, over the rms
-position."""
+RELATIVE_HALF_DIFFERENCE = 1e-4
+"""Half the difference of the position in the tangent of a law of the speed, as a fraction of the
+rms position."""
 
 
 @dataclass(frozen=True, eq=False)
-class ForceAlong:
-    """The force of laws at a port along its motion, counted positive against the motion.
+class LawForce:
+    """The force of laws at a port along its motion, with its derivatives by the motion (tangents).
+
+    A force is counted positive if it acts against the motion.
 
     Attributes
     ----------
@@ -36,23 +38,23 @@ class ForceAlong:
     by_position: FloatArray
     by_speed: FloatArray
 
-    def plus(self, other: "ForceAlong") -> "ForceAlong":
+    def plus(self, other: "LawForce") -> "LawForce":
         """Return the sum with the force of other laws at the same port."""
-        return ForceAlong(
+        return LawForce(
             self.force + other.force,
             self.by_position + other.by_position,
             self.by_speed + other.by_speed,
         )
 
 
-def along(
-    number: int,
+def fill_force_and_tangents(
+    law_index: int,
     of_speed: bool,
     law: FloatArray,
     positions: FloatArray,
     speeds: FloatArray,
     half_width: float,
-    nudge: float,
+    half_difference: float,
     memory: FloatArray,
     force: FloatArray,
     by_position: FloatArray,
@@ -61,22 +63,22 @@ def along(
     """Fill the force of a law along a motion of its port, and its tangents.
 
     A law of the speed is averaged over a window of speeds, so that the jump of dry friction has a
-    finite tangent. The tangent of a law with memory is that in its present state; that an earlier
-    motion changes the memory is neglected.
+    finite tangent. The tangent of a law with memory is that for its present memory; the influence
+    of the earlier motion on the memory is neglected.
 
     Parameters
     ----------
-    number : int
+    law_index : int
         The index of the law's class in `LAWS`.
     of_speed : bool
-        Whether the law is one of the speed, which has no memory.
+        Whether the law is a function of position and speed, without memory.
     law : (R,) array
-        The parameter row of the law.
+        The parameters of the law, as `PortForce.parameter_row`.
     positions, speeds : (F,) array
         The motion of the port [m or rad, and per s].
     half_width : float
         Half the window of speeds [m/s or rad/s].
-    nudge : float
+    half_difference : float
         Half the difference of the position in a tangent [m or rad].
     memory : (M,) array
         The memory of the law, which is changed.
@@ -86,37 +88,37 @@ def along(
     for j in range(len(positions)):
         x, v = positions[j], speeds[j]
         if not of_speed:
-            advance(number, law, memory, x)
+            advance(law_index, law, memory, x)
             memory[POSITION] = x
-            force[j], by_position[j] = force_and_slope(number, law, memory, x, 1.0)
+            force[j], by_position[j] = force_and_slope(law_index, law, memory, x, 1.0)
             continue
         total = 0.0
-        for i in range(NODES):
-            # midpoints of `NODES` equal parts of the window
-            offset = half_width * ((2.0 * i + 1.0) / NODES - 1.0)
+        for i in range(WINDOW_NODES):
+            # midpoints of `WINDOW_NODES` equal parts of the window
+            offset = half_width * ((2.0 * i + 1.0) / WINDOW_NODES - 1.0)
             total += steady_force(law, x, v + offset)
-        force[j] = total / NODES
+        force[j] = total / WINDOW_NODES
         # the exact derivative of the mean over the window
         difference_over_window = steady_force(law, x, v + half_width) - steady_force(
             law, x, v - half_width
         )
         by_speed[j] = difference_over_window / (2.0 * half_width)
-        if law[2] != 0.0:
-            difference_by_position = steady_force(law, x + nudge, v) - steady_force(
-                law, x - nudge, v
+        if law[POSITION_EXPONENT] != 0.0:
+            difference_by_position = steady_force(law, x + half_difference, v) - steady_force(
+                law, x - half_difference, v
             )
-            by_position[j] = difference_by_position / (2.0 * nudge)
+            by_position[j] = difference_by_position / (2.0 * half_difference)
 
 
 @cache
-def _compiled_along() -> Callable[..., None]:
-    """Return `along`, compiled if numba is installed."""
-    return compiled(along, law_functions())
+def _compiled_fill() -> Callable[..., None]:
+    """Return `fill_force_and_tangents`, compiled if numba is installed."""
+    return compiled(fill_force_and_tangents, law_functions())
 
 
-def force_along(
-    law: PortForce, time: FloatArray, positions: FloatArray, speeds: FloatArray, smoothing: float
-) -> ForceAlong:
+def force_and_tangents(
+    law: PortForce, time: FloatArray, positions: FloatArray, speeds: FloatArray, speed_window: float
+) -> LawForce:
     """Return the force of a law along a motion of its port, and its tangents.
 
     Both are zero outside of the law's windows in time.
@@ -127,7 +129,7 @@ def force_along(
         The law with its parameters.
     time, positions, speeds : (F,) ndarray
         The fine stamps [s], and the motion of the port there [m or rad, and per s].
-    smoothing : float
+    speed_window : float
         Half the window of speeds over which a law of the speed is averaged, over the rms speed.
     """
     row = law.parameter_row
@@ -135,18 +137,18 @@ def force_along(
     force, by_position, by_speed = np.zeros((3, len(time)))
     rms_speed = max(float(np.sqrt(np.mean(speeds**2))), 1e-300)
     rms_position = max(float(np.sqrt(np.mean(positions**2))), 1e-300)
-    _compiled_along()(
+    _compiled_fill()(
         LAWS.index(type(law)),
         type(law).depends_on_speed,
         row,
         np.ascontiguousarray(positions),
         np.ascontiguousarray(speeds),
-        smoothing * rms_speed,
-        NUDGE * rms_position,
+        speed_window * rms_speed,
+        RELATIVE_HALF_DIFFERENCE * rms_position,
         memory,
         force,
         by_position,
         by_speed,
     )
     is_acting = law.acts_at(time)
-    return ForceAlong(force * is_acting, by_position * is_acting, by_speed * is_acting)
+    return LawForce(force * is_acting, by_position * is_acting, by_speed * is_acting)

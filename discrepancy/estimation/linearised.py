@@ -8,8 +8,8 @@ w, it obeys
     reading = r(w) + C(w) s - sum_p e_p (G_p(x, v; w) + f_p) + noise.
 
 Here x and v are the position and the speed of port p, and r is the reading of the linear model. All
-of it is linearised along a trajectory. A weight is a factor of the linear model: the first weight
-is one and stands for what is known, the others are the unknowns.
+of it is linearised along a trajectory. A weight is a factor of a column of the linear model: the
+first weight is one, that of the constant part, and the others are the unknowns.
 """
 
 from collections.abc import Mapping
@@ -21,11 +21,11 @@ from scipy.linalg import expm
 
 from discrepancy.campaign.records import FloatArray, IntArray
 from discrepancy.missing_force.filtered import ForceFilter, Process
-from discrepancy.missing_force.kalman import discretised
-from discrepancy.missing_force.trial import SeenTrial
+from discrepancy.missing_force.kalman import discretise
+from discrepancy.missing_force.trial import PortedTrial
 
-from .kernel import filter_record, smooth_record, step_matrices
-from .laws import ForceAlong
+from .kernel import filter_record, smooth_record, substep_matrices_with_laws
+from .laws import LawForce
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ class Trajectory:
 
     Attributes
     ----------
-    added : (F, n) ndarray
+    added_state : (F, n) ndarray
         The state that forces at ports add to the response of the linear model.
     positions, speeds : (F, P) ndarray
         The motion of the P ports [m or rad, and per s].
@@ -43,12 +43,12 @@ class Trajectory:
         N m].
     """
 
-    added: FloatArray
+    added_state: FloatArray
     positions: FloatArray
     speeds: FloatArray
     forces: Mapping[int, FloatArray]
 
-    def toward(self, other: "Trajectory", fraction: float) -> "Trajectory":
+    def interpolate(self, other: "Trajectory", fraction: float) -> "Trajectory":
         """Return the trajectory that lies a fraction of the way to another one."""
         ports = {*self.forces, *other.forces}
         forces = {
@@ -57,7 +57,7 @@ class Trajectory:
             for port in ports
         }
         return Trajectory(
-            self.added + fraction * (other.added - self.added),
+            self.added_state + fraction * (other.added_state - self.added_state),
             self.positions + fraction * (other.positions - self.positions),
             self.speeds + fraction * (other.speeds - self.speeds),
             {port: np.asarray(force) for port, force in forces.items()},
@@ -65,34 +65,53 @@ class Trajectory:
 
 
 @dataclass(frozen=True, eq=False)
-class Forces:
+class LinearisedForce:
     """The force of a hypothesis' laws at a port along a trajectory, with its derivatives.
 
     Attributes
     ----------
-    along : ForceAlong
+    law_force : LawForce
         The force of all laws at the port, and its derivatives by the motion.
     by_unknown : mapping of int to (F,) ndarray
         The derivatives of the force by unknowns, by the number of the unknown.
     """
 
-    along: ForceAlong
+    law_force: LawForce
     by_unknown: Mapping[int, FloatArray]
+
+    def extrapolate(
+        self, position_change: FloatArray, speed_change: FloatArray, unknowns_change: FloatArray
+    ) -> FloatArray:
+        """Return the force (F,) that the linear laws have after a change of motion and unknowns.
+
+        Parameters
+        ----------
+        position_change, speed_change : (F,) array
+            The change of the motion of the port [m or rad, and per s].
+        unknowns_change : (K + E,) array
+            The change of the shared unknowns, then of those of effects.
+        """
+        law = self.law_force
+        force = law.force + law.by_position * position_change
+        force = force + law.by_speed * speed_change
+        for unknown, derivative in self.by_unknown.items():
+            force = force + unknowns_change[unknown] * derivative
+        return force
 
 
 @dataclass(frozen=True, eq=False)
-class SensorReadings:
+class LinearisedSensorErrors:
     """The changes of a trial's readings by errors of sensors, divided by the noise.
 
     Attributes
     ----------
-    known : (N, C) ndarray
+    change : (N, C) ndarray
         The change at the present values of the unknowns.
     by_unknown : mapping of int to (N, C) ndarray
         The derivatives of the change by unknowns, by the number of the unknown.
     """
 
-    known: FloatArray
+    change: FloatArray
     by_unknown: Mapping[int, FloatArray]
 
 
@@ -100,223 +119,251 @@ class SensorReadings:
 class LinearisedTrial:
     """A trial, linear along a trajectory.
 
-    The unknowns are the K shared ones, the E of the hypothesis' effects, and the trial's own, in
-    this order. Shapes: F fine stamps, N samples, C channels, n states, W weights (one and all
-    unknowns), L ports with a law of the hypothesis.
+    The unknowns are the K shared ones, the E ones of the hypothesis' effects, and those of the
+    trial alone, in this order. Shapes: F fine stamps, N samples, C channels, n states, W weights
+    (one, then all unknowns), L ports with a law of the hypothesis.
 
     Attributes
     ----------
-    trial : SeenTrial
-        The readings minus the linear model, and how ports move.
+    trial : PortedTrial
+        The trial with its residuals, its linear system, and the motion of its ports.
     processes : mapping of int to Process
-        Missing forces, by the numbers of their ports.
+        The missing forces, by the number of the port.
     trajectory : Trajectory
         The trajectory along which it is linear.
-    forces : mapping of int to Forces
+    forces : mapping of int to LinearisedForce
         The forces of the hypothesis' laws, by port.
-    sensors : SensorReadings
+    sensor_errors : LinearisedSensorErrors
         The changes of readings by the hypothesis' effects of sensors.
     effect : (E,) ndarray
         The values of the effects' unknowns at which laws and sensors are linearised.
     shared : (K,) ndarray
-        The values of the shared unknowns there.
+        The values of the shared unknowns at which they are linearised.
     """
 
-    trial: SeenTrial
+    trial: PortedTrial
     processes: Mapping[int, Process]
     trajectory: Trajectory
-    forces: Mapping[int, Forces]
-    sensors: SensorReadings
+    forces: Mapping[int, LinearisedForce]
+    sensor_errors: LinearisedSensorErrors
     effect: FloatArray
     shared: FloatArray
 
     # ------------------------------------------------------------ layout
 
     @cached_property
-    def filtered(self) -> ForceFilter:
+    def force_filter(self) -> ForceFilter:
         """The linear system with its missing forces, scaled so that its states are of size one."""
         return ForceFilter(self.trial, tuple(self.processes.items()))
 
     @property
-    def moving(self) -> int:
-        """The number of states of the structure; missing forces and coloured noises follow them."""
-        return len(self.trial.system.generator)
+    def structure(self) -> slice:
+        """The states of the structure; those of missing forces and coloured noises follow them."""
+        return slice(0, len(self.trial.system.generator))
 
     @property
-    def width(self) -> int:
-        """The number W of weights: one for what is known, and one for each unknown."""
-        return 1 + len(self.shared) + len(self.effect) + len(self.trial.local)
+    def weight_count(self) -> int:
+        """The number W of weights: the first is one, the others are the unknowns."""
+        return 1 + len(self.shared) + len(self.effect) + len(self.trial.local_derivatives)
 
-    def weight_of(self, unknown: int) -> int:
+    def weight_index(self, unknown: int) -> int:
         """Return the index of the weight of a shared unknown, or of one of the trial alone.
 
         Parameters
         ----------
         unknown : int
-            The number of the unknown in `SeenTrial.about`, where those of the trial alone follow
-            the shared ones. In the weights, those of effects stand between both.
+            The number of the unknown in `PortedTrial.linearisation_point`, where those of the trial
+            alone follow the shared ones. In the weights, those of effects stand between both.
         """
         shared_count = len(self.shared)
         return 1 + unknown + (len(self.effect) if unknown >= shared_count else 0)
 
     @cached_property
-    def ports(self) -> tuple[int, ...]:
+    def law_ports(self) -> tuple[int, ...]:
         """The numbers of the L ports at which a law of the hypothesis acts."""
         return tuple(self.forces)
 
     # ------------------------------------------------------------ forces of the laws
 
     @cached_property
-    def tangents(self) -> FloatArray:
-        """The derivatives (F, L, n) of the laws' force at their ports by the scaled state."""
-        generator, _, _, _ = self.filtered.system
-        tangents = np.zeros((len(self.trial.fine_time), len(self.ports), len(generator)))
+    def force_by_state(self) -> FloatArray:
+        """The derivatives (F, L, n) of the laws' force at each port by the scaled state."""
+        state_count = len(self.force_filter.state_space.generator)
+        derivatives = np.zeros((len(self.trial.fine_time), len(self.law_ports), state_count))
         system = self.trial.system
-        units = self.filtered.units
-        for row, port in enumerate(self.ports):
-            law = self.forces[port].along
-            tangents[:, row, : self.moving] = (
+        units = self.force_filter.state_units
+        for row, port in enumerate(self.law_ports):
+            law = self.forces[port].law_force
+            derivatives[:, row, self.structure] = (
                 law.by_position[:, None] * system.positions[port] * units
                 + law.by_speed[:, None] * system.speeds[port] * units
             )
-        return tangents
+        return derivatives
 
     @cached_property
-    def pushes(self) -> FloatArray:
-        """The laws' force (F, L, W) at their ports at state zero, for a unit of each weight.
+    def force_by_weight(self) -> FloatArray:
+        """The laws' force (F, L, W) at each port at state zero, for a unit of each weight.
 
-        The whole force of the laws is `pushes` times the weights plus `tangents` times the state.
+        The whole force of the laws is `force_by_weight` times the weights plus `force_by_state`
+        times the state.
         """
         trial = self.trial
         trajectory = self.trajectory
-        pushes = np.zeros((len(trial.fine_time), len(self.ports), self.width))
-        for row, port in enumerate(self.ports):
-            law = self.forces[port].along
+        force = np.zeros((len(trial.fine_time), len(self.law_ports), self.weight_count))
+        for row, port in enumerate(self.law_ports):
+            law = self.forces[port].law_force
             # motion at state zero and zero unknowns, minus that of the trajectory
-            position_offset = trial.positions[:, port] - trajectory.positions[:, port]
-            speed_offset = trial.speeds[:, port] - trajectory.speeds[:, port]
-            for unknown, (position_slopes, speed_slopes) in trial.by_unknowns.items():
-                position_offset = position_offset - trial.about[unknown] * position_slopes[:, port]
-                speed_offset = speed_offset - trial.about[unknown] * speed_slopes[:, port]
-                pushes[:, row, self.weight_of(unknown)] += (
-                    law.by_position * position_slopes[:, port]
-                    + law.by_speed * speed_slopes[:, port]
+            position_offset = trial.port_positions[:, port] - trajectory.positions[:, port]
+            speed_offset = trial.port_speeds[:, port] - trajectory.speeds[:, port]
+            # unknowns that move the ports in the model's response
+            for unknown, (positions, speeds) in trial.port_motion_derivatives.items():
+                value = trial.linearisation_point[unknown]
+                position_offset = position_offset - value * positions[:, port]
+                speed_offset = speed_offset - value * speeds[:, port]
+                force[:, row, self.weight_index(unknown)] += (
+                    law.by_position * positions[:, port] + law.by_speed * speeds[:, port]
                 )
-            pushes[:, row, 0] = (
+            # the first weight: the force at zero unknowns
+            force[:, row, 0] = (
                 law.force + law.by_position * position_offset + law.by_speed * speed_offset
             )
-            for unknown, slope in self.forces[port].by_unknown.items():
-                pushes[:, row, 1 + unknown] += slope
-                # refer the known force from the present value of the unknown to zero
-                pushes[:, row, 0] -= self._value(unknown) * slope
-        return pushes
+            # unknowns that change the laws; the law's force is that at their present values
+            for unknown, derivative in self.forces[port].by_unknown.items():
+                force[:, row, 1 + unknown] += derivative
+                force[:, row, 0] -= self._value_of_unknown(unknown) * derivative
+        return force
 
-    def _value(self, unknown: int) -> float:
+    def _value_of_unknown(self, unknown: int) -> float:
         """Return the value of an unknown, shared or of an effect, about which laws are linear."""
         return float(np.concatenate((self.shared, self.effect))[unknown])
 
     @cached_property
-    def directions(self) -> FloatArray:
-        """The rate (n, L) of the scaled state for a unit force at each of the laws' ports."""
-        generator, _, _, _ = self.filtered.system
-        directions = np.zeros((len(generator), len(self.ports)))
-        for row, port in enumerate(self.ports):
-            directions[: self.moving, row] = -self.trial.system.actions[port] / self.filtered.units
-        return directions
+    def state_rate_by_force(self) -> FloatArray:
+        """The rate (n, L) of the scaled state by a unit force at each port with a law."""
+        state_count = len(self.force_filter.state_space.generator)
+        rates = np.zeros((state_count, len(self.law_ports)))
+        # a force acts against the motion: s' = A s - b force, see `PortedSystem`
+        for row, port in enumerate(self.law_ports):
+            rates[self.structure, row] = (
+                -self.trial.system.actions[port] / self.force_filter.state_units
+            )
+        return rates
 
     # ------------------------------------------------------------ steps
 
-    def _steps(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return transitions, process noises and drifts of all fine steps, with the laws in them.
+    def _substep_matrices(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return transitions, process noises and drifts of all substeps, with the laws in them.
 
         Returns
         -------
-        transition, noise : (F - 1, n, n) array
-            The transition of each fine step, and the covariance of its process noise.
-        drift : (F - 1, n, W) array
-            The state that each weight adds in a fine step.
+        transitions, noises : (F - 1, n, n) array
+            The transition of each substep, and the covariance of its process noise.
+        drifts : (F - 1, n, W) array
+            The state that a unit of each weight adds in each substep.
         """
-        generator, intensity, _, _ = self.filtered.system
-        lengths, step_kind = self.trial.steps
-        fine_lengths = lengths / self.trial.parts
-        free_transition, free_noise = discretised(generator, intensity, fine_lengths)
-        by_input_at_begin, by_input_at_end = push_matrices(generator, fine_lengths)
-        drift = self._drift_by_parameters(by_input_at_begin, by_input_at_end, step_kind)
-        transition, noise = step_matrices(
-            self.trial.parts,
-            step_kind,
+        state_space = self.force_filter.state_space
+        lengths, interval_of_sample = self.trial.intervals
+        substep_lengths = lengths / self.trial.substeps
+        free_transition, free_noise = discretise(
+            state_space.generator, state_space.intensity, substep_lengths
+        )
+        by_input_at_begin, by_input_at_end = input_matrices(state_space.generator, substep_lengths)
+        drifts = self._drift_by_system_parameters(
+            by_input_at_begin, by_input_at_end, interval_of_sample
+        )
+        # adds the drift by the laws
+        transitions, noises = substep_matrices_with_laws(
+            self.trial.substeps,
+            interval_of_sample,
             free_transition,
             free_noise,
-            np.ascontiguousarray(by_input_at_begin @ self.directions),
-            np.ascontiguousarray(by_input_at_end @ self.directions),
-            self.tangents,
-            self.pushes,
-            drift,
+            np.ascontiguousarray(by_input_at_begin @ self.state_rate_by_force),
+            np.ascontiguousarray(by_input_at_end @ self.state_rate_by_force),
+            self.force_by_state,
+            self.force_by_weight,
+            drifts,
         )
-        return transition, noise, drift
+        return transitions, noises, drifts
 
-    def _drift_by_parameters(
-        self, begin: FloatArray, end: FloatArray, kind: IntArray
+    def _drift_by_system_parameters(
+        self,
+        by_input_at_begin: FloatArray,
+        by_input_at_end: FloatArray,
+        interval_of_sample: IntArray,
     ) -> FloatArray:
         """Return the drift (F - 1, n, W) by parameters that change the linear system itself.
 
         Parameters
         ----------
-        begin, end : (K, n, n) array
-            The change of the state over a fine step for a unit input at its start, or at its end,
-            by the kind of step.
-        kind : (N,) array of int
-            The kind of step that leads to each sample; steps of one kind have one length.
+        by_input_at_begin, by_input_at_end : (K, n, n) array
+            The change of the state over a substep for a unit input at its start, or at its end,
+            for each of the K lengths of intervals.
+        interval_of_sample : (N,) array of int
+            The index of the length of the interval that ends at each sample.
         """
         trial = self.trial
-        moving = self.moving
+        structure = self.structure
         step_count = len(trial.fine_time) - 1
-        drift = np.zeros((step_count, len(begin[0]), self.width))
-        kind_of_step = kind[np.arange(step_count) // trial.parts + 1]
-        for unknown, slope in enumerate(trial.slopes):
-            if slope is None:
+        drift = np.zeros((step_count, len(by_input_at_begin[0]), self.weight_count))
+        interval_of_substep = interval_of_sample[np.arange(step_count) // trial.substeps + 1]
+        for unknown, derivative in enumerate(trial.system_derivatives):
+            if derivative is None:
                 continue
             # derivative of A s - sum_p b_p force_p by the parameter, along the trajectory
-            rate_change = self.trajectory.added @ slope.generator.T
+            rate_change = self.trajectory.added_state @ derivative.generator.T
             for port, force in self.trajectory.forces.items():
-                rate_change = rate_change - np.outer(force, slope.actions[port])
-            rate_change = rate_change / self.filtered.units
+                rate_change = rate_change - np.outer(force, derivative.actions[port])
+            rate_change = rate_change / self.force_filter.state_units
+            # over each substep j: matrix (a, b) of the scaled states times rate (b,)
             state_change = np.einsum(
-                "jab,jb->ja", begin[kind_of_step, :, :moving], rate_change[:-1]
+                "jab,jb->ja",
+                by_input_at_begin[interval_of_substep, :, structure],
+                rate_change[:-1],
             )
-            state_change += np.einsum("jab,jb->ja", end[kind_of_step, :, :moving], rate_change[1:])
+            state_change += np.einsum(
+                "jab,jb->ja",
+                by_input_at_end[interval_of_substep, :, structure],
+                rate_change[1:],
+            )
             drift[:, :, 1 + unknown] += state_change
-            drift[:, :, 0] -= trial.about[unknown] * state_change
+            drift[:, :, 0] -= trial.linearisation_point[unknown] * state_change
         return drift
 
-    def _start(self) -> tuple[FloatArray, FloatArray]:
+    def _initial_state(self) -> tuple[FloatArray, FloatArray]:
         """Return covariance (n, n) and mean (n, W) of the state before the first reading.
 
         The mean has one column for each weight.
         """
-        generator, _, _, covariance = self.filtered.system
-        mean = np.zeros((len(generator), self.width))
-        if not self.trial.settled:
+        generator = self.force_filter.state_space.generator
+        covariance = self.force_filter.state_space.initial_covariance
+        mean = np.zeros((len(generator), self.weight_count))
+        if not self.trial.begins_at_rest:
             return covariance, mean
-        # At rest s' = 0 under the laws and the missing forces f, whose first values are not known:
-        # (A + directions tangents) s + directions pushes + (column of A for f) f = 0
-        moving = self.moving
-        directions = self.directions[:moving]
-        rate_matrix = generator[:moving, :moving] + directions @ self.tangents[0][:, :moving]
-        mean[:moving] = np.linalg.lstsq(rate_matrix, -directions @ self.pushes[0], rcond=1e-12)[0]
+        # At rest s' = 0 under the laws and the missing forces f, whose first values are not known.
+        # With the rates B by the laws' forces T s + u:  (A + B T) s + B u + (column of A for f) f =
+        # 0
+        structure = self.structure
+        state_rate_by_force = self.state_rate_by_force[structure]
+        rate_matrix = (
+            generator[structure, structure]
+            + state_rate_by_force @ self.force_by_state[0][:, structure]
+        )
+        mean[structure] = np.linalg.lstsq(
+            rate_matrix, -state_rate_by_force @ self.force_by_weight[0], rcond=1e-12
+        )[0]
         covariance = covariance.copy()
-        covariance[:moving, :moving] = 0.0
-        for index in self.filtered.places:
-            at_rest = np.linalg.lstsq(rate_matrix, -generator[:moving, index], rcond=1e-12)[0]
-            covariance[:moving, :moving] += np.outer(at_rest, at_rest)
-            covariance[:moving, index] = at_rest
-            covariance[index, :moving] = at_rest
+        covariance[structure, structure] = 0.0
+        for index in self.force_filter.force_state_indices:
+            at_rest = np.linalg.lstsq(rate_matrix, -generator[structure, index], rcond=1e-12)[0]
+            covariance[structure, structure] += np.outer(at_rest, at_rest)
+            covariance[structure, index] = at_rest
+            covariance[index, structure] = at_rest
         return covariance, mean
 
     # ------------------------------------------------------------ readings
 
-    def _readings(self) -> tuple[FloatArray, FloatArray]:
-        """Return the readings as rows on the state and columns of the weights.
+    def _observations(self) -> tuple[FloatArray, FloatArray]:
+        """Return the readings by the state, and the residuals by the weights.
 
         Returns
         -------
@@ -329,90 +376,99 @@ class LinearisedTrial:
             explains. Zero if a reading does not count.
         """
         trial = self.trial
-        parts = trial.parts
+        substeps = trial.substeps
         samples, channels = trial.residual.shape
-        _, _, state_rows, _ = self.filtered.system
-        rows = np.repeat(state_rows[None], samples, axis=0)
-        columns = np.zeros((samples, channels, self.width))
-        columns[:, :, 0] = trial.residual - self.sensors.known
-        for unknown, slope in self.sensors.by_unknown.items():
-            columns[:, :, 1 + unknown] -= slope
-            columns[:, :, 0] += self._value(unknown) * slope
-        derivatives = np.concatenate((trial.shared, trial.local))
-        for unknown, derivative in enumerate(derivatives):
-            columns[:, :, self.weight_of(unknown)] -= derivative
-        for unknown, derivative in self._by_parameters().items():
+        rows = np.repeat(self.force_filter.state_space.output_rows[None], samples, axis=0)
+        columns = np.zeros((samples, channels, self.weight_count))
+        columns[:, :, 0] = trial.residual - self.sensor_errors.change
+        for unknown, derivative in self.sensor_errors.by_unknown.items():
             columns[:, :, 1 + unknown] -= derivative
-            columns[:, :, 0] += trial.about[unknown] * derivative
-        columns *= self.filtered.white[:, None]
+            columns[:, :, 0] += self._value_of_unknown(unknown) * derivative
+        derivatives = np.concatenate((trial.shared_derivatives, trial.local_derivatives))
+        for unknown, derivative in enumerate(derivatives):
+            columns[:, :, self.weight_index(unknown)] -= derivative
+        for unknown, derivative in self._readings_by_shared_unknowns().items():
+            columns[:, :, 1 + unknown] -= derivative
+            columns[:, :, 0] += trial.linearisation_point[unknown] * derivative
+        columns *= self.force_filter.white_noise_scale[:, None]
         # an acceleration shows the forces of laws directly, with the sign of - e_p G_p
-        for row, port in enumerate(self.ports):
-            through = trial.system.through[port] / trial.deviation * self.filtered.white
+        for row, port in enumerate(self.law_ports):
+            through = (
+                trial.system.through[port] / trial.deviation * self.force_filter.white_noise_scale
+            )
             if not np.any(through):
                 continue
-            rows = rows - through[:, None] * self.tangents[::parts, row][:, None, :]
-            columns += self.pushes[::parts, row, None, :] * through[:, None]
+            rows = rows - through[:, None] * self.force_by_state[::substeps, row][:, None, :]
+            columns += self.force_by_weight[::substeps, row, None, :] * through[:, None]
         return np.ascontiguousarray(rows), columns * trial.used[:, :, None]
 
-    def _by_parameters(self) -> dict[int, FloatArray]:
-        """Return the derivatives (N, C) of readings by shared unknowns, along the trajectory.
+    def _readings_by_shared_unknowns(self) -> dict[int, FloatArray]:
+        """Return the derivatives (N, C) of the readings by shared unknowns at a fixed added state.
 
-        They are the changes of the output equation, divided by the noise: by parameters that change
-        the system, and by gains of channels.
+        They are divided by the noise. The shared unknowns are parameters that change the output
+        equation, and gains of channels.
         """
         trial = self.trial
         trajectory = self.trajectory
         derivatives: dict[int, FloatArray] = {}
-        for unknown, slope in enumerate(trial.slopes):
-            if slope is not None:
-                derivatives[unknown] = trial.over_noise(
-                    trial.shown(slope, trajectory.added, trajectory.forces)
+        for unknown, derivative in enumerate(trial.system_derivatives):
+            if derivative is not None:
+                derivatives[unknown] = trial.divide_by_noise(
+                    trial.outputs_of_state(derivative, trajectory.added_state, trajectory.forces)
                 )
-        added_readings = trial.readings(trajectory.added, trajectory.forces)
-        for unknown, channel, scale in trial.gains:
+        added_readings = trial.readings_of_state(trajectory.added_state, trajectory.forces)
+        for unknown, channel, scale in trial.gain_unknowns:
             derivatives[unknown] = added_readings * scale * np.eye(added_readings.shape[1])[channel]
         return derivatives
 
     # ------------------------------------------------------------ filter and smoother
 
     @cached_property
-    def record(self) -> "FilteredRecord":
+    def filtered_record(self) -> "FilteredRecord":
         """The results of one pass of the Kalman filter."""
-        transition, noise, drift = self._steps()
-        rows, columns = self._readings()
-        covariance, mean = self._start()
+        transitions, noises, drifts = self._substep_matrices()
+        output_rows, columns = self._observations()
+        covariance, mean = self._initial_state()
         means, covariances, innovations, gains, variances = filter_record(
-            self.trial.parts,
-            transition,
-            noise,
-            drift,
-            rows,
+            self.trial.substeps,
+            transitions,
+            noises,
+            drifts,
+            output_rows,
             columns,
             self.trial.used,
             covariance,
             mean,
         )
-        return FilteredRecord(transition, rows, means, covariances, innovations, gains, variances)
+        return FilteredRecord(
+            transitions=transitions,
+            output_rows=output_rows,
+            means=means,
+            covariances=covariances,
+            innovations=innovations,
+            gains=gains,
+            variances=variances,
+        )
 
     @cached_property
-    def products(self) -> tuple[FloatArray, float]:
-        """The products (W, W) of whitened residual and derivatives, and half a log determinant.
+    def whitened_products(self) -> tuple[FloatArray, float]:
+        """The inner products (W, W) of the whitened columns, and half a log determinant [nat].
 
-        The second is half the sum of the logarithms of the readings' variances, each given those
-        before it [nat].
+        The columns are the residual and its derivatives by the unknowns. The determinant is that of
+        the covariance of the readings: the product of their variances, each given those before it.
         """
-        record = self.record
-        white = record.innovations / np.sqrt(record.variances)[:, :, None]
-        white = white.reshape(-1, self.width)
-        # from minus the derivatives of the readings to the derivatives
-        white[:, 1:] *= -1.0
+        record = self.filtered_record
+        whitened = record.innovations / np.sqrt(record.variances)[:, :, None]
+        whitened = whitened.reshape(-1, self.weight_count)
+        # `_observations` has minus the derivatives of the readings: change the sign
+        whitened[:, 1:] *= -1.0
         used = self.trial.used
         half_log_determinant = 0.5 * float(np.sum(np.log(record.variances)[used]))
-        # readings were multiplied by `white`, and their deviations with them
-        half_log_determinant -= float(np.sum(np.log(self.filtered.white) * used))
-        return white.T @ white, half_log_determinant
+        # readings were multiplied by `white_noise_scale`, and their deviations with them
+        half_log_determinant -= float(np.sum(np.log(self.force_filter.white_noise_scale) * used))
+        return whitened.T @ whitened, half_log_determinant
 
-    def smoothed(self, unknowns: FloatArray) -> "SmoothedTrial":
+    def smooth(self, unknowns: FloatArray) -> "SmoothedTrial":
         """Return the smoothed trajectory and forces of the trial, given all readings.
 
         Parameters
@@ -420,12 +476,13 @@ class LinearisedTrial:
         unknowns : (W - 1,) ndarray
             The values of all unknowns.
         """
-        record, trial = self.record, self.trial
+        trial = self.trial
+        record = self.filtered_record
         weights = np.concatenate(([1.0], unknowns))
         states, variance = smooth_record(
-            trial.parts,
-            record.transition,
-            record.rows,
+            trial.substeps,
+            record.transitions,
+            record.output_rows,
             trial.used,
             record.means @ weights,
             record.covariances,
@@ -433,36 +490,57 @@ class LinearisedTrial:
             record.gains,
             record.variances,
         )
-        added = states[:, : self.moving] * self.filtered.units
-        missing: dict[int, FloatArray] = {}
+        # the states of the structure and of the missing forces, in their units
+        added_state = states[:, self.structure] * self.force_filter.state_units
+        state_deviation = np.sqrt(variance[:, self.structure]) * self.force_filter.state_units
+        missing_forces: dict[int, FloatArray] = {}
         deviations: dict[int, FloatArray] = {}
         for (port, process), index in zip(
-            self.processes.items(), self.filtered.places, strict=True
+            self.processes.items(), self.force_filter.force_state_indices, strict=True
         ):
-            missing[port] = states[:, index] * process.size
-            deviations[port] = np.sqrt(variance[:, index]) * process.size
-        forces = dict(missing)
-        laws: dict[int, FloatArray] = {}
-        for row, port in enumerate(self.ports):
-            law = self.pushes[:, row] @ weights + np.einsum(
-                "fn,fn->f", self.tangents[:, row], states
-            )
-            laws[port] = law
-            forces[port] = forces.get(port, 0.0) + law
+            missing_forces[port] = states[:, index] * process.standard_deviation
+            deviations[port] = np.sqrt(variance[:, index]) * process.standard_deviation
+        # forces of the laws, at each fine stamp f by the states n there
+        law_forces: dict[int, FloatArray] = {}
+        forces = dict(missing_forces)
+        for row, port in enumerate(self.law_ports):
+            force_by_states = np.einsum("fn,fn->f", self.force_by_state[:, row], states)
+            law_forces[port] = self.force_by_weight[:, row] @ weights + force_by_states
+            forces[port] = forces.get(port, 0.0) + law_forces[port]
+        # motion of the ports
         shared = unknowns[: len(self.shared)]
         local = unknowns[len(self.shared) + len(self.effect) :]
-        positions, speeds = trial.port_motion(np.concatenate((shared, local)), added)
-        trajectory = Trajectory(added, positions, speeds, forces)
-        state_deviation = np.sqrt(variance[:, : self.moving]) * self.filtered.units
-        return SmoothedTrial(trajectory, missing, laws, deviations, state_deviation)
+        positions, speeds = trial.port_motion(np.concatenate((shared, local)), added_state)
+        trajectory = Trajectory(added_state, positions, speeds, forces)
+        return SmoothedTrial(
+            trajectory=trajectory,
+            missing_forces=missing_forces,
+            law_forces=law_forces,
+            missing_force_deviations=deviations,
+            state_deviation=state_deviation,
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class FilteredRecord:
-    """The results of one pass of the filter over a trial; shapes as in `kernel.filter_record`."""
+    """The results of one pass of the filter over a trial.
 
-    transition: FloatArray
-    rows: FloatArray
+    Attributes
+    ----------
+    transitions : (F - 1, n, n) ndarray
+        The transition of each substep.
+    output_rows : (N, C, n) ndarray
+        The readings for a unit of each state.
+    means, covariances : (F, n, W), (F, n, n) ndarray
+        The predicted state at each fine stamp; its mean is that for a unit of each weight.
+    innovations : (N, C, W) ndarray
+        The readings minus their predictions, for a unit of each weight.
+    gains, variances : (N, C, n), (N, C) ndarray
+        The gain of each reading, and the variance of its innovation.
+    """
+
+    transitions: FloatArray
+    output_rows: FloatArray
     means: FloatArray
     covariances: FloatArray
     innovations: FloatArray
@@ -478,25 +556,25 @@ class SmoothedTrial:
     ----------
     trajectory : Trajectory
         The smoothed motion, and all forces at ports.
-    missing : mapping of int to (F,) ndarray
-        The force at each port that no law explains, by the number of the port [N or N m].
-    laws : mapping of int to (F,) ndarray
-        The force of the laws at each port, linear about the trajectory before.
-    deviations : mapping of int to (F,) ndarray
-        The posterior standard deviation of `missing`.
+    missing_forces : mapping of int to (F,) ndarray
+        The missing force at each port, which no law explains, by the number of the port [N or N m].
+    law_forces : mapping of int to (F,) ndarray
+        The force of the laws at each port, linear about the previous trajectory.
+    missing_force_deviations : mapping of int to (F,) ndarray
+        The posterior standard deviation of `missing_forces`.
     state_deviation : (F, n) ndarray
         The posterior standard deviation of the added state.
     """
 
     trajectory: Trajectory
-    missing: Mapping[int, FloatArray]
-    laws: Mapping[int, FloatArray]
-    deviations: Mapping[int, FloatArray]
+    missing_forces: Mapping[int, FloatArray]
+    law_forces: Mapping[int, FloatArray]
+    missing_force_deviations: Mapping[int, FloatArray]
     state_deviation: FloatArray
 
 
-def push_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the changes of the state over a step for a unit input to its rate.
+def input_matrices(generator: FloatArray, lengths: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the changes of a state over steps by a unit input to its rate.
 
     The input is linear over the step. The matrices follow from one exponential of the system with
     the input and its rate as further states (Van Loan 1978, IEEE Transactions on Automatic Control

@@ -1,7 +1,7 @@
 """The most probable hypotheses on the missing force, estimated together with the motion.
 
-The search follows a hypothesis along a motion that is taken as known. Here its laws are inside of
-the smoother that estimates the motion.
+The search evaluates the laws of a hypothesis along a motion that is taken as known. Here the laws
+are part of the smoother that estimates the motion.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,21 +13,22 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import with_step
 from discrepancy.missing_force.explained import ForceHypothesis
 from discrepancy.missing_force.filtered import Solution
+from discrepancy.missing_force.linear_trials import PortDeviations, TrialMotion
 from discrepancy.missing_force.naming import ForceSearch
-from discrepancy.missing_force.trial import SeenTrial
-from discrepancy.missing_force.view import TrialMotion
+from discrepancy.missing_force.trial import PortedTrial
 
-from .effects import STEP, EffectLaws
+from .effects import HALF_DIFFERENCE, EffectLaws
 from .estimator import EstimatorStart, MotionEstimate, MotionEstimator
 from .linearised import SmoothedTrial, Trajectory
 
-REFINED = 4
-"""Largest number of hypotheses that are estimated, the most probable first."""
-CLOSE = 60.0
-"""Log probability below the best hypothesis from which on none is estimated [nat]."""
+MOST_REFINED = 4
+"""Largest number of hypotheses that are estimated together with the motion, the most probable
+first."""
+REFINED_WITHIN = 60.0
+"""Difference to the best score above which no hypothesis is estimated with the motion [nat]."""
 
 
-def refined(
+def refine_hypotheses(
     search: ForceSearch,
     ranked: Sequence[ForceHypothesis],
     effect_count: int,
@@ -35,7 +36,7 @@ def refined(
 ) -> list[ForceHypothesis]:
     """Return hypotheses, the most probable first, the best ones estimated with the motion.
 
-    The search follows a law along a motion that is taken as known. That gives wrong values for a
+    The search evaluates a law along a motion that is taken as known. That gives wrong values for a
     law that changes much within a time step, such as dry friction at a reversal of the motion; a
     free exponent then explains more than the true law. A hypothesis is replaced by its estimate
     only if the estimate is more probable.
@@ -47,7 +48,7 @@ def refined(
     ranked : sequence of ForceHypothesis
         The hypotheses, the most probable first.
     effect_count : int
-        The number of effects that were compared, for the prior of a hypothesis.
+        The number of effects that were compared, by which the prior of each is smaller.
     on_progress : callable
         The function that takes a line on what is estimated.
     """
@@ -58,12 +59,12 @@ def refined(
     with_effects = [hypothesis for hypothesis in ranked if hypothesis.candidate.terms]
     nearly_best = []
     for hypothesis in with_effects:
-        if score(hypothesis) > score(with_effects[0]) - CLOSE:
+        if score(hypothesis) > score(with_effects[0]) - REFINED_WITHIN:
             nearly_best.append(hypothesis)
     hypotheses = list(ranked)
-    for hypothesis in nearly_best[:REFINED]:
+    for hypothesis in nearly_best[:MOST_REFINED]:
         on_progress(f"estimating {hypothesis.candidate.description} together with the motion")
-        refined_hypothesis = estimated(search, hypothesis)
+        refined_hypothesis = estimate_hypothesis(search, hypothesis)
         if refined_hypothesis is None:
             continue
         if refined_hypothesis.log_evidence > hypothesis.log_evidence:
@@ -73,58 +74,65 @@ def refined(
     return sorted(hypotheses, key=lambda hypothesis: -score(hypothesis))
 
 
-def estimated(search: ForceSearch, followed: ForceHypothesis) -> ForceHypothesis | None:
+def estimate_hypothesis(search: ForceSearch, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
     """Return a hypothesis whose effects and motion are estimated together.
 
     Parameters
     ----------
     search : ForceSearch
         The search for the missing force.
-    followed : ForceHypothesis
-        The result of the search for this hypothesis, from which the estimate begins.
+    hypothesis : ForceHypothesis
+        The hypothesis as the search has fitted it, with which the estimate begins.
 
     Returns
     -------
     ForceHypothesis or None
         The hypothesis; None if its laws are not possible along the motion.
     """
-    trials = tuple(followed.view.trials)
+    trials = tuple(hypothesis.linear_trials.trials)
     problem = search.problem
     laws = EffectLaws(
-        search.columns, trials, followed.candidate, search.own_laws, adjustable_laws(search)
+        search.column_builder,
+        trials,
+        hypothesis.candidate,
+        search.evaluate_model_laws,
+        unknowns_of_model_laws(search),
     )
     estimator = MotionEstimator(
-        trials, problem.shared.precision, search.prior_processes(followed.processes)
+        trials, problem.shared.precision, search.prior_processes(hypothesis.processes)
     )
     trajectories = tuple(
-        Trajectory(motion.added, motion.positions, motion.speeds, motion.forces)
-        for motion in followed.motions
+        Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
+        for motion in hypothesis.motions
     )
     # missing forces as large as without any effect: the trajectory then follows the readings even
     # if the parameters of the law are still wrong
     processes = {
-        port: replace(process, size=max(process.size, search.whole_size(port)))
-        for port, process in followed.processes.items()
+        port: replace(
+            process,
+            standard_deviation=max(process.standard_deviation, search.force_deviation(port)),
+        )
+        for port, process in hypothesis.processes.items()
     }
     estimate = estimator.estimate(
-        laws, EstimatorStart(followed.effect, followed.shared, trajectories, processes)
+        laws, EstimatorStart(hypothesis.effect, hypothesis.shared, trajectories, processes)
     )
-    return None if estimate is None else _explained(search, followed, estimate)
+    return None if estimate is None else _hypothesis_of_estimate(search, hypothesis, estimate)
 
 
-def adjustable_laws(search: ForceSearch) -> tuple[int, ...]:
+def unknowns_of_model_laws(search: ForceSearch) -> tuple[int, ...]:
     """Return the numbers of the shared unknowns that change the model's own laws."""
     shared = search.point.shared
-    laws_at_point = search.own_laws(shared)
+    laws_at_point = search.evaluate_model_laws(shared)
     return tuple(
         number
-        for number in range(search.problem.shared.count)
-        if search.own_laws(with_step(shared, number, STEP)) != laws_at_point
+        for number in range(search.problem.shared.parameter_count)
+        if search.evaluate_model_laws(with_step(shared, number, HALF_DIFFERENCE)) != laws_at_point
     )
 
 
-def _explained(
-    search: ForceSearch, followed: ForceHypothesis, estimate: MotionEstimate
+def _hypothesis_of_estimate(
+    search: ForceSearch, hypothesis: ForceHypothesis, estimate: MotionEstimate
 ) -> ForceHypothesis | None:
     """Return an estimate as a hypothesis of the search, to which further effects may be added.
 
@@ -132,7 +140,7 @@ def _explained(
     ----------
     search : ForceSearch
         The search for the missing force.
-    followed : ForceHypothesis
+    hypothesis : ForceHypothesis
         The hypothesis before the estimate.
     estimate : MotionEstimate
         The estimate.
@@ -143,26 +151,28 @@ def _explained(
         The hypothesis; None if its effects cannot act along the estimated motion.
     """
     motions = [
-        _smoothed_motion(trial, smoothed)
-        for trial, smoothed in zip(followed.view.trials, estimate.trials, strict=True)
+        _trial_motion(trial, smoothed)
+        for trial, smoothed in zip(hypothesis.linear_trials.trials, estimate.trials, strict=True)
     ]
-    view = search.linear(followed.view, motions, followed.candidate, estimate.effect)
-    if view is None:
+    linear_trials = search.linearise_effects(
+        hypothesis.linear_trials, motions, hypothesis.candidate, estimate.effect
+    )
+    if linear_trials is None:
         return None
     mean = np.concatenate((estimate.shared, estimate.effect))
     return ForceHypothesis(
-        candidate=followed.candidate,
+        candidate=hypothesis.candidate,
         effect=estimate.effect,
         processes=estimate.processes,
         log_evidence=estimate.log_evidence,
-        view=view,
+        linear_trials=linear_trials,
         solution=Solution(estimate.log_evidence, mean, estimate.covariance),
         local=estimate.local,
         motions=motions,
     )
 
 
-def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> TrialMotion:
+def _trial_motion(trial: PortedTrial, smoothed: SmoothedTrial) -> TrialMotion:
     """Return the smoothed motion of a trial in the form that the search for effects uses.
 
     The search distinguishes the part of the added state that the hypothesis explains: all but that
@@ -170,38 +180,40 @@ def _smoothed_motion(trial: SeenTrial, smoothed: SmoothedTrial) -> TrialMotion:
 
     Parameters
     ----------
-    trial : SeenTrial
+    trial : PortedTrial
         The trial.
     smoothed : SmoothedTrial
         Its smoothed trajectory and forces.
     """
     trajectory = smoothed.trajectory
-    state_by_missing_force = np.zeros_like(trajectory.added)
-    for port, force in smoothed.missing.items():
-        state_by_missing_force = state_by_missing_force + trial.pushed(port, force)
+    state_by_missing_force = np.zeros_like(trajectory.added_state)
+    for port, force in smoothed.missing_forces.items():
+        state_by_missing_force = state_by_missing_force + trial.state_under_force(port, force)
     deviations = {}
-    for port, deviation in smoothed.deviations.items():
-        at_samples = deviation[:: trial.parts]
-        deviations[port] = (at_samples, _speed_deviation(trial, port, smoothed.state_deviation))
+    for port, deviation in smoothed.missing_force_deviations.items():
+        deviations[port] = PortDeviations(
+            force=deviation[:: trial.substeps],
+            speed=_speed_deviation(trial, port, smoothed.state_deviation),
+        )
     return TrialMotion(
-        added=trajectory.added,
+        added_state=trajectory.added_state,
         forces=trajectory.forces,
-        left=smoothed.missing,
-        explained=trajectory.added - state_by_missing_force,
+        unexplained_forces=smoothed.missing_forces,
+        explained_state=trajectory.added_state - state_by_missing_force,
         positions=trajectory.positions,
         speeds=trajectory.speeds,
-        deviations=deviations,
+        deviations_by_port=deviations,
     )
 
 
-def _speed_deviation(trial: SeenTrial, port: int, state_deviation: FloatArray) -> float:
+def _speed_deviation(trial: PortedTrial, port: int, state_deviation: FloatArray) -> float:
     """Return the median standard deviation of the speed of a port over time [per s].
 
     Correlations between the states are neglected, as only their variances are computed.
 
     Parameters
     ----------
-    trial : SeenTrial
+    trial : PortedTrial
         The trial.
     port : int
         The number of the port.

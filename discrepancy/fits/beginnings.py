@@ -11,14 +11,14 @@ from dataclasses import replace
 import numpy as np
 
 from discrepancy.fits.candidate import Candidate, Point
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.problem import Problem
 
 FIRST_SAMPLES = 8
 """Number of readings to which an initial state is fitted first."""
-STEPS = 12
+MOST_STEPS = 12
 """Largest number of steps of each fit to a part of a record."""
-MISFIT = 1.5
+LARGEST_CHI_SQUARE = 1.5
 """χ² per sample above which a fit is repeated with initial states from the first readings."""
 
 
@@ -42,17 +42,17 @@ def refit_from_first_readings(
         Whether only the trials' own unknowns are fitted, while shared unknowns and effects are
         fixed.
     """
-    is_fitted = fit.chi_square < MISFIT * float(problem.counts.sum())
+    is_fitted = fit.chi_square < LARGEST_CHI_SQUARE * float(problem.sample_counts.sum())
     if is_fitted or not has_unknown_initial_state(problem):
         return fit
     candidate = fit.candidate
     start = Point(
-        shared=fit.point.shared if local_only else np.zeros(problem.shared.size),
-        local=problem.start(candidate).local,
+        shared=fit.point.shared if local_only else np.zeros(problem.shared.unknown_count),
+        local=problem.prior_mean_point(candidate).local,
         effect=fit.point.effect,
     )
     start = with_initial_states_of_first_readings(problem, start)
-    new_fit = attempt(problem, candidate, start, iterations=iterations, local_only=local_only)
+    new_fit = try_fit(problem, candidate, start, iterations=iterations, local_only=local_only)
     if new_fit is None or new_fit.objective >= fit.objective:
         return fit
     return new_fit
@@ -70,10 +70,10 @@ def has_unknown_initial_state(problem: Problem) -> bool:
 def with_initial_states_of_first_readings(problem: Problem, point: Point) -> Point:
     """Return a point whose local unknowns are fitted to the first readings of the trials.
 
-    They are fitted once, with the model without effect, and kept in `Problem.beginnings` by the
+    They are fitted once, with the model without effect, and kept in `Problem.initial_states` by the
     name of the trial, since the initial state of a trial is nearly the same under all hypotheses.
     """
-    beginnings = problem.beginnings
+    beginnings = problem.initial_states
     if any(data.trial.name not in beginnings for data in problem.trials):
         without_effect = replace(point, effect=np.zeros(0))
         fitted_point = _fit_to_growing_records(problem, without_effect)
@@ -90,8 +90,8 @@ def _fit_to_growing_records(problem: Problem, point: Point) -> Point:
     longest = max(len(data.trial.time) for data in problem.trials)
     samples = FIRST_SAMPLES
     while samples < 2 * longest:
-        shortened = problem.first_samples(samples)
-        fit = attempt(shortened, Candidate(), point, iterations=STEPS, local_only=True)
+        shortened = problem.with_first_samples(samples)
+        fit = try_fit(shortened, Candidate(), point, iterations=MOST_STEPS, local_only=True)
         if fit is None:
             break
         point = fit.point

@@ -66,16 +66,16 @@ class EffectTerm:
         low_ends = [parameter.prior.low for parameter in self.parameters if parameter.magnitude]
         return not low_ends or min(low_ends) < 0.0
 
-    def values(self, normal: Sequence[float] | FloatArray) -> dict[str, float]:
+    def physical_values(self, scaled_values: Sequence[float] | FloatArray) -> dict[str, float]:
         """Return the physical values by name, at the standard normal variables (E,)."""
-        pairs = zip(self.parameters, normal, strict=True)
+        pairs = zip(self.parameters, scaled_values, strict=True)
         return {parameter.name: parameter.prior.value(float(u)) for parameter, u in pairs}
 
-    def patch(self, setting: Setting, normal: Sequence[float] | FloatArray) -> ModelPatch:
+    def patch(self, setting: Setting, scaled_values: Sequence[float] | FloatArray) -> ModelPatch:
         """Return the change of the model by the effect, given its scaled parameters (E,)."""
-        return self.effect.patch(setting, self.values(normal), self.place)
+        return self.effect.patch(setting, self.physical_values(scaled_values), self.place)
 
-    def start(self) -> FloatArray:
+    def start_values(self) -> FloatArray:
         """Return the scaled parameters (E,): medians of the prior, and canonical shapes."""
         variables = []
         for parameter in self.parameters:
@@ -85,26 +85,26 @@ class EffectTerm:
                 variables.append(0.0)
         return np.array(variables)
 
-    def rescaled(
-        self, normal: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
+    def multiply_magnitudes(
+        self, scaled_values: FloatArray, factor: float, lowest: float = -inf, highest: float = inf
     ) -> FloatArray:
         """Return the scaled parameters (E,) after all magnitudes are multiplied by a factor.
 
         Parameters
         ----------
-        normal : (E,) array
+        scaled_values : (E,) array
             The scaled parameters of the term.
         factor : float
             The factor on the physical value of each magnitude.
         lowest, highest : float
             The limits of the returned scaled magnitudes.
         """
-        rescaled = normal.copy()
+        rescaled = scaled_values.copy()
         for number, parameter in enumerate(self.parameters):
             if not parameter.magnitude:
                 continue
             prior = parameter.prior
-            physical_value = factor * prior.value(float(normal[number]))
+            physical_value = factor * prior.value(float(scaled_values[number]))
             if prior.shape == "log_normal":  # a log-normal magnitude cannot change its sign
                 physical_value = max(physical_value, prior.value(lowest))
             rescaled[number] = np.clip(prior.normal(physical_value), lowest, highest)
@@ -139,7 +139,7 @@ class Candidate:
         return " and ".join(self.identifiers)
 
     @property
-    def is_family(self) -> bool:
+    def has_free_shape(self) -> bool:
         """Whether the shape of one of the effects is free."""
         return any(term.free_shape for term in self.terms)
 
@@ -149,7 +149,7 @@ class Candidate:
         return [parameter for term in self.terms for parameter in term.parameters]
 
     @property
-    def size(self) -> int:
+    def parameter_count(self) -> int:
         """The number E of fitted parameters."""
         return len(self.parameters)
 
@@ -158,19 +158,19 @@ class Candidate:
         """The kinds of trials whose prediction the candidate changes."""
         return frozenset().union(*(term.effect.acts_on for term in self.terms))
 
-    def acts_on_with(self, parameter: int) -> frozenset[TrialKind]:
+    def trial_kinds_of_parameter(self, parameter_index: int) -> frozenset[TrialKind]:
         """Return the kinds of trials whose prediction depends on a parameter, given its index."""
         effects = [term.effect for term in self.terms for _ in term.parameters]
-        return effects[parameter].acts_on
+        return effects[parameter_index].acts_on
 
-    def split(self, normal: FloatArray) -> list[tuple[EffectTerm, FloatArray]]:
+    def split_by_term(self, scaled_values: FloatArray) -> list[tuple[EffectTerm, FloatArray]]:
         """Return each term with its own part of the scaled effect parameters (E,)."""
         if not self.terms:
             return []
         ends = np.cumsum([len(term.parameters) for term in self.terms])
-        return list(zip(self.terms, np.split(normal, ends[:-1]), strict=True))
+        return list(zip(self.terms, np.split(scaled_values, ends[:-1]), strict=True))
 
-    def stepped(self, normal: FloatArray, step: FloatArray) -> FloatArray:
+    def add_step(self, scaled_values: FloatArray, step: FloatArray) -> FloatArray:
         """Return the scaled effect parameters (E,) after a step of a fit.
 
         A magnitude makes its step in the physical value, linearised at the present value, because
@@ -178,53 +178,55 @@ class Candidate:
 
         Parameters
         ----------
-        normal : (E,) array
+        scaled_values : (E,) array
             The scaled effect parameters.
         step : (E,) array
             The step of these variables.
         """
         variables = []
-        moves = zip(self.parameters, normal.tolist(), step.tolist(), strict=True)
+        moves = zip(self.parameters, scaled_values.tolist(), step.tolist(), strict=True)
         for parameter, u, du in moves:
             variables.append(parameter.prior.stepped(u, du) if parameter.magnitude else u + du)
         return np.array(variables)
 
-    def patches(self, setting: Setting, normal: FloatArray) -> list[ModelPatch]:
+    def patches(self, setting: Setting, scaled_values: FloatArray) -> list[ModelPatch]:
         """Return the patch of each term at the standard normal variables (E,)."""
-        return [term.patch(setting, values) for term, values in self.split(normal)]
+        return [term.patch(setting, values) for term, values in self.split_by_term(scaled_values)]
 
-    def patch(self, setting: Setting, normal: FloatArray) -> ModelPatch:
+    def patch(self, setting: Setting, scaled_values: FloatArray) -> ModelPatch:
         """Return the patch of all terms together at the standard normal variables (E,)."""
-        return sum(self.patches(setting, normal), ModelPatch())
+        return sum(self.patches(setting, scaled_values), ModelPatch())
 
-    def start(self) -> FloatArray:
+    def start_values(self) -> FloatArray:
         """Return the standard normal variables (E,) from which a fit may begin."""
         if not self.terms:
             return np.empty(0)
-        return np.concatenate([term.start() for term in self.terms])
+        return np.concatenate([term.start_values() for term in self.terms])
 
     def with_term(self, term: EffectTerm) -> "Candidate":
         """Return the candidate with one more effect."""
         return Candidate((*self.terms, term))
 
-    def subset(self, numbers: Iterable[int], normal: FloatArray) -> tuple["Candidate", FloatArray]:
+    def subset_of_terms(
+        self, term_indices: Iterable[int], scaled_values: FloatArray
+    ) -> tuple["Candidate", FloatArray]:
         """Return the candidate of some of the terms, and its scaled parameters.
 
         Parameters
         ----------
-        numbers : iterable of int
+        term_indices : iterable of int
             The indices of the terms to keep, at least one.
-        normal : (E,) array
+        scaled_values : (E,) array
             The scaled parameters of all terms.
         """
-        terms_with_values = self.split(normal)
-        terms, values = zip(*(terms_with_values[number] for number in numbers), strict=True)
+        terms_with_values = self.split_by_term(scaled_values)
+        terms, values = zip(*(terms_with_values[number] for number in term_indices), strict=True)
         return Candidate(terms), np.concatenate(values)
 
 
 PARAMETER_STEP = 1e-2
 """Step of finite differences in scaled variables."""
-LEAST_STEP = 1e-4
+LEAST_EFFECT_STEP = 1e-4
 """Least step in effect parameters: above the rounding of the time integration."""
 SHARED_STEP = 1e-3
 """Step in calibrated parameters: what an effect shares with the stiffness must cancel to a
@@ -239,19 +241,19 @@ class TrialDerivatives:
     ----------
     response : (N, C) array
         The prediction at N times in C channels [unit of the channel].
-    parameters : (P, N, C) array
+    by_parameters : (P, N, C) array
         The derivatives with respect to the scaled calibrated parameters.
-    local : (I, N, C) array
+    by_local : (I, N, C) array
         The derivatives with respect to the scaled unknowns of the trial except its zeros: initial
         state, constants of inputs, time zero, health.
-    effect : (E, N, C) array
+    by_effect : (E, N, C) array
         The derivatives with respect to the scaled effect parameters.
     """
 
     response: FloatArray
-    parameters: FloatArray
-    local: FloatArray
-    effect: FloatArray
+    by_parameters: FloatArray
+    by_local: FloatArray
+    by_effect: FloatArray
 
 
 @dataclass(frozen=True)
@@ -285,22 +287,22 @@ class FitState:
         The negative log posterior, up to a constant that all candidates share [nat].
     residuals : tuple of (N, C) array
         The standardised residuals of each trial.
-    sums : (channels,) array
+    squares_by_channel : (channels,) array
         The sum of squared standardised residuals of each channel.
-    linearisations : tuple of TrialDerivatives
+    trial_derivatives : tuple of TrialDerivatives
         The prediction of each trial and its derivatives at the point, or near it.
     """
 
     point: Point
     objective: float
     residuals: tuple[FloatArray, ...]
-    sums: FloatArray
-    linearisations: tuple[TrialDerivatives, ...] = field(repr=False)
+    squares_by_channel: FloatArray
+    trial_derivatives: tuple[TrialDerivatives, ...] = field(repr=False)
 
     @property
     def responses(self) -> tuple[FloatArray, ...]:
         """The prediction (N, C) of each trial, without gains and zeros of the channels."""
-        return tuple(derivatives.response for derivatives in self.linearisations)
+        return tuple(derivatives.response for derivatives in self.trial_derivatives)
 
 
 def with_step(values: FloatArray, index: int, step: float = PARAMETER_STEP) -> FloatArray:

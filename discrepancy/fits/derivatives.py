@@ -18,12 +18,12 @@ from .candidate import (
     TrialDerivatives,
     with_step,
 )
-from .trial_data import GlobalUnknowns, TrialData
+from .trial_data import SharedUnknowns, TrialData
 
 
 def nuisance_derivatives(
     data: TrialData,
-    shared_unknowns: GlobalUnknowns,
+    shared_unknowns: SharedUnknowns,
     shared: FloatArray,
     local: FloatArray,
     respond: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray | None]],
@@ -36,7 +36,7 @@ def nuisance_derivatives(
     ----------
     data : TrialData
         The trial and its unknowns.
-    shared_unknowns : GlobalUnknowns
+    shared_unknowns : SharedUnknowns
         The layout of the shared unknowns.
     shared, local : (Q,), (L,) array
         The scaled shared unknowns, and those of the trial.
@@ -61,14 +61,14 @@ def nuisance_derivatives(
         return (stepped - response) / step
 
     # calibrated parameters: a step from the upper end of the range goes downwards
-    _, high = shared_unknowns.ends
+    _, high = shared_unknowns.bounds
     is_at_end = shared + SHARED_STEP > high
-    steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: shared_unknowns.count]
+    steps = np.where(is_at_end, -SHARED_STEP, SHARED_STEP)[: shared_unknowns.parameter_count]
     by_parameters = [
         slope(with_step(shared, k, step), local, step) for k, step in enumerate(steps.tolist())
     ]
     # initial state and constants of inputs
-    zeros_end, _, inputs_end, time_zero_end = unknowns.ends
+    zeros_end, _, inputs_end, time_zero_end = unknowns.ends_by_kind
     by_local = [slope(shared, with_step(local, k)) for k in range(zeros_end, inputs_end)]
     if unknowns.has_time_zero:
         if rates is None:
@@ -88,7 +88,7 @@ def nuisance_derivatives(
 def _health_derivatives(
     data: TrialData,
     local: FloatArray,
-    first: int,
+    first_health: int,
     shape: tuple[int, ...],
     slope: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
@@ -104,7 +104,7 @@ def _health_derivatives(
         The trial and its unknowns.
     local : (L,) array
         The scaled unknowns of the trial.
-    first : int
+    first_health : int
         The index of the first health entry among these unknowns.
     shape : tuple of int
         The shape (N, C) of the response.
@@ -120,8 +120,8 @@ def _health_derivatives(
             continue
         stepped = local.copy()
         # step towards zero, away from the limits of the stiffness loss
-        sign = np.where(stepped[first + region_entries] > 0.0, -1.0, 1.0)
-        stepped[first + region_entries] += sign * PARAMETER_STEP
+        sign = np.where(stepped[first_health + region_entries] > 0.0, -1.0, 1.0)
+        stepped[first_health + region_entries] += sign * PARAMETER_STEP
         difference_quotient = slope(stepped)
         if data.trial.is_dynamic:
             derivatives[region_entries] = sign[:, np.newaxis, np.newaxis] * difference_quotient
@@ -135,7 +135,7 @@ def _health_derivatives(
 
 def prediction_derivatives(
     data: TrialData,
-    shared_unknowns: GlobalUnknowns,
+    shared_unknowns: SharedUnknowns,
     shared: FloatArray,
     derivatives: TrialDerivatives,
     candidate: Candidate,
@@ -149,7 +149,7 @@ def prediction_derivatives(
     ----------
     data : TrialData
         The trial and its unknowns.
-    shared_unknowns : GlobalUnknowns
+    shared_unknowns : SharedUnknowns
         The layout of the shared unknowns.
     shared : (Q,) array
         The scaled shared unknowns.
@@ -172,38 +172,43 @@ def prediction_derivatives(
     response = derivatives.response
     gains = 1.0 + shared_unknowns.gains(shared, channels)
     # zeros of the channels
-    by_zeros = np.zeros((unknowns.zeros, *response.shape))
-    zero_scale = unknowns.scale[: unknowns.zeros, np.newaxis]
-    by_zeros[np.arange(unknowns.zeros), :, unknowns.zero_columns] = zero_scale
+    by_zeros = np.zeros((unknowns.zero_count, *response.shape))
+    zero_scale = unknowns.scale[: unknowns.zero_count, np.newaxis]
+    by_zeros[np.arange(unknowns.zero_count), :, unknowns.zero_columns] = zero_scale
     # gains of the channels
     gain_numbers = np.array(
         [k for k, name in enumerate(shared_unknowns.gain_channels) if name in channels], dtype=int
     )
     gain_columns = [channels.index(shared_unknowns.gain_channels[k]) for k in gain_numbers]
     by_gains = np.zeros((len(gain_numbers), *response.shape))
-    gain_scale = shared_unknowns.scale[shared_unknowns.count + gain_numbers]
+    gain_scale = shared_unknowns.scale[shared_unknowns.parameter_count + gain_numbers]
     by_gains[np.arange(len(gain_numbers)), :, gain_columns] = (
         response[:, gain_columns] * gain_scale
     ).T
     # parameters of the effects that act on such trials
     kind = data.trial.kind
     effect_numbers = np.array(
-        [k for k in range(candidate.size) if kind in candidate.acts_on_with(k)], dtype=int
+        [
+            k
+            for k in range(candidate.parameter_count)
+            if kind in candidate.trial_kinds_of_parameter(k)
+        ],
+        dtype=int,
     )
     by_unknowns = np.concatenate(
         (
             by_zeros,
-            derivatives.local * gains,
-            derivatives.parameters * gains,
+            derivatives.by_local * gains,
+            derivatives.by_parameters * gains,
             by_gains,
-            derivatives.effect[effect_numbers] * gains,
+            derivatives.by_effect[effect_numbers] * gains,
         )
     )
     shared_indices = np.concatenate(
         (
-            np.arange(shared_unknowns.count),
-            shared_unknowns.count + gain_numbers,
-            shared_unknowns.size + effect_numbers,
+            np.arange(shared_unknowns.parameter_count),
+            shared_unknowns.parameter_count + gain_numbers,
+            shared_unknowns.unknown_count + effect_numbers,
         )
     )
     return by_unknowns, shared_indices

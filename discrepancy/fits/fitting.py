@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from discrepancy.campaign.records import FloatArray
+from discrepancy.campaign.records import BoolArray, FloatArray
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import (
     Candidate,
@@ -32,9 +32,9 @@ from reporting.words import comma_list
 
 LARGEST_EFFECT = 8.0
 """Effect parameters stay within this many prior deviations of their median."""
-CONVERGED = 1e-2
+CONVERGED_DECREASE = 1e-2
 """Predicted decrease of the objective by a step below which a fit has converged [nat]."""
-WHOLE_STEP = 1e-2
+NEWTON_DAMPING = 1e-2
 """Damping below which a step is nearly a Gauss-Newton step."""
 LARGEST_DAMPING = 1.0
 """Damping above which steps are so short that a small predicted decrease does not mean
@@ -59,11 +59,11 @@ class CandidateFit(FitState):
     covariance : (Q + E, Q + E) array
         The posterior covariance of the shared unknowns and effect parameters (scaled), with the
         unknowns of the trials marginalised.
-    spent : (channels,) array
+    absorbed_freedom : (channels,) array
         The degrees of freedom that the fitted unknowns absorb in each channel: the trace of the hat
         matrix over the readings of the channel.
     converged : bool
-        Whether the predicted decrease of the objective fell below `CONVERGED`.
+        Whether the predicted decrease of the objective fell below `CONVERGED_DECREASE`.
     draws : (N, E) array or None
         Posterior draws of the effect parameters, if their posterior is wider than the covariance
         says (see `predictive.with_draws`).
@@ -75,7 +75,7 @@ class CandidateFit(FitState):
     candidate: Candidate
     log_evidence: float
     covariance: FloatArray
-    spent: FloatArray
+    absorbed_freedom: FloatArray
     converged: bool = True
     draws: FloatArray | None = field(default=None, repr=False)
     residual_process: ResidualProcess | None = field(default=None, repr=False)
@@ -93,13 +93,13 @@ class CandidateFit(FitState):
     @property
     def effect_covariance(self) -> FloatArray:
         """The covariance (E, E) of the scaled effect parameters."""
-        first = len(self.covariance) - self.candidate.size
+        first = len(self.covariance) - self.candidate.parameter_count
         return self.covariance[first:, first:]
 
     @property
     def chi_square(self) -> float:
         """The sum of squared standardised residuals."""
-        return float(self.sums.sum())
+        return float(self.squares_by_channel.sum())
 
 
 @np.errstate(over="ignore", invalid="ignore")  # a step that is too long is rejected
@@ -108,10 +108,10 @@ def fit(
     candidate: Candidate,
     start: Point,
     *,
-    known: tuple[TrialDerivatives, ...] | None = None,
+    nearby_derivatives: tuple[TrialDerivatives, ...] | None = None,
     iterations: int = 60,
     local_only: bool = False,
-    give_up: float | None = None,
+    objective_limit: float | None = None,
 ) -> CandidateFit:
     """Return a candidate at the maximum of its posterior, by Levenberg-Marquardt.
 
@@ -123,7 +123,7 @@ def fit(
         The effects whose parameters are fitted.
     start : Point
         The point from which the fit begins.
-    known : tuple of TrialDerivatives, optional
+    nearby_derivatives : tuple of TrialDerivatives, optional
         Derivatives of each trial with respect to nuisances at a nearby point, used for the first
         steps instead of new ones.
     iterations : int
@@ -131,7 +131,7 @@ def fit(
     local_only : bool
         Whether only the trials' own unknowns are fitted, as for held-out trials. Shared unknowns
         and effect parameters are then fixed.
-    give_up : float, optional
+    objective_limit : float, optional
         A value of the objective [nat]. The fit ends early, not converged, if it is not expected to
         come below this value.
 
@@ -143,7 +143,7 @@ def fit(
     """
     descent = _Descent(problem, candidate, local_only)
     damping = 1e-3
-    state = descent.state(_within_bounds(problem, start), known)
+    state = descent.state_at(_within_bounds(problem, start), nearby_derivatives)
     if not np.isfinite(state.objective):
         names = comma_list(candidate.identifiers) if candidate.terms else "no effect"
         raise FitError(
@@ -151,32 +151,32 @@ def fit(
             "parameters."
         )
     converged = False
-    has_current_derivatives = known is None
+    has_current_derivatives = nearby_derivatives is None
     for _ in range(iterations):
-        step, promised_decrease = descent.step(state, damping)
+        step, predicted_decrease = descent.damped_step(state, damping)
         next_state = None
-        if promised_decrease >= CONVERGED:
-            next_state = descent.next_state(state, step)
+        if predicted_decrease >= CONVERGED_DECREASE:
+            next_state = descent.descend(state, step)
         if next_state is not None:
             decrease = state.objective - next_state.objective
-            damping = max(damping * (0.1 if decrease > 0.5 * promised_decrease else 0.5), 1e-9)
+            # the better the prediction, the less damping has the next step
+            reduction = 0.1 if decrease > 0.5 * predicted_decrease else 0.5
+            damping = max(damping * reduction, 1e-9)
             state = next_state
             # a decrease well below the predicted one shows that the derivatives are outdated
-            has_current_derivatives = decrease < 0.7 * promised_decrease
+            has_current_derivatives = decrease < 0.7 * predicted_decrease
             if has_current_derivatives:
-                state = descent.state(state.point)
+                state = descent.state_at(state.point)
             # the further decrease is taken to be at most twice the one predicted for this step
-            is_near_newton = damping < WHOLE_STEP
-            if (
-                give_up is not None
-                and is_near_newton
-                and state.objective - 2.0 * promised_decrease > give_up
-            ):
+            is_near_newton = damping < NEWTON_DAMPING
+            expected_end = state.objective - 2.0 * predicted_decrease
+            if objective_limit is not None and is_near_newton and expected_end > objective_limit:
                 break
-        elif not has_current_derivatives:  # no step was found with old derivatives
-            state = descent.state(state.point)
+        elif not has_current_derivatives:
+            # no step was found with old derivatives: try again with new ones
+            state = descent.state_at(state.point)
             has_current_derivatives = True
-        elif promised_decrease < CONVERGED:
+        elif predicted_decrease < CONVERGED_DECREASE:
             converged = damping < LARGEST_DAMPING
             break
         else:
@@ -184,19 +184,19 @@ def fit(
             if damping > HOPELESS_DAMPING:
                 break
     if not has_current_derivatives:
-        state = descent.state(state.point)
+        state = descent.state_at(state.point)
     return _with_evidence(problem, candidate, state, converged)
 
 
-def attempt(
+def try_fit(
     problem: Problem,
     candidate: Candidate,
     start: Point,
     *,
-    known: tuple[TrialDerivatives, ...] | None = None,
+    nearby_derivatives: tuple[TrialDerivatives, ...] | None = None,
     iterations: int = 60,
     local_only: bool = False,
-    give_up: float | None = None,
+    objective_limit: float | None = None,
 ) -> CandidateFit | None:
     """Return the fit of a candidate by `fit`, or None if it cannot be fitted.
 
@@ -207,10 +207,10 @@ def attempt(
             problem,
             candidate,
             start,
-            known=known,
+            nearby_derivatives=nearby_derivatives,
             iterations=iterations,
             local_only=local_only,
-            give_up=give_up,
+            objective_limit=objective_limit,
         )
     except DiscrepancyError as cause:
         problem.record_refusal(candidate, cause)
@@ -230,7 +230,7 @@ def objective(problem: Problem, candidate: Candidate, point: Point) -> float:
     """
     point = _within_bounds(problem, point)
     numbers = range(len(problem.trials))
-    responses = [problem.response_with(number, point, candidate) for number in numbers]
+    responses = [problem.response_of_candidate(number, point, candidate) for number in numbers]
     return _misfit_at(problem, point, responses).objective
 
 
@@ -265,9 +265,10 @@ def _misfit_at(problem: Problem, point: Point, responses: Sequence[FloatArray]) 
         The response of the model in each trial at the point.
     """
     residuals = tuple(
-        problem.residual(number, point, response) for number, response in enumerate(responses)
+        problem.standardised_residual(number, point, response)
+        for number, response in enumerate(responses)
     )
-    sums = problem.sums_by_channel(residuals)
+    sums = problem.squares_by_channel(residuals)
     prior_energy = 0.5 * float(problem.shared.precision @ point.shared**2)
     prior_energy += 0.5 * float(point.effect @ point.effect)
     for data, u in zip(problem.trials, point.local, strict=True):
@@ -300,14 +301,16 @@ class _Descent:
     local_only: bool
     effect_deviation: FloatArray | None = None
 
-    def state(self, point: Point, known: tuple[TrialDerivatives, ...] | None = None) -> FitState:
+    def state_at(
+        self, point: Point, nearby_derivatives: tuple[TrialDerivatives, ...] | None = None
+    ) -> FitState:
         """Return the objective and the derivatives at a point.
 
         Parameters
         ----------
         point : Point
             The values of all unknowns.
-        known : tuple of TrialDerivatives, optional
+        nearby_derivatives : tuple of TrialDerivatives, optional
             Derivatives of each trial with respect to nuisances at a nearby point. If given, only
             the response and the derivatives with respect to effect parameters are computed.
         """
@@ -316,21 +319,21 @@ class _Descent:
                 number,
                 point,
                 self.candidate,
-                known=known_derivatives,
+                nearby_derivatives=nearby,
                 effect_steps=self.effect_deviation,
             )
-            for number, known_derivatives in enumerate(known or [None] * len(self.problem.trials))
+            for number, nearby in enumerate(nearby_derivatives or [None] * len(self.problem.trials))
         )
         misfit = _misfit_at(self.problem, point, [trial.response for trial in derivatives])
         return FitState(
             point=point,
             objective=misfit.objective,
             residuals=misfit.residuals,
-            sums=misfit.sums,
-            linearisations=derivatives,
+            squares_by_channel=misfit.sums,
+            trial_derivatives=derivatives,
         )
 
-    def step(self, state: FitState, damping: float) -> tuple[Point, float]:
+    def damped_step(self, state: FitState, damping: float) -> tuple[Point, float]:
         """Return a Levenberg-Marquardt step, and the decrease of the objective that it predicts.
 
         An unknown at an end of its range is fixed if the step would move it out of the range
@@ -347,14 +350,14 @@ class _Descent:
         -------
         step : Point
             The change of each unknown.
-        promised_decrease : float
+        predicted_decrease : float
             The predicted decrease of the objective: half of the gradient times the step, which is
             that of the quadratic model for a step without damping [nat].
         """
         problem = self.problem
-        first_effect = problem.shared.size
-        first_local = first_effect + self.candidate.size
-        precision = problem.precisions(state.sums)
+        first_effect = problem.shared.unknown_count
+        first_local = first_effect + self.candidate.parameter_count
+        precision = problem.noise_precisions(state.squares_by_channel)
         equations = normal_equations(problem, state, self.candidate, precision)
         size = len(equations.gradient)
         # posterior deviations of the effect parameters: their columns of the inverse matrix
@@ -362,26 +365,38 @@ class _Descent:
         covariance_columns = solve_factored(cholesky_factor(equations.matrix), unit_vectors)
         self.effect_deviation = np.sqrt(np.diag(covariance_columns[first_effect:first_local]))
         # unknowns that may move
-        low, high = problem.shared.ends
-        shared = state.point.shared
+        first_free = first_local if self.local_only else 0
+        is_free = np.arange(size) >= first_free
         downhill = check_finite(equations.gradient)[:first_effect]
-        is_held_low = (shared <= low) & (downhill < 0.0)
-        is_held_high = (shared >= high) & (downhill > 0.0)
-        is_free = np.arange(size) >= (first_local if self.local_only else 0)
-        is_free[:first_effect] &= ~(is_held_low | is_held_high)
+        is_free[:first_effect] &= ~self._is_held_at_bound(state.point.shared, downhill)
         # Levenberg-Marquardt step
         damped_matrix = equations.matrix + damping * np.diag(np.diag(equations.matrix))
         damped_matrix = damped_matrix[np.ix_(is_free, is_free)]
         step = np.zeros(size)
         step[is_free] = solve_factored(cholesky_factor(damped_matrix), equations.gradient[is_free])
-        promised_decrease = 0.5 * float(equations.gradient @ step)
-        return self._step_by_kind(step), promised_decrease
+        predicted_decrease = 0.5 * float(equations.gradient @ step)
+        return self._split_step(step), predicted_decrease
 
-    def _step_by_kind(self, step: FloatArray) -> Point:
+    def _is_held_at_bound(self, shared: FloatArray, downhill: FloatArray) -> BoolArray:
+        """Return which shared unknowns (Q,) are at an end of their range and would leave it.
+
+        Parameters
+        ----------
+        shared : (Q,) array
+            The scaled shared unknowns.
+        downhill : (Q,) array
+            The direction in which the objective decreases.
+        """
+        low, high = self.problem.shared.bounds
+        is_held_low = (shared <= low) & (downhill < 0.0)
+        is_held_high = (shared >= high) & (downhill > 0.0)
+        return np.asarray(is_held_low | is_held_high)
+
+    def _split_step(self, step: FloatArray) -> Point:
         """Return a step of all unknowns (n,) split into shared, effect and local unknowns."""
-        first_effect = self.problem.shared.size
-        first_local = first_effect + self.candidate.size
-        local_sizes = [data.unknowns.size for data in self.problem.trials]
+        first_effect = self.problem.shared.unknown_count
+        first_local = first_effect + self.candidate.parameter_count
+        local_sizes = [data.unknowns.unknown_count for data in self.problem.trials]
         ends = np.cumsum([first_local, *local_sizes]).tolist()
         return Point(
             shared=step[:first_effect],
@@ -389,16 +404,16 @@ class _Descent:
             effect=step[first_effect:first_local],
         )
 
-    def next_state(self, state: FitState, step: Point) -> FitState | None:
+    def descend(self, state: FitState, step: Point) -> FitState | None:
         """Return the state after a step or a fraction of it, with old derivatives by nuisances.
 
         None if no fraction in `STEP_FRACTIONS` lowers the objective.
         """
         for fraction in STEP_FRACTIONS:
             try:
-                point = _point_after(self.problem, self.candidate, state.point, step, fraction)
+                point = _move_point(self.problem, self.candidate, state.point, step, fraction)
                 if objective(self.problem, self.candidate, point) < state.objective:
-                    return self.state(point, state.linearisations)
+                    return self.state_at(point, state.trial_derivatives)
             except DiscrepancyError:  # the model cannot be evaluated there: try a shorter step
                 continue
         return None
@@ -412,7 +427,7 @@ def _with_evidence(
     The log evidence is -objective - ln(det H) / 2 with the Hessian H = U^T U, up to a constant:
     ln(det H) / 2 is the sum of the logarithms of the diagonal of U.
     """
-    precision = problem.precisions(state.sums)
+    precision = problem.noise_precisions(state.squares_by_channel)
     equations = normal_equations(problem, state, candidate, precision)
     factor = cholesky_factor(equations.matrix)
     covariance = solve_factored(factor, np.eye(len(factor)))
@@ -420,34 +435,36 @@ def _with_evidence(
     spent_freedom = np.zeros(len(problem.channel_names))
     for data, (trial_rows, unknown_indices) in zip(problem.trials, equations.trials, strict=True):
         trial_covariance = covariance[np.ix_(unknown_indices, unknown_indices)]
-        leverage = ((trial_covariance @ trial_rows.rows) * trial_rows.rows).sum(axis=0)
-        np.add.at(spent_freedom, data.groups, leverage.reshape(data.weight.shape).sum(axis=0))
-    shared_count = problem.shared.size + candidate.size
+        leverage = ((trial_covariance @ trial_rows.jacobian) * trial_rows.jacobian).sum(axis=0)
+        np.add.at(
+            spent_freedom, data.channel_indices, leverage.reshape(data.weight.shape).sum(axis=0)
+        )
+    shared_count = problem.shared.unknown_count + candidate.parameter_count
     return CandidateFit(
         **vars(state),
         candidate=candidate,
         log_evidence=-state.objective - float(np.log(np.diag(factor)).sum()),
         covariance=covariance[:shared_count, :shared_count],
-        spent=spent_freedom,
+        absorbed_freedom=spent_freedom,
         converged=converged,
     )
 
 
-def _point_after(
+def _move_point(
     problem: Problem, candidate: Candidate, point: Point, step: Point, fraction: float
 ) -> Point:
     """Return the point after a fraction of a step, clipped to the ranges of the unknowns."""
     stepped = Point(
         shared=point.shared + fraction * step.shared,
         local=tuple(u + fraction * du for u, du in zip(point.local, step.local, strict=True)),
-        effect=candidate.stepped(point.effect, fraction * step.effect),
+        effect=candidate.add_step(point.effect, fraction * step.effect),
     )
     return _within_bounds(problem, stepped)
 
 
 def _within_bounds(problem: Problem, point: Point) -> Point:
     """Return the point with shared unknowns and effect parameters clipped to their ranges."""
-    low, high = problem.shared.ends
+    low, high = problem.shared.bounds
     return replace(
         point,
         shared=np.clip(point.shared, low, high),
@@ -455,7 +472,9 @@ def _within_bounds(problem: Problem, point: Point) -> Point:
     )
 
 
-def fit_free_shape(problem: Problem, named_fit: CandidateFit, number: int) -> CandidateFit | None:
+def fit_free_shape(
+    problem: Problem, canonical_fit: CandidateFit, term_index: int
+) -> CandidateFit | None:
     """Return a fit in which the shape parameters of one effect are fitted too.
 
     The effects that differ only by their shape are a family. `gates.check_shape` compares the
@@ -465,9 +484,9 @@ def fit_free_shape(problem: Problem, named_fit: CandidateFit, number: int) -> Ca
     ----------
     problem : Problem
         The campaign and model.
-    named_fit : CandidateFit
+    canonical_fit : CandidateFit
         The fit in which all shapes have their canonical values.
-    number : int
+    term_index : int
         The index of the effect among the terms of the candidate.
 
     Returns
@@ -475,12 +494,12 @@ def fit_free_shape(problem: Problem, named_fit: CandidateFit, number: int) -> Ca
     CandidateFit or None
         The fit; None if the effect has no shape parameters or cannot be fitted.
     """
-    terms_with_values = named_fit.candidate.split(named_fit.effect)
-    term, values = terms_with_values[number]
+    terms_with_values = canonical_fit.candidate.split_by_term(canonical_fit.effect)
+    term, values = terms_with_values[term_index]
     if not term.effect.shape:
         return None
     canonical = [parameter.prior.normal(parameter.canonical) for parameter in term.effect.shape]
-    terms_with_values[number] = (replace(term, free_shape=True), np.append(values, canonical))
+    terms_with_values[term_index] = (replace(term, free_shape=True), np.append(values, canonical))
     terms, effect_values = zip(*terms_with_values, strict=True)
-    start = replace(named_fit.point, effect=np.concatenate(effect_values))
-    return attempt(problem, Candidate(terms), start)
+    start = replace(canonical_fit.point, effect=np.concatenate(effect_values))
+    return try_fit(problem, Candidate(terms), start)

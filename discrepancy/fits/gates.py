@@ -17,9 +17,9 @@ from discrepancy.verdict import Gate
 from .fitting import CandidateFit
 from .problem import Problem
 
-ABSOLUTE_LEVEL = 1e-3
+ABSOLUTE_FIT_LEVEL = 1e-3
 """Level of the test of absolute fit: the probability that a true hypothesis fails it."""
-SHAPE_GAIN = 2.0
+LEAST_SHAPE_GAIN = 2.0
 """Gain of log evidence by a free shape above which a verdict names the family of the effect, and
 not the effect [nat]."""
 
@@ -38,7 +38,7 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     """Test whether the residuals of a fit are white noise of the recorded level.
 
     The tests are those of `absolute_fit_tests`. The least of their p-values, multiplied by the
-    number of tests, is compared with `ABSOLUTE_LEVEL` (Holm 1979, Scand. J. Statist. 6, 65-70).
+    number of tests, is compared with `ABSOLUTE_FIT_LEVEL` (Holm 1979, Scand. J. Statist. 6, 65-70).
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     """
     tests = absolute_fit_tests(problem, fit)
     has_variance_test = any(test.name.startswith("variance") for test in tests)
-    has_noise_record = bool(np.any(problem.freedom[problem.counts > 0.0] > 0.0))
+    has_noise_record = bool(np.any(problem.record_freedom[problem.sample_counts > 0.0] > 0.0))
     cause = "Too few readings for the unknowns" if has_noise_record else "No noise record"
     worst = min(tests, key=lambda test: test.p_value, default=NamedTest("", np.nan))
     statistic = min(worst.p_value * len(tests), 1.0)
@@ -63,7 +63,7 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
     reason = "What is left agrees with the noise records."
     if not tests:
         reason = f"{cause}: the fit cannot be judged."
-    elif statistic < ABSOLUTE_LEVEL:
+    elif statistic < ABSOLUTE_FIT_LEVEL:
         passed = False
         reason = f"More is left than noise and priors allow: {worst.name}."
     elif not has_variance_test:
@@ -71,7 +71,7 @@ def check_absolute_fit(problem: Problem, fit: CandidateFit) -> Gate:
             f"{cause}: only priors and the whiteness of what is left could be judged, and they "
             "agree."
         )
-    return Gate("absolute fit", passed, statistic, ABSOLUTE_LEVEL, reason)
+    return Gate("absolute fit", passed, statistic, ABSOLUTE_FIT_LEVEL, reason)
 
 
 def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
@@ -89,15 +89,17 @@ def absolute_fit_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     """
     # correlated residuals count as fewer independent ones: all degrees of freedom are divided
     samples_per_independent = _recorded_colour_factor(problem, fit) ** 2
-    residual_freedom = (problem.counts - fit.spent) / samples_per_independent
-    record_freedom = problem.freedom / samples_per_independent
-    is_testable = (problem.freedom > 0.0) & (residual_freedom >= 1.0)
+    residual_freedom = (problem.sample_counts - fit.absorbed_freedom) / samples_per_independent
+    record_freedom = problem.record_freedom / samples_per_independent
+    is_testable = (problem.record_freedom > 0.0) & (residual_freedom >= 1.0)
     testable_channels = np.flatnonzero(is_testable)
     tests = []
     for channel in testable_channels:
         # sum of squares over counts - spent: the second divisor undoes that of residual_freedom
         mean_square = (
-            fit.sums[channel] / residual_freedom[channel] / samples_per_independent[channel]
+            fit.squares_by_channel[channel]
+            / residual_freedom[channel]
+            / samples_per_independent[channel]
         )
         p_value = noise_tests.variance_p_value(
             mean_square, residual_freedom[channel], record_freedom[channel]
@@ -128,16 +130,16 @@ def _recorded_colour_factor(problem: Problem, fit: CandidateFit) -> FloatArray:
 def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     """Return χ² tests of whether the unknowns of a fit are consistent with their priors.
 
-    A wrong model can fit the readings by moving calibrated values far from their priors, and a law
-    by extreme parameters that make it another law: a joint that slips at zero force is a soft
-    joint. The magnitude of an effect is not tested, as it may have any value. The tests are
-    conservative, since estimates scatter less than the prior.
+    A wrong model can fit the readings if calibrated parameters move far from their priors. A wrong
+    law can fit them with extreme parameters, which make it another law: a joint that slips at zero
+    force is a soft joint. The magnitude of an effect is not tested, as it may have any value. The
+    tests are conservative, since estimates scatter less than the prior.
     """
     # scaled unknowns are standard normal under their prior: their sum of squares is χ²
     shared = problem.shared
-    parameter_deviations = fit.point.shared[: shared.count]
-    has_proper_prior = shared.precision[shared.count :] > 0.0
-    gain_deviations = fit.point.shared[shared.count :][has_proper_prior]
+    parameter_deviations = fit.point.shared[: shared.parameter_count]
+    has_proper_prior = shared.precision[shared.parameter_count :] > 0.0
+    gain_deviations = fit.point.shared[shared.parameter_count :][has_proper_prior]
     tests = []
     if parameter_deviations.size:
         p_value = float(
@@ -147,9 +149,11 @@ def prior_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     if gain_deviations.size:
         p_value = float(chi2.sf(gain_deviations @ gain_deviations, gain_deviations.size))
         tests.append(NamedTest("gains beside their priors", p_value))
-    for term, values in fit.candidate.split(fit.effect):
+    for term, values in fit.candidate.split_by_term(fit.effect):
+        # the values of free shape parameters follow those of the effect, and are not tested
         for parameter, u in zip(term.effect.parameters, values.tolist(), strict=False):
-            is_uniform = parameter.prior.shape == "uniform"  # its ends are as likely as its middle
+            # the ends of a uniform prior are as probable as its middle
+            is_uniform = parameter.prior.shape == "uniform"
             if parameter.magnitude or is_uniform:
                 continue
             name = f"{parameter.name} of {term.effect.identifier} beside its prior"
@@ -166,7 +170,7 @@ def whiteness_tests(problem: Problem, fit: CandidateFit) -> list[NamedTest]:
     tests = []
     is_white_noise = _recorded_colour_factor(problem, fit) == 1.0
     for channel in np.flatnonzero(is_white_noise).tolist():
-        if not problem.tests_whiteness[channel]:
+        if not problem.is_whiteness_tested[channel]:
             continue
         records = residual_records(problem, fit, channel)
         if records:
@@ -215,9 +219,9 @@ def residual_records(problem: Problem, fit: CandidateFit, channel: int) -> list[
     for data, residual in zip(problem.trials, fit.residuals, strict=True):
         if not data.trial.is_dynamic or len(residual) < noise_tests.SHORTEST_SERIES:
             continue
-        for column in np.flatnonzero(data.groups == channel):
+        for column in np.flatnonzero(data.channel_indices == channel):
             steps = np.diff(data.trial.time)
-            if not data.noise[column].stays_coloured(data.trial):
+            if not data.noise_models[column].stays_coloured(data.trial):
                 steps = np.median(steps, keepdims=True)
             record = ResidualRecord(
                 values=np.ascontiguousarray(residual[:, column]),
@@ -240,26 +244,26 @@ def whiteness_p_value(records: Sequence[ResidualRecord]) -> float:
 # ---------------------------------------------------------------- shape and time steps
 
 
-def check_shape(named_fit: CandidateFit, family_fit: CandidateFit | None) -> Gate:
+def check_shape(canonical_fit: CandidateFit, free_fit: CandidateFit | None) -> Gate:
     """Test whether a fit with a free shape parameter explains more than the fit without one.
 
     Parameters
     ----------
-    named_fit : CandidateFit
+    canonical_fit : CandidateFit
         The fit with the canonical shape.
-    family_fit : CandidateFit or None
+    free_fit : CandidateFit or None
         The fit with the free shape; None if the effect has no shape parameters.
     """
-    if family_fit is None:
+    if free_fit is None:
         reason = "The effect has no shape that could be free."
-        return Gate("shape", True, 0.0, SHAPE_GAIN, reason)
-    gain = family_fit.log_evidence - named_fit.log_evidence
-    passed = gain <= SHAPE_GAIN
+        return Gate("shape", True, 0.0, LEAST_SHAPE_GAIN, reason)
+    gain = free_fit.log_evidence - canonical_fit.log_evidence
+    passed = gain <= LEAST_SHAPE_GAIN
     if passed:
         reason = "A free shape explains no more than the named one."
     else:
         reason = f"Its family with a free shape gains {gain:.1f} nats over the name."
-    return Gate("shape", passed, gain, SHAPE_GAIN, reason)
+    return Gate("shape", passed, gain, LEAST_SHAPE_GAIN, reason)
 
 
 def time_step_error(problem: Problem, fit: CandidateFit) -> float:
@@ -272,7 +276,9 @@ def time_step_error(problem: Problem, fit: CandidateFit) -> float:
     for number, data in enumerate(problem.trials):
         if not data.trial.is_dynamic:
             continue
-        finer_response = problem.response_with(number, fit.point, fit.candidate, finer=2)
+        finer_response = problem.response_of_candidate(
+            number, fit.point, fit.candidate, refinement=2
+        )
         standardised_change = (finer_response - fit.responses[number]) / data.deviation
         rms = np.sqrt((standardised_change**2).mean(axis=0))
         largest = max(largest, float(rms.max()))

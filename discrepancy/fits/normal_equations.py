@@ -71,34 +71,34 @@ def solve_factored(factor: FloatArray, right: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class TrialRows:
+class TrialJacobian:
     """The derivatives and residuals of one trial, in units of the noise deviation.
 
     The N C readings are those of N samples in C channels, sample by sample.
 
     Attributes
     ----------
-    rows : (L + K, N C) array
+    jacobian : (L + K, N C) array
         The derivatives of the readings: one row for each of the L unknowns of the trial, then one
         for each of the K shared unknowns and effect parameters that act on it.
-    index : (K,) array of int
+    shared_indices : (K,) array of int
         The indices of these K among all shared unknowns and effect parameters.
-    root : (C,) array
+    precision_root : (C,) array
         The recorded noise deviation of each channel over the estimated one.
     residual : (N C,) array
         The readings minus their prediction.
-    value : (L,) array
+    local_values : (L,) array
         The scaled values of the unknowns of the trial.
-    prior : (L,) array
+    local_precision : (L,) array
         The prior precisions of the unknowns of the trial.
     """
 
-    rows: FloatArray
-    index: IntArray
-    root: FloatArray
+    jacobian: FloatArray
+    shared_indices: IntArray
+    precision_root: FloatArray
     residual: FloatArray
-    value: FloatArray
-    prior: FloatArray
+    local_values: FloatArray
+    local_precision: FloatArray
 
     def eliminate_local(self) -> tuple[FloatArray, FloatArray]:
         """Return the matrices by which the trial's own unknowns are eliminated.
@@ -114,22 +114,24 @@ class TrialRows:
         local_per_shared : (L, K) array
             A^-1 B.
         """
-        local_jacobian, shared_jacobian = np.split(self.rows, [len(self.prior)])
-        local_block = local_jacobian @ local_jacobian.T + np.diag(self.prior + LEAST_PRECISION)
+        local_jacobian, shared_jacobian = np.split(self.jacobian, [len(self.local_precision)])
+        local_block = local_jacobian @ local_jacobian.T + np.diag(
+            self.local_precision + LEAST_PRECISION
+        )
         factor = cholesky_factor(local_block)
         return factor, solve_factored(factor, local_jacobian @ shared_jacobian.T)
 
 
-def trial_rows(
-    problem: Problem, number: int, state: FitState, candidate: Candidate, precision: FloatArray
-) -> TrialRows:
+def trial_jacobian(
+    problem: Problem, trial_index: int, state: FitState, candidate: Candidate, precision: FloatArray
+) -> TrialJacobian:
     """Return the derivatives and residuals of a trial in units of the noise deviation.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model.
-    number : int
+    trial_index : int
         The index of the trial.
     state : FitState
         The point, its residuals and derivatives.
@@ -138,22 +140,22 @@ def trial_rows(
     precision : (channels,) array
         The estimated noise precision (inverse variance) of each channel over the recorded one.
     """
-    data = problem.trials[number]
+    data = problem.trials[trial_index]
     by_unknowns, shared_indices = problem.prediction_derivatives(
-        number, state.point, state.linearisations[number], candidate
+        trial_index, state.point, state.trial_derivatives[trial_index], candidate
     )
-    precision_root = np.sqrt(precision[data.groups])
-    residual = (state.residuals[number] * precision_root).ravel()
-    jacobian = (data.standardised(by_unknowns) * precision_root).reshape(
+    precision_root = np.sqrt(precision[data.channel_indices])
+    residual = (state.residuals[trial_index] * precision_root).ravel()
+    jacobian = (data.standardise(by_unknowns) * precision_root).reshape(
         len(by_unknowns), residual.size
     )
-    return TrialRows(
-        rows=jacobian,
-        index=shared_indices,
-        root=precision_root,
+    return TrialJacobian(
+        jacobian=jacobian,
+        shared_indices=shared_indices,
+        precision_root=precision_root,
         residual=residual,
-        value=state.point.local[number],
-        prior=data.unknowns.precision,
+        local_values=state.point.local[trial_index],
+        local_precision=data.unknowns.precision,
     )
 
 
@@ -166,7 +168,7 @@ class NormalEquations:
 
     Attributes
     ----------
-    trials : list of (TrialRows, (M,) array of int)
+    trials : list of (TrialJacobian, (M,) array of int)
         The derivatives of each trial, and the indices of their M rows among the n unknowns.
     matrix : (n, n) array
         The Gauss-Newton approximation of the Hessian of the negative log posterior.
@@ -174,7 +176,7 @@ class NormalEquations:
         The negative gradient of the negative log posterior, which points downhill.
     """
 
-    trials: list[tuple[TrialRows, IntArray]]
+    trials: list[tuple[TrialJacobian, IntArray]]
     matrix: FloatArray
     gradient: FloatArray
 
@@ -203,26 +205,26 @@ def normal_equations(
     """
     numbers = range(len(problem.trials))
     trial_equations = [
-        trial_rows(problem, number, state, candidate, precision) for number in numbers
+        trial_jacobian(problem, number, state, candidate, precision) for number in numbers
     ]
     # prior: each scaled unknown u adds precision u^2 / 2 to the objective
     if effect_precision is None:
-        effect_precision = np.ones(candidate.size)
-    local_priors = [trial.prior for trial in trial_equations]
+        effect_precision = np.ones(candidate.parameter_count)
+    local_priors = [trial.local_precision for trial in trial_equations]
     prior_precision = np.concatenate((problem.shared.precision, effect_precision, *local_priors))
-    effect = state.point.effect[: candidate.size]
-    local_values = [trial.value for trial in trial_equations]
+    effect = state.point.effect[: candidate.parameter_count]
+    local_values = [trial.local_values for trial in trial_equations]
     values = np.concatenate((state.point.shared, effect, *local_values))
     matrix = np.diag(prior_precision + LEAST_PRECISION)
     gradient = -prior_precision * values
     # readings: J J^T and J r of each trial, with its derivatives J (M, N C) and residuals r
-    first_local = problem.shared.size + candidate.size
+    first_local = problem.shared.unknown_count + candidate.parameter_count
     trials_with_indices = []
     for trial in trial_equations:
-        local_indices = first_local + np.arange(len(trial.prior))
-        unknown_indices = np.concatenate((local_indices, trial.index))
-        first_local += len(trial.prior)
-        matrix[np.ix_(unknown_indices, unknown_indices)] += trial.rows @ trial.rows.T
-        gradient[unknown_indices] += trial.rows @ trial.residual
+        local_indices = first_local + np.arange(len(trial.local_precision))
+        unknown_indices = np.concatenate((local_indices, trial.shared_indices))
+        first_local += len(trial.local_precision)
+        matrix[np.ix_(unknown_indices, unknown_indices)] += trial.jacobian @ trial.jacobian.T
+        gradient[unknown_indices] += trial.jacobian @ trial.residual
         trials_with_indices.append((trial, unknown_indices))
     return NormalEquations(trials_with_indices, matrix, gradient)

@@ -22,7 +22,7 @@ from discrepancy.fits.beginnings import (
 )
 from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import LARGEST_EFFECT, CandidateFit, fit, objective
-from discrepancy.fits.normal_equations import TrialRows, trial_rows
+from discrepancy.fits.normal_equations import TrialJacobian, trial_jacobian
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen
 from discrepancy.fits.trial_data import TrialData
@@ -52,18 +52,20 @@ def residual_set(
     process, which a χ² against the noise is meant to show. The noise of a channel without a record
     is estimated from the residuals of the fitted trials.
     """
-    precision = np.where(problem.freedom > 0.0, 1.0, problem.precisions(fitted.sums))
-    predictions = _Predictions(problem, fitted, fitted, precision)
-    trials = predictions.trials(sensitivities=sensitivities)
+    precision = np.where(
+        problem.record_freedom > 0.0, 1.0, problem.noise_precisions(fitted.squares_by_channel)
+    )
+    predictions = _TrialPredictions(problem, fitted, fitted, precision)
+    trials = predictions.fitted_trials(sensitivities=sensitivities)
     if problem.campaign.held_out:
-        held_out_problem, held_out = held_out_fit(problem, fitted)
-        trials += _Predictions(held_out_problem, fitted, held_out, precision).trials()
+        held_out_problem, held_out = fit_held_out(problem, fitted)
+        trials += _TrialPredictions(held_out_problem, fitted, held_out, precision).fitted_trials()
     by_name = {trial.trial.name: trial for trial in trials}
     in_order = [by_name[trial.name] for trial in problem.campaign.trials if trial.name in by_name]
     return ResidualSet(problem.campaign.channels, tuple(in_order))
 
 
-def held_out_fit(problem: Problem, fitted: CandidateFit) -> tuple[Problem, CandidateFit]:
+def fit_held_out(problem: Problem, fitted: CandidateFit) -> tuple[Problem, CandidateFit]:
     """Return the problem of the held-out trials, and the fit of their own unknowns.
 
     A trial's own unknowns are, for example, zeros of channels and the initial state. The shared
@@ -73,14 +75,14 @@ def held_out_fit(problem: Problem, fitted: CandidateFit) -> tuple[Problem, Candi
     candidate = fitted.candidate
     held_out = problem.with_trials(problem.campaign.held_out)
     start = replace(
-        held_out.start(candidate), shared=fitted.point.shared, effect=fitted.point.effect
+        held_out.prior_mean_point(candidate), shared=fitted.point.shared, effect=fitted.point.effect
     )
-    if all(trial.name in problem.beginnings for trial in problem.campaign.held_out):
+    if all(trial.name in problem.initial_states for trial in problem.campaign.held_out):
         start = with_initial_states_of_first_readings(held_out, start)
     local_fit = fit(held_out, candidate, start, local_only=True)
     local_fit = refit_from_first_readings(held_out, local_fit, local_only=True)
     # a poor fit may be at a wrong optimum: try again from another release amplitude
-    if local_fit.chi_square > SEARCH.far * float(held_out.counts.sum()):
+    if local_fit.chi_square > SEARCH.far * float(held_out.sample_counts.sum()):
         start = _with_best_release_amplitudes(held_out, candidate, start)
         second_fit = fit(held_out, candidate, start, local_only=True)
         if second_fit.objective < local_fit.objective:
@@ -88,7 +90,7 @@ def held_out_fit(problem: Problem, fitted: CandidateFit) -> tuple[Problem, Candi
     return held_out, local_fit
 
 
-RELEASE_STEPS = tuple(np.linspace(-2.0, 2.0, 17).tolist())
+RELEASE_AMPLITUDES = tuple(np.linspace(-2.0, 2.0, 17).tolist())
 """Amplitudes of a release from which the fit of a held-out trial may begin, about the nominal one:
 in prior deviations, of a free initial state in tenths of the nominal one."""
 
@@ -97,13 +99,13 @@ def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start
     """Return the start with the release amplitude of each trial that gives the least objective.
 
     If friction ends a motion, there is one optimum for each number of half swings, and a descent
-    finds only the nearest. So a grid of amplitudes, `RELEASE_STEPS`, is tried.
+    finds only the nearest. So a grid of amplitudes, `RELEASE_AMPLITUDES`, is tried.
     """
     best_local = list(start.local)
     for number, data in enumerate(held_out.trials):
         release = data.trial.release
-        amplitude_index = data.unknowns.zeros
-        if release is None or amplitude_index >= data.unknowns.size:
+        amplitude_index = data.unknowns.zero_count
+        if release is None or amplitude_index >= data.unknowns.unknown_count:
             continue
         nominal = 0.0
         step = 1.0
@@ -111,7 +113,7 @@ def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start
             nominal = 1.0 / data.unknowns.scale[amplitude_index]
             step = 0.1 * nominal
         least = np.inf
-        for amplitude in nominal + step * np.array(RELEASE_STEPS):
+        for amplitude in nominal + step * np.array(RELEASE_AMPLITUDES):
             local = start.local[number].copy()
             local[amplitude_index] = amplitude
             trial_locals = (*best_local[:number], local, *best_local[number + 1 :])
@@ -125,7 +127,7 @@ def _with_best_release_amplitudes(held_out: Problem, candidate: Candidate, start
 # ---------------------------------------------------------------- expected variances
 
 
-class _Projection(NamedTuple):
+class _CovarianceFactors(NamedTuple):
     """Factors of the covariance of a trial's prediction, in units of its noise deviation.
 
     The covariance is `by_local.T @ by_local + by_shared @ by_shared.T`.
@@ -151,7 +153,7 @@ class _Projection(NamedTuple):
         return np.asarray(np.einsum("nk,nk->n", self.by_shared, self.by_shared))
 
 
-class _Predictions:
+class _TrialPredictions:
     """Predictions of trials by a fit, with the variance that their residuals should have.
 
     Parameters
@@ -179,10 +181,10 @@ class _Predictions:
         self.local_fit = local_fit
         self.precision = precision
         covariance = fitted.covariance
-        self.root = np.linalg.cholesky(covariance + 1e-14 * np.eye(len(covariance)))
+        self.covariance_root = np.linalg.cholesky(covariance + 1e-14 * np.eye(len(covariance)))
         self.is_held_out = local_fit is not fitted
 
-    def trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
+    def fitted_trials(self, *, sensitivities: bool = False) -> list[FittedTrial]:
         """Return each trial with its prediction, residuals and their expected variance.
 
         Parameters
@@ -191,57 +193,59 @@ class _Predictions:
             Whether the factor of the exact covariance of the residuals is computed too.
         """
         fitted_trials = []
-        shared_count = len(self.root)
-        local_counts = [data.unknowns.size for data in self.problem.trials]
+        shared_count = len(self.covariance_root)
+        local_counts = [data.unknowns.unknown_count for data in self.problem.trials]
         first_local = shared_count
-        for number, data in enumerate(self.problem.trials):
-            rows = trial_rows(
-                self.problem, number, self.local_fit, self.local_fit.candidate, self.precision
+        for trial_index, data in enumerate(self.problem.trials):
+            rows = trial_jacobian(
+                self.problem, trial_index, self.local_fit, self.local_fit.candidate, self.precision
             )
-            projection = self._projection(rows, data.unknowns.size)
+            factors = self._covariance_factors(rows, data.unknowns.unknown_count)
             sensitivity = None
             if sensitivities:
-                shape = self.local_fit.residuals[number].shape
+                shape = self.local_fit.residuals[trial_index].shape
                 sensitivity = np.zeros((*shape, shared_count + sum(local_counts)))
-                by_shared = projection.by_shared.reshape(*shape, shared_count)
+                by_shared = factors.by_shared.reshape(*shape, shared_count)
                 sensitivity[..., :shared_count] = by_shared
-                local_count = len(projection.by_local)
-                by_local = projection.by_local.T.reshape(*shape, local_count)
+                local_count = len(factors.by_local)
+                by_local = factors.by_local.T.reshape(*shape, local_count)
                 sensitivity[..., first_local : first_local + local_count] = by_local
                 first_local += local_count
-            fitted_trials.append(self._fitted_trial(number, data, projection, sensitivity))
+            fitted_trials.append(self._fitted_trial(trial_index, data, factors, sensitivity))
         return fitted_trials
 
-    def _projection(self, rows: TrialRows, local_count: int) -> _Projection:
+    def _covariance_factors(self, rows: TrialJacobian, local_count: int) -> _CovarianceFactors:
         """Return the factors of the covariance of a trial's prediction.
 
         Parameters
         ----------
-        rows : TrialRows
+        rows : TrialJacobian
             The derivatives of the trial, by its own L unknowns first.
         local_count : int
             The number L of the trial's own unknowns.
         """
-        local_rows, shared_rows = np.split(rows.rows, [local_count])
+        local_rows, shared_rows = np.split(rows.jacobian, [local_count])
         factor, local_per_shared = rows.eliminate_local()
         # A = U^T U is the precision of the local unknowns: J_l^T A^-1 J_l = (U^-T J_l)^T (U^-T J_l)
         by_local = solve_triangular(factor, local_rows, trans="T")
         # Schur complement: local unknowns follow the shared ones, J_s - J_l A^-1 B
         total_derivatives = (shared_rows - local_per_shared.T @ local_rows).T
-        return _Projection(by_local, total_derivatives @ self.root[rows.index])
+        return _CovarianceFactors(
+            by_local, total_derivatives @ self.covariance_root[rows.shared_indices]
+        )
 
-    def _variances(
-        self, number: int, data: TrialData, projection: _Projection
+    def _leverage_and_variance(
+        self, trial_index: int, data: TrialData, factors: _CovarianceFactors
     ) -> tuple[FloatArray, FloatArray]:
         """Return the leverage of the readings and the variance of a new reading, both (N, C).
 
         Both are relative to the noise variance; `FittedTrial` defines the leverage.
         """
-        shape = self.local_fit.residuals[number].shape
+        shape = self.local_fit.residuals[trial_index].shape
         process = self.fitted.residual_process
         shared_weight = float(process is None)  # 0: the residual process stands for shared unknowns
-        local_variance = projection.local_variance()
-        shared_variance = projection.shared_variance()
+        local_variance = factors.local_variance()
+        shared_variance = factors.shared_variance()
         if self.is_held_out:
             # own unknowns were fitted to the trial and reduce its residuals; the uncertainty of
             # shared unknowns, which were not, adds to them
@@ -254,32 +258,36 @@ class _Predictions:
             variance = 1.0 + np.maximum(leverage, 0.0).reshape(shape)
         if process is not None and data.trial.is_dynamic:
             # without a noise record the process is part of the noise already
-            has_record = self.problem.freedom[data.groups] > 0.0
-            variance = variance + has_record * process.amplitude[data.groups] ** 2
+            has_record = self.problem.record_freedom[data.channel_indices] > 0.0
+            variance = variance + has_record * process.amplitude[data.channel_indices] ** 2
         return leverage.reshape(shape), variance
 
     def _fitted_trial(
-        self, number: int, data: TrialData, projection: _Projection, sensitivity: FloatArray | None
+        self,
+        trial_index: int,
+        data: TrialData,
+        factors: _CovarianceFactors,
+        sensitivity: FloatArray | None,
     ) -> FittedTrial:
         """Return a trial with its prediction, its residuals and their expected variance.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         data : TrialData
             The trial.
-        projection : _Projection
+        factors : _CovarianceFactors
             The factors of the covariance of its prediction.
         sensitivity : (N, C, P) array or None
             The factor of the exact covariance of its residuals, if that is asked for.
         """
         point = self.local_fit.point
-        response = self.local_fit.responses[number]
-        prediction = self.problem.prediction(number, point, response)
-        residual = self.problem.residual(number, point, response)
-        leverage, variance = self._variances(number, data, projection)
-        noise_deviation = data.deviation / np.sqrt(self.precision[data.groups])
+        response = self.local_fit.responses[trial_index]
+        prediction = self.problem.prediction(trial_index, point, response)
+        residual = self.problem.standardised_residual(trial_index, point, response)
+        leverage, variance = self._leverage_and_variance(trial_index, data, factors)
+        noise_deviation = data.deviation / np.sqrt(self.precision[data.channel_indices])
         rates = None
         if data.trial.is_dynamic:
             rates = np.gradient(prediction, data.trial.time, axis=0)
@@ -299,7 +307,7 @@ class _Predictions:
 
 # ---------------------------------------------------------------- draws of the effect
 
-LEAST_RISE = 0.6
+LEAST_MISFIT_RISE = 0.6
 """Rise of the misfit at the ends of a Gaussian 90 % interval below which the posterior is sampled
 [nat]; a Gaussian posterior has NINETY^2 / 2 = 1.35."""
 SEED = 20211
@@ -308,7 +316,7 @@ ROUNDS = 5
 """Rounds of adaptive importance sampling."""
 POINTS_PER_ROUND = 400
 """Points of each round at which the density is evaluated."""
-KEPT_DRAWS = 1000
+RETURNED_DRAWS = 1000
 """Equally weighted draws that are returned."""
 
 
@@ -325,11 +333,11 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     Returns
     -------
     CandidateFit
-        The given fit if -ln posterior rises by more than `LEAST_RISE` at both ends of the Gaussian
-        90 % interval along every principal axis of the covariance; otherwise the fit with `draws`.
-        The same fit always gives the same draws.
+        The given fit if -ln posterior rises by more than `LEAST_MISFIT_RISE` at both ends of the
+        Gaussian 90 % interval along every principal axis of the covariance; otherwise the fit with
+        `draws`. The same fit always gives the same draws.
     """
-    if not fit.candidate.size:
+    if not fit.candidate.parameter_count:
         return fit
     screen = Screen(problem, fit, record_noise=False)
     fitted_effect = fit.point.effect
@@ -350,7 +358,7 @@ def with_draws(problem: Problem, fit: CandidateFit) -> CandidateFit:
     for axis in axes.T:
         energy_rises.append(energy(fitted_effect - NINETY * axis))
         energy_rises.append(energy(fitted_effect + NINETY * axis))
-    if min(energy_rises) > LEAST_RISE:
+    if min(energy_rises) > LEAST_MISFIT_RISE:
         return fit
     return replace(fit, draws=importance_draws(energy, fitted_effect, axes))
 
@@ -402,5 +410,5 @@ def importance_draws(
         mean = weights @ points
         covariance = np.atleast_2d(np.cov(points.T, aweights=weights))
     # stratified resampling
-    quantiles = stratified(generator, KEPT_DRAWS)
+    quantiles = stratified(generator, RETURNED_DRAWS)
     return np.asarray(points[np.searchsorted(np.cumsum(weights)[:-1], quantiles)])

@@ -27,7 +27,7 @@ from fe.runtime.patch import ModelPatch
 from reporting.memory import ResultCache
 
 from .candidate import (
-    LEAST_STEP,
+    LEAST_EFFECT_STEP,
     PARAMETER_STEP,
     Candidate,
     Point,
@@ -35,34 +35,41 @@ from .candidate import (
     with_step,
 )
 from .derivatives import nuisance_derivatives, prediction_derivatives
-from .trial_data import TrialData, global_unknowns, stand_in_deviation
+from .trial_data import TrialData, shared_unknowns, stand_in_deviation
 
-KEPT_RESPONSES = 2000
+MOST_CACHED_RESPONSES = 2000
 """Number of responses that a problem keeps in memory."""
-QUIETEST = 1e-12
+LEAST_VARIANCE = 1e-12
 """Least variance of an unknown noise over its stand-in: a billionth of the range, from rounding."""
 
 
-def channel_misfits(freedom: FloatArray, counts: FloatArray, sums: FloatArray) -> FloatArray:
-    """Return the misfit of each channel: -ln L with the noise variance marginalised [nat].
+def channel_misfits(
+    record_freedom: FloatArray, sample_counts: FloatArray, squares: FloatArray
+) -> FloatArray:
+    """Return -ln L of each channel with the noise variance marginalised, up to a constant [nat].
 
-    It is up to a constant. Without a noise record, the logarithm of the noise deviation has a flat
-    prior.
+    Without a noise record, the logarithm of the noise deviation has a flat prior.
 
     Parameters
     ----------
-    freedom : (...) array
+    record_freedom : (...) array
         The degrees of freedom n0 of the noise record: 0 without a record, infinite where the noise
         is known.
-    counts : (...) array
+    sample_counts : (...) array
         The number n of samples.
-    sums : (...) array
+    squares : (...) array
         The sums of squared standardised residuals.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        recorded = 0.5 * (freedom + counts) * np.log1p(sums / freedom)
-        unrecorded = 0.5 * counts * np.log(np.maximum(sums, QUIETEST * counts))
-    return np.where(np.isinf(freedom), 0.5 * sums, np.where(freedom > 0.0, recorded, unrecorded))
+        recorded = 0.5 * (record_freedom + sample_counts) * np.log1p(squares / record_freedom)
+        unrecorded = (
+            0.5 * sample_counts * np.log(np.maximum(squares, LEAST_VARIANCE * sample_counts))
+        )
+    return np.where(
+        np.isinf(record_freedom),
+        0.5 * squares,
+        np.where(record_freedom > 0.0, recorded, unrecorded),
+    )
 
 
 class Problem:
@@ -81,17 +88,17 @@ class Problem:
     ----------
     trials : tuple of TrialData
         The trials that are compared, with their noise and unknowns.
-    shared : GlobalUnknowns
+    shared : SharedUnknowns
         The layout of the unknowns that all hypotheses and trials share.
-    noise : dict of str to NoiseModel
+    noise_models : dict of str to NoiseModel
         The noise model of each channel.
-    freedom, counts : (channels,) array
+    record_freedom, sample_counts : (channels,) array
         The degrees of freedom of each noise record, and the number of samples of each channel.
     refinement : int
         The factor by which time steps are smaller than the model's own.
     refusals : dict of str to str
         The reason why an effect could not be fitted, by its identifier.
-    beginnings : dict of str to (L,) array
+    initial_states : dict of str to (L,) array
         The scaled unknowns of a trial as fitted to its first readings, by the name of the trial;
         filled by `beginnings.with_initial_states_of_first_readings`.
 
@@ -111,33 +118,36 @@ class Problem:
         self.model = model.remembering()
         self.channel_names = tuple(campaign.channels)
         self.refinement = 1
-        self.noise: dict[str, NoiseModel] = {}
+        self.noise_models: dict[str, NoiseModel] = {}
         for name, channel in campaign.channels.items():
-            self.noise[name] = noise_model(channel, stand_in_deviation(campaign, name))
-        self.freedom = np.array([noise.degrees_of_freedom for noise in self.noise.values()])
+            self.noise_models[name] = noise_model(channel, stand_in_deviation(campaign, name))
+        self.record_freedom = np.array(
+            [noise.degrees_of_freedom for noise in self.noise_models.values()]
+        )
         channels = campaign.channels.values()
-        self.tests_whiteness = [whiteness_is_tested(channel) for channel in channels]
+        self.is_whiteness_tested = [whiteness_is_tested(channel) for channel in channels]
         self.refusals: dict[str, str] = {}
-        self.beginnings: dict[str, FloatArray] = {}
+        self.initial_states: dict[str, FloatArray] = {}
         self._prepare_trials(campaign.fitted)
         # first estimates of unknown gains need a response, and a response needs the layout of the
         # unknowns: so the layout is made twice, the first time without these estimates
-        self.shared = global_unknowns(campaign, model, campaign.fitted, {})
-        self.shared = global_unknowns(campaign, model, campaign.fitted, self._data_over_model())
+        self.shared = shared_unknowns(campaign, model, campaign.fitted, {})
+        self.shared = shared_unknowns(campaign, model, campaign.fitted, self._gain_estimates())
 
     def _prepare_trials(self, trials: Sequence[Trial]) -> None:
         """Set the trials that are compared, the number of their samples, and an empty cache."""
         self.trials = tuple(
-            TrialData.prepare(self.campaign, trial, self.noise, self.model) for trial in trials
+            TrialData.prepare(self.campaign, trial, self.noise_models, self.model)
+            for trial in trials
         )
-        self.counts = self._sample_counts()
-        self._responses = ResultCache(KEPT_RESPONSES)
+        self.sample_counts = self._sample_counts()
+        self._responses = ResultCache(MOST_CACHED_RESPONSES)
 
     def _sample_counts(self) -> FloatArray:
         """Return the number of samples (channels,) of each channel in the trials."""
         counts = np.zeros(len(self.channel_names))
         for data in self.trials:
-            np.add.at(counts, data.groups, data.weight.sum(axis=0))
+            np.add.at(counts, data.channel_indices, data.weight.sum(axis=0))
         return counts
 
     def record_refusal(self, candidate: Candidate, cause: DiscrepancyError) -> None:
@@ -148,27 +158,27 @@ class Problem:
         if len(candidate.terms) == 1:
             self.refusals[candidate.terms[0].effect.identifier] = str(cause)
 
-    def _data_over_model(self) -> dict[str, float]:
-        """Return the ratio of readings to model response for each channel of unknown gain.
+    def _gain_estimates(self) -> dict[str, float]:
+        """Return first estimates of unknown gains: the ratio of readings to the model's response.
 
         It is the ratio of their largest amplitudes in the first trial in which the channel moves in
         the model. It is negative if readings and response have opposite signs, except after a
         release.
         """
-        ratios: dict[str, float] = {}
-        point = self.start(Candidate())
+        estimates: dict[str, float] = {}
+        point = self.prior_mean_point(Candidate())
         for number, data in enumerate(self.trials):
             release = data.trial.release
             for column, name in enumerate(data.trial.channels):
                 has_unknown_scale = self.campaign.channels[name].gain_deviation == inf
-                if not has_unknown_scale or name in ratios:
+                if not has_unknown_scale or name in estimates:
                     continue
                 readings = data.trial.values[:, column]
                 deviation_from_median = readings - np.median(readings)
                 local = point.local[number]
                 # a free initial state is zero at its prior mean, where nothing would move
                 if release is not None and not release.at_rest:
-                    first_amplitude = data.unknowns.zeros
+                    first_amplitude = data.unknowns.zero_count
                     local[first_amplitude] = 1.0 / data.unknowns.scale[first_amplitude]
                 response, _ = self.response(number, point.shared, local, ModelPatch())
                 response_amplitude = float(np.abs(response[:, column]).max())
@@ -177,49 +187,56 @@ class Problem:
                         release is not None or deviation_from_median @ response[:, column] > 0.0
                     )
                     sign = 1.0 if has_same_sign else -1.0
-                    ratios[name] = (
+                    estimates[name] = (
                         float(np.abs(deviation_from_median).max()) / response_amplitude * sign
                     )
-        return ratios
+        return estimates
 
     # -------------------------------------------------------------------------- values
 
-    def start(self, candidate: Candidate) -> Point:
+    def prior_mean_point(self, candidate: Candidate) -> Point:
         """Return the point of the prior means, from which the fit of a candidate may begin."""
         return Point(
-            shared=np.zeros(self.shared.size),
-            local=tuple(np.zeros(data.unknowns.size) for data in self.trials),
-            effect=candidate.start(),
+            shared=np.zeros(self.shared.unknown_count),
+            local=tuple(np.zeros(data.unknowns.unknown_count) for data in self.trials),
+            effect=candidate.start_values(),
         )
 
-    def patch_in(self, number: int, candidate: Candidate, effect: FloatArray) -> ModelPatch:
+    def patch_in_trial(
+        self, trial_index: int, candidate: Candidate, effect: FloatArray
+    ) -> ModelPatch:
         """Return the change of the model by the effects of a candidate in a trial.
 
         It is empty if the effects do not act on trials of this kind.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         candidate : Candidate
             The effects.
         effect : (E,) array
             The scaled effect parameters.
         """
-        if self.trials[number].trial.kind not in candidate.acts_on:
+        if self.trials[trial_index].trial.kind not in candidate.acts_on:
             return ModelPatch()
         return candidate.patch(self.setting, effect)
 
     def response(
-        self, number: int, shared: FloatArray, local: FloatArray, patch: ModelPatch, finer: int = 1
+        self,
+        trial_index: int,
+        shared: FloatArray,
+        local: FloatArray,
+        patch: ModelPatch,
+        refinement: int = 1,
     ) -> tuple[FloatArray, FloatArray | None]:
-        """Return the response of a patched model in a trial, without gains and zeros.
+        """Return the response of a patched model in a trial, without gains and zeros of channels.
 
-        The last `KEPT_RESPONSES` responses are kept in memory.
+        The last `MOST_CACHED_RESPONSES` responses are kept in memory.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         shared : (Q,) array
             The scaled shared unknowns.
@@ -227,7 +244,7 @@ class Problem:
             The scaled unknowns of the trial.
         patch : ModelPatch
             The change of the model by effects.
-        finer : int
+        refinement : int
             The factor by which the time steps of the problem are divided.
 
         Returns
@@ -237,64 +254,68 @@ class Problem:
         rates : (N, C) array or None
             Its time derivative; None if the model does not give it.
         """
-        data = self.trials[number]
+        data = self.trials[trial_index]
         conditions = data.unknowns.conditions(data.trial, self.shared.parameters(shared), local)
-        conditions = replace(conditions, refinement=self.refinement * finer)
+        conditions = replace(conditions, refinement=self.refinement * refinement)
 
         def simulate() -> tuple[FloatArray, FloatArray | None]:
             observed = observe(self.model, self.campaign, data.trial, patch, conditions)
             return observed.values, observed.rates
 
-        return self._responses.get((number, patch.primitives, conditions.key), simulate)
+        return self._responses.get((trial_index, patch.primitives, conditions.key), simulate)
 
-    def response_with(
-        self, number: int, point: Point, candidate: Candidate, finer: int = 1
+    def response_of_candidate(
+        self, trial_index: int, point: Point, candidate: Candidate, refinement: int = 1
     ) -> FloatArray:
         """Return the `response` (N, C) of a trial with the effects of a candidate."""
-        patch = self.patch_in(number, candidate, point.effect)
-        response, _ = self.response(number, point.shared, point.local[number], patch, finer)
+        patch = self.patch_in_trial(trial_index, candidate, point.effect)
+        response, _ = self.response(
+            trial_index, point.shared, point.local[trial_index], patch, refinement
+        )
         return response
 
-    def prediction(self, number: int, point: Point, response: FloatArray) -> FloatArray:
+    def prediction(self, trial_index: int, point: Point, response: FloatArray) -> FloatArray:
         """Return the prediction (N, C) of the readings: the response with gains and zeros."""
-        data = self.trials[number]
+        data = self.trials[trial_index]
         gains = self.shared.gains(point.shared, data.trial.channels)
-        zero = data.unknowns.zero(point.local[number], len(data.trial.channels))
+        zero = data.unknowns.channel_zeros(point.local[trial_index], len(data.trial.channels))
         return np.asarray((1.0 + gains) * response + zero)
 
-    def residual(self, number: int, point: Point, response: FloatArray) -> FloatArray:
+    def standardised_residual(
+        self, trial_index: int, point: Point, response: FloatArray
+    ) -> FloatArray:
         """Return the standardised residuals (N, C) of a trial, given its response (N, C)."""
-        data = self.trials[number]
-        return data.standardised(data.trial.values - self.prediction(number, point, response))
+        data = self.trials[trial_index]
+        return data.standardise(data.trial.values - self.prediction(trial_index, point, response))
 
     # -------------------------------------------------------------------------- derivatives
 
     def linearise(
         self,
-        number: int,
+        trial_index: int,
         point: Point,
         candidate: Candidate,
         *,
-        known: TrialDerivatives | None = None,
+        nearby_derivatives: TrialDerivatives | None = None,
         effect_steps: FloatArray | None = None,
     ) -> TrialDerivatives:
         """Return the response of a trial and its derivatives, by finite differences.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
         point : Point
             The values of all unknowns.
         candidate : Candidate
             The effects that act.
-        known : TrialDerivatives, optional
+        nearby_derivatives : TrialDerivatives, optional
             Derivatives with respect to nuisances at a nearby point, which are not computed again.
         effect_steps : (E,) array, optional
             The posterior standard deviations of the effect parameters, used as steps of their
-            finite differences, at least `LEAST_STEP` and at most `PARAMETER_STEP`. Such a step
-            averages over the kinks of friction and hysteresis, and stays where the parameters may
-            lie.
+            finite differences, at least `LEAST_EFFECT_STEP` and at most `PARAMETER_STEP`. Such a
+            step averages over the kinks of friction and hysteresis, and stays where the parameters
+            may lie.
 
         Notes
         -----
@@ -302,69 +323,69 @@ class Problem:
         cannot compensate is small: a ten-thousandth if the effect moves frequencies. The error of a
         one-sided difference by curvature is larger, and would count as information.
         """
-        kind = self.trials[number].trial.kind
-        response = self.response_with(number, point, candidate)
-        if known is None:
-            by_parameters, by_local = self._nuisance_derivatives(number, point, candidate)
+        kind = self.trials[trial_index].trial.kind
+        response = self.response_of_candidate(trial_index, point, candidate)
+        if nearby_derivatives is None:
+            by_parameters, by_local = self._nuisance_derivatives(trial_index, point, candidate)
         else:
-            by_parameters = known.parameters
-            by_local = known.local
-        by_effect = np.zeros((candidate.size, *response.shape))
-        steps = np.full(candidate.size, PARAMETER_STEP)
+            by_parameters = nearby_derivatives.by_parameters
+            by_local = nearby_derivatives.by_local
+        by_effect = np.zeros((candidate.parameter_count, *response.shape))
+        steps = np.full(candidate.parameter_count, PARAMETER_STEP)
         if effect_steps is not None:
-            steps = np.clip(effect_steps, LEAST_STEP, PARAMETER_STEP)
+            steps = np.clip(effect_steps, LEAST_EFFECT_STEP, PARAMETER_STEP)
         for k, step in enumerate(steps.tolist()):
-            if kind not in candidate.acts_on_with(k):
+            if kind not in candidate.trial_kinds_of_parameter(k):
                 continue
             point_above = replace(point, effect=with_step(point.effect, k, step))
             point_below = replace(point, effect=with_step(point.effect, k, -step))
-            above = self.response_with(number, point_above, candidate)
-            below = self.response_with(number, point_below, candidate)
+            above = self.response_of_candidate(trial_index, point_above, candidate)
+            below = self.response_of_candidate(trial_index, point_below, candidate)
             by_effect[k] = (above - below) / (2.0 * step)
         return TrialDerivatives(response, by_parameters, by_local, by_effect)
 
     def _nuisance_derivatives(
-        self, number: int, point: Point, candidate: Candidate
+        self, trial_index: int, point: Point, candidate: Candidate
     ) -> tuple[FloatArray, FloatArray]:
         """Return the `nuisance_derivatives` of a trial while the effects of a candidate act."""
-        patch = self.patch_in(number, candidate, point.effect)
+        patch = self.patch_in_trial(trial_index, candidate, point.effect)
 
         def respond(shared: FloatArray, local: FloatArray) -> tuple[FloatArray, FloatArray | None]:
-            return self.response(number, shared, local, patch)
+            return self.response(trial_index, shared, local, patch)
 
         return nuisance_derivatives(
-            self.trials[number], self.shared, point.shared, point.local[number], respond
+            self.trials[trial_index], self.shared, point.shared, point.local[trial_index], respond
         )
 
     def prediction_derivatives(
-        self, number: int, point: Point, derivatives: TrialDerivatives, candidate: Candidate
+        self, trial_index: int, point: Point, derivatives: TrialDerivatives, candidate: Candidate
     ) -> tuple[FloatArray, IntArray]:
         """Return the `prediction_derivatives` of a trial, given those of its response."""
         return prediction_derivatives(
-            self.trials[number], self.shared, point.shared, derivatives, candidate
+            self.trials[trial_index], self.shared, point.shared, derivatives, candidate
         )
 
     # -------------------------------------------------------------------------- likelihood
 
-    def sums_by_channel(self, residuals: Sequence[FloatArray]) -> FloatArray:
+    def squares_by_channel(self, residuals: Sequence[FloatArray]) -> FloatArray:
         """Return the sum of squares (channels,), given the residuals (N, C) of each trial."""
         sums = np.zeros(len(self.channel_names))
         for data, residual in zip(self.trials, residuals, strict=True):
-            np.add.at(sums, data.groups, np.einsum("nc,nc->c", residual, residual))
+            np.add.at(sums, data.channel_indices, np.einsum("nc,nc->c", residual, residual))
         return sums
 
-    def misfit(self, sums: FloatArray) -> float:
+    def misfit(self, squares: FloatArray) -> float:
         """Return -ln L with the noise variances marginalised, up to a constant [nat].
 
         Parameters
         ----------
-        sums : (channels,) array
+        squares : (channels,) array
             The sum of squared standardised residuals of each channel.
         """
-        misfits = channel_misfits(self.freedom, self.counts, sums)
-        return float(misfits[self.counts > 0].sum())
+        misfits = channel_misfits(self.record_freedom, self.sample_counts, squares)
+        return float(misfits[self.sample_counts > 0].sum())
 
-    def recorded_misfit(self, sums: FloatArray) -> float:
+    def recorded_misfit(self, squares: FloatArray) -> float:
         """Return -ln L if the noise is exactly as recorded, up to a constant [nat].
 
         Its constant is that of the evidence with a missing force, where the noise is taken as
@@ -373,19 +394,19 @@ class Problem:
 
         Parameters
         ----------
-        sums : (channels,) array
+        squares : (channels,) array
             The sum of squared standardised residuals of each channel.
         """
         log_determinant = 0.0
         for data in self.trials:
             static_deviation = data.trial.noise_factor * np.array(
-                [noise.static_deviation for noise in data.noise]
+                [noise.static_deviation for noise in data.noise_models]
             )
             log_ratio = np.log(data.deviation / static_deviation)
             log_determinant += float((data.weight * log_ratio).sum())
-        return 0.5 * float(sums.sum()) + log_determinant
+        return 0.5 * float(squares.sum()) + log_determinant
 
-    def precisions(self, sums: FloatArray) -> FloatArray:
+    def noise_precisions(self, squares: FloatArray) -> FloatArray:
         """Return the expected noise precision of each channel over the recorded 1 / s0^2.
 
         It is (n0 + n) / (n0 + RSS), the mean of its gamma posterior (see the module docstring), and
@@ -393,12 +414,12 @@ class Problem:
 
         Parameters
         ----------
-        sums : (channels,) array
+        squares : (channels,) array
             The sum of squared standardised residuals RSS of each channel.
         """
-        n0, n = self.freedom, self.counts
+        n0, n = self.record_freedom, self.sample_counts
         with np.errstate(divide="ignore", invalid="ignore"):
-            bounded_sums = np.where(n0 > 0.0, sums, np.maximum(sums, QUIETEST * n))
+            bounded_sums = np.where(n0 > 0.0, squares, np.maximum(squares, LEAST_VARIANCE * n))
             precisions = np.where(np.isinf(n0), 1.0, (n0 + n) / (n0 + bounded_sums))
         return np.where(n > 0, precisions, 1.0)
 
@@ -420,7 +441,7 @@ class Problem:
         other._prepare_trials(trials)
         return other
 
-    def first_samples(self, count: int) -> "Problem":
+    def with_first_samples(self, count: int) -> "Problem":
         """Return the problem in which only the first samples of each trial in motion are compared.
 
         Parameters
@@ -436,10 +457,10 @@ class Problem:
                 data = replace(data, weight=data.weight * is_counted[:, None])
             shorter_trials.append(data)
         shorter.trials = tuple(shorter_trials)
-        shorter.counts = shorter._sample_counts()
+        shorter.sample_counts = shorter._sample_counts()
         return shorter
 
-    def widened(self, factors: FloatArray) -> "Problem":
+    def with_wider_noise(self, factors: FloatArray) -> "Problem":
         """Return the problem under a noise with a larger standard deviation, taken as known.
 
         The factors apply in trials in motion, and at rest only to channels without a noise record.
@@ -450,12 +471,12 @@ class Problem:
             The factor on the noise deviation of each channel.
         """
         wider = copy(self)
-        is_unrecorded = self.freedom == 0.0
+        is_unrecorded = self.record_freedom == 0.0
         wider_trials = []
         for data in self.trials:
-            is_wider = is_unrecorded[data.groups] | data.trial.is_dynamic
-            factor = np.where(is_wider, factors[data.groups], 1.0)
+            is_wider = is_unrecorded[data.channel_indices] | data.trial.is_dynamic
+            factor = np.where(is_wider, factors[data.channel_indices], 1.0)
             wider_trials.append(replace(data, deviation=data.deviation * factor))
         wider.trials = tuple(wider_trials)
-        wider.freedom = np.where(factors != 1.0, inf, self.freedom)
+        wider.record_freedom = np.where(factors != 1.0, inf, self.record_freedom)
         return wider

@@ -41,11 +41,11 @@ class ScreenedChange:
     ----------
     term : EffectTerm
         The effect at its place.
-    start : (E,) array
+    effect_values : (E,) array
         The scaled parameters of the effect.
     vector : (D,) array
         The change d of all readings, then its projections H^(-1/2) J d on the nuisances, such that
-        G(c, d) = sum(sign * c.vector * d.vector) with `Screen.sign`.
+        G(c, d) = sum(sign * c.vector * d.vector) with `Screen.inner_product_signs`.
     overlap : float
         b(d): the overlap of the change with the residuals [nat].
     squared_size : float
@@ -53,13 +53,13 @@ class ScreenedChange:
     """
 
     term: EffectTerm
-    start: FloatArray
+    effect_values: FloatArray
     vector: FloatArray
     overlap: float
     squared_size: float
 
     @property
-    def scale(self) -> float:
+    def best_scale(self) -> float:
         """The factor on the change that reduces the misfit most: b(d) / G(d, d)."""
         return self.overlap / self.squared_size if self.squared_size > 0.0 else 0.0
 
@@ -70,14 +70,16 @@ class ScreenedChange:
         It is 0 if the best scale is negative and the effect cannot be.
         """
         if self.overlap > 0.0 or self.term.may_be_negative:
-            return 0.5 * self.overlap * self.scale
+            return 0.5 * self.overlap * self.best_scale
         return 0.0
 
     @property
-    def best(self) -> FloatArray:
+    def best_values(self) -> FloatArray:
         """The scaled parameters (E,) with the magnitude at the best scale, to begin a fit with."""
         lowest = -0.7 * LARGEST_EFFECT
-        return self.term.rescaled(self.start, self.scale, lowest, SEARCH.largest_start)
+        return self.term.multiply_magnitudes(
+            self.effect_values, self.best_scale, lowest, SEARCH.largest_start
+        )
 
 
 class Screen:
@@ -108,9 +110,9 @@ class Screen:
     ) -> None:
         self.problem = problem
         self.fit = fit
-        precision = problem.precisions(fit.sums)
+        precision = problem.noise_precisions(fit.squares_by_channel)
         if record_noise:
-            precision = np.where(problem.freedom > 0.0, 1.0, precision)
+            precision = np.where(problem.record_freedom > 0.0, 1.0, precision)
         adapting = Candidate() if effect_precision is None else fit.candidate
         equations = normal_equations(problem, fit, adapting, precision, effect_precision)
         self._trials = equations.trials
@@ -123,7 +125,7 @@ class Screen:
         self._gradient = self._inverse_factor @ equations.gradient
 
     @property
-    def sign(self) -> FloatArray:
+    def inner_product_signs(self) -> FloatArray:
         """The signs (D,) of the inner product G of two vectors.
 
         They are 1 for the changes of readings and -1 for the projections on the nuisances, since G
@@ -134,29 +136,29 @@ class Screen:
 
     # ---------------------------------------------------------------- changes of the prediction
 
-    def change(self, term: EffectTerm, start: FloatArray) -> ScreenedChange:
+    def change_by_effect(self, term: EffectTerm, effect_values: FloatArray) -> ScreenedChange:
         """Return the change of the prediction if one more effect acts.
 
         Parameters
         ----------
         term : EffectTerm
             The effect at its place, added to those of the fit.
-        start : (E,) array
+        effect_values : (E,) array
             The scaled parameters of the effect.
         """
         candidate = self.fit.candidate.with_term(term)
-        effect = np.concatenate((self.fit.point.effect, start))
-        vector, overlap, squared_size = self._change_to(candidate, effect, term.effect.acts_on)
-        return ScreenedChange(term, start, vector, overlap, max(squared_size, 0.0))
+        effect = np.concatenate((self.fit.point.effect, effect_values))
+        vector, overlap, squared_size = self._project_change(candidate, effect, term.effect.acts_on)
+        return ScreenedChange(term, effect_values, vector, overlap, max(squared_size, 0.0))
 
     def misfit_rise(self, effect: FloatArray) -> float:
         """Return the rise of the misfit at other parameters (E,) of the fit's own effects [nat]."""
         candidate = self.fit.candidate
-        _, overlap, squared_size = self._change_to(candidate, effect, candidate.acts_on)
+        _, overlap, squared_size = self._project_change(candidate, effect, candidate.acts_on)
         return 0.5 * squared_size - overlap
 
     @np.errstate(over="ignore", invalid="ignore")
-    def _change_to(
+    def _project_change(
         self, candidate: Candidate, effect: FloatArray, kinds: frozenset[TrialKind]
     ) -> tuple[FloatArray, float, float]:
         """Return vector, overlap b and squared size G of the change to another candidate.
@@ -179,7 +181,7 @@ class Screen:
                 continue
             response, _ = problem.response(number, point.shared, point.local[number], patch)
             gains = 1.0 + problem.shared.gains(point.shared, data.trial.channels)
-            standardised_changes[number] = data.standardised(
+            standardised_changes[number] = data.standardise(
                 gains * (response - self.fit.responses[number])
             )
         return self.project(standardised_changes)
@@ -208,8 +210,8 @@ class Screen:
         for number, (trial_rows, nuisance_indices) in enumerate(self._trials):
             d: FloatArray = np.zeros(trial_rows.residual.shape)
             if number in changes:
-                d = (changes[number] * trial_rows.root).ravel()
-                nuisance_overlaps[nuisance_indices] += trial_rows.rows @ d
+                d = (changes[number] * trial_rows.precision_root).ravel()
+                nuisance_overlaps[nuisance_indices] += trial_rows.jacobian @ d
                 overlap += float(trial_rows.residual @ d)
                 squared_size += float(d @ d)
             trial_changes.append(d)
@@ -219,7 +221,7 @@ class Screen:
         check_finite(np.array((overlap, squared_size)))
         return np.concatenate((*trial_changes, projections)), overlap, squared_size
 
-    def shrunk(self, change: ScreenedChange) -> tuple[ScreenedChange, float]:
+    def shrink_change(self, change: ScreenedChange) -> tuple[ScreenedChange, float]:
         """Return a change with so small a magnitude that it is linear in it, and the factor.
 
         At the median of its prior an effect that moves a frequency may shift phases by many
@@ -232,14 +234,18 @@ class Screen:
         factor : float
             The factor on the magnitude, at most 1.
         """
-        is_reading = self.sign > 0.0
+        is_reading = self.inner_product_signs > 0.0
         squared_size = float((change.vector[is_reading] ** 2).sum())
         factor = sqrt(SEARCH.first_order / squared_size) if squared_size > 0.0 else 1.0
         if factor >= 1.0:
             return change, 1.0
-        return self.change(change.term, change.term.rescaled(change.start, factor)), factor
+        return self.change_by_effect(
+            change.term, change.term.multiply_magnitudes(change.effect_values, factor)
+        ), factor
 
-    def changes(self, term: EffectTerm, *, fine: bool = True) -> Iterator[ScreenedChange]:
+    def changes_on_grid(
+        self, term: EffectTerm, *, with_small_magnitude: bool = True
+    ) -> Iterator[ScreenedChange]:
         """Yield the changes by an effect over a grid of its parameters.
 
         Points of the grid at which the model cannot be evaluated are left out.
@@ -248,15 +254,17 @@ class Screen:
         ----------
         term : EffectTerm
             The effect at its place.
-        fine : bool
+        with_small_magnitude : bool
             Whether a magnitude that may be negative is tried at a small value too. One value is
             enough for an effect that is linear in its magnitude.
         """
         has_change = False
         refusal = None
-        for start in parameter_grid(term, self._spectral_peaks(term), fine=fine):
+        for start in parameter_grid(
+            term, self._spectral_peaks(term), with_small_magnitude=with_small_magnitude
+        ):
             try:
-                change = self.change(term, start)
+                change = self.change_by_effect(term, start)
             except DiscrepancyError as cause:  # such as more stiffness removed than there is
                 refusal = cause
             else:
@@ -282,14 +290,14 @@ class Screen:
             if trial.kind not in term.effect.acts_on or term.place not in trial.channels:
                 continue
             series = residual[:, trial.channels.index(term.place)]
-            padded_length = SEARCH.padded * len(series)
+            padded_length = SEARCH.zero_padding * len(series)
             power = np.abs(np.fft.rfft(series - series.mean(), padded_length)) ** 2
             key = (len(series), trial.interval)
             spectra[key] = spectra.get(key, 0.0) + power
         first_frequency = self.problem.setting.scales.angular_frequency / (2.0 * np.pi)
         peaks: list[float] = []
         for (count, interval), power in spectra.items():
-            resolution = 1.0 / (SEARCH.padded * count * interval)
+            resolution = 1.0 / (SEARCH.zero_padding * count * interval)
             for index in _largest_peaks(power):
                 peaks.append(index * resolution / first_frequency)
         return tuple(peaks)
@@ -303,11 +311,11 @@ def _largest_peaks(power: FloatArray) -> list[int]:
     """
     is_peak = (power[1:-1] > power[:-2]) & (power[1:-1] >= power[2:])
     peaks = np.flatnonzero(is_peak) + 1
-    largest = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.peaks]]
+    largest = peaks[np.argsort(power[peaks])[::-1][: 4 * SEARCH.most_peaks]]
     chosen: list[int] = []
     for index in largest:
-        is_apart = all(abs(index - other) > 2 * SEARCH.padded for other in chosen)
-        if is_apart and len(chosen) < SEARCH.peaks:
+        is_apart = all(abs(index - other) > 2 * SEARCH.zero_padding for other in chosen)
+        if is_apart and len(chosen) < SEARCH.most_peaks:
             chosen.append(int(index))
     return chosen
 
@@ -316,7 +324,7 @@ def _largest_peaks(power: FloatArray) -> list[int]:
 
 
 def parameter_grid(
-    term: EffectTerm, peaks: Sequence[float] = (), *, fine: bool = True
+    term: EffectTerm, peaks: Sequence[float] = (), *, with_small_magnitude: bool = True
 ) -> Iterator[FloatArray]:
     """Yield the points of a grid of an effect's scaled parameters (E,), for a screen.
 
@@ -329,7 +337,7 @@ def parameter_grid(
         The effect at its place.
     peaks : sequence of float
         The frequencies of peaks in the residuals, over the first natural frequency.
-    fine : bool
+    with_small_magnitude : bool
         Whether a magnitude that may be negative is tried at a small value too.
     """
     other_parameter_count = sum(not parameter.magnitude for parameter in term.parameters)
@@ -340,7 +348,11 @@ def parameter_grid(
     has_magnitude = False
     for parameter in term.parameters:
         if parameter.magnitude:
-            axes.append(_magnitude_levels(parameter, is_first=not has_magnitude, fine=fine))
+            axes.append(
+                _magnitude_levels(
+                    parameter, is_first=not has_magnitude, with_small_magnitude=with_small_magnitude
+                )
+            )
             has_magnitude = True
         elif parameter.name == term.effect.spectral and peaks:
             scaled_peaks = [
@@ -358,21 +370,32 @@ def parameter_grid(
 
 
 def _magnitude_levels(
-    parameter: EffectParameter | ShapeParameter, *, is_first: bool, fine: bool
+    parameter: EffectParameter | ShapeParameter, *, is_first: bool, with_small_magnitude: bool
 ) -> tuple[float, ...]:
-    """Return the scaled values of a magnitude in the grid.
+    """Return the scaled values at which a magnitude is tried in the grid.
 
-    The first magnitude of an effect needs fewer values, as it only scales the change. A magnitude
-    is signed if the median of its prior is zero.
+    Parameters
+    ----------
+    parameter : EffectParameter or ShapeParameter
+        The magnitude.
+    is_first : bool
+        Whether it is the first magnitude of its effect. The screen finds the best factor on that
+        one, of either sign, so that it needs fewer values than others.
+    with_small_magnitude : bool
+        Whether a first magnitude that may be negative is tried at a small value too.
     """
-    is_signed = parameter.prior.value(0.0) == 0.0
-    if parameter.levels and is_first:
+    has_own_levels = parameter.levels > 0
+    if has_own_levels and is_first:
         return _prior_quantiles(parameter)
-    if not is_signed:
+    # the prior of a magnitude that may have both signs has the median zero
+    may_be_negative = parameter.prior.value(0.0) == 0.0
+    if not may_be_negative:
         return (0.0,)
     if not is_first:
         return (-1.0, 0.0, 1.0)
-    return (1.0, SEARCH.linear) if fine else (1.0,)
+    if with_small_magnitude:
+        return (1.0, SEARCH.small_magnitude)
+    return (1.0,)
 
 
 def _prior_quantiles(parameter: EffectParameter | ShapeParameter) -> tuple[float, ...]:

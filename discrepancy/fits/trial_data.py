@@ -1,7 +1,7 @@
 """Trials with all that is needed to compare them with a model: noise, used samples, and unknowns.
 
 Each unknown is a scaled variable u with the prior N(0, 1), or a flat prior if nothing is known of
-it. Its value is centre + scale u. *Global* unknowns have the same value in all hypotheses and
+it. Its value is centre + scale u. *Shared* unknowns have the same value in all hypotheses and
 trials: calibrated parameters and gains of channels. *Local* unknowns belong to one trial: zeros of
 its channels, an unknown initial state, the time of release of a ring-down, constants to be added to
 recorded inputs, and uncertain health (stiffness losses).
@@ -29,7 +29,7 @@ from discrepancy.campaign.records import (
 from discrepancy.system.interface import Model
 from discrepancy.system.response import Conditions
 
-FREE_MOTION = 3.0
+FREE_STATE_DEVIATION = 3.0
 """Prior deviation of a free initial state, in units of the release displacement."""
 LEAST_LOSS = -0.5
 """Lower limit of an uncertain stiffness loss. A loss below zero has no physical meaning. But with a
@@ -56,7 +56,7 @@ class ScaledPrior(NamedTuple):
 
 
 @dataclass(frozen=True)
-class GlobalUnknowns:
+class SharedUnknowns:
     """The layout of the unknowns that all hypotheses and trials share.
 
     First come the P calibrated parameters, then the gains of channels.
@@ -87,23 +87,23 @@ class GlobalUnknowns:
     fixed_gain: dict[str, float]
 
     @property
-    def size(self) -> int:
-        """The number Q of global unknowns."""
+    def unknown_count(self) -> int:
+        """The number Q of shared unknowns."""
         return len(self.scale)
 
     @property
-    def count(self) -> int:
+    def parameter_count(self) -> int:
         """The number P of calibrated parameters."""
         return len(self.low)
 
     @cached_property
-    def ends(self) -> FloatArray:
+    def bounds(self) -> FloatArray:
         """The least and largest value of each scaled variable, (2, Q).
 
         They come from the ranges of the calibrated parameters; gains have no limits.
         """
-        scaled_ends = np.tile([[-inf], [inf]], self.size)
-        uncertain = np.flatnonzero(self.scale[: self.count])
+        scaled_ends = np.tile([[-inf], [inf]], self.unknown_count)
+        uncertain = np.flatnonzero(self.scale[: self.parameter_count])
         physical_ends = np.array([self.low, self.high])
         centre = self.centre[uncertain]
         scaled_ends[:, uncertain] = (physical_ends[:, uncertain] - centre) / self.scale[uncertain]
@@ -111,11 +111,11 @@ class GlobalUnknowns:
 
     def parameters(self, u: FloatArray) -> FloatArray:
         """Return the calibrated parameters (P,) within their ranges, given scaled values u (Q,)."""
-        return np.clip((self.centre + self.scale * u)[: self.count], self.low, self.high)
+        return np.clip((self.centre + self.scale * u)[: self.parameter_count], self.low, self.high)
 
     def gains(self, u: FloatArray, channels: tuple[str, ...]) -> FloatArray:
         """Return the gain errors (C,) of channels, given the scaled variables u (Q,)."""
-        values = (self.centre + self.scale * u)[self.count :]
+        values = (self.centre + self.scale * u)[self.parameter_count :]
         gains = self.fixed_gain | dict(zip(self.gain_channels, values, strict=True))
         return np.array([gains.get(name, 0.0) for name in channels])
 
@@ -156,30 +156,30 @@ class LocalUnknowns:
     health_columns: IntArray
 
     @property
-    def size(self) -> int:
+    def unknown_count(self) -> int:
         """The number L of local unknowns."""
         return len(self.scale)
 
     @property
-    def zeros(self) -> int:
+    def zero_count(self) -> int:
         """The number Z of unknown zeros."""
         return len(self.zero_columns)
 
     @cached_property
-    def ends(self) -> list[int]:
+    def ends_by_kind(self) -> list[int]:
         """The index after the last of the zeros, initial state, input constants, and time zero."""
         counts = (
-            self.zeros,
+            self.zero_count,
             prod(self.initial_shape),
             len(self.offset_inputs),
             int(self.has_time_zero),
         )
         return list(accumulate(counts))
 
-    def zero(self, u: FloatArray, columns: int) -> FloatArray:
+    def channel_zeros(self, u: FloatArray, channel_count: int) -> FloatArray:
         """Return the zeros (C,) of the trial's channels, given the scaled variables u (L,)."""
-        values = np.zeros(columns)
-        values[self.zero_columns] = (self.scale * u)[: self.zeros]
+        values = np.zeros(channel_count)
+        values[self.zero_columns] = (self.scale * u)[: self.zero_count]
         return values
 
     def conditions(self, trial: Trial, parameters: FloatArray, u: FloatArray) -> Conditions:
@@ -195,7 +195,7 @@ class LocalUnknowns:
             The scaled variables of the trial.
         """
         _, initial_entries, input_constants, time_zero, loss_changes = np.split(
-            self.scale * u, self.ends
+            self.scale * u, self.ends_by_kind
         )
         rows, width = self.initial_shape
         initial = np.zeros((rows, 2))
@@ -214,9 +214,9 @@ class LocalUnknowns:
         return Conditions(parameters, initial, times, health, tuple(offset.tolist()))
 
 
-def global_unknowns(
-    campaign: Campaign, model: Model, trials: tuple[Trial, ...], data_over_model: dict[str, float]
-) -> GlobalUnknowns:
+def shared_unknowns(
+    campaign: Campaign, model: Model, trials: tuple[Trial, ...], gain_estimates: dict[str, float]
+) -> SharedUnknowns:
     """Return the layout of the unknowns that all hypotheses and trials share.
 
     Parameters
@@ -227,7 +227,7 @@ def global_unknowns(
         The model with its calibrated parameters.
     trials : tuple of Trial
         The trials that are fitted; only gains of channels in them are unknowns.
-    data_over_model : dict of str to float
+    gain_estimates : dict of str to float
         The ratio of readings to model for channels of unknown scale: a first estimate of 1 + gain.
     """
     priors = [ScaledPrior(*prior, 1.0) for prior in model.stated(campaign)]
@@ -237,7 +237,7 @@ def global_unknowns(
     for name, channel in campaign.channels.items():
         if name not in used_channels or channel.gain_deviation == 0.0:
             continue
-        estimate = data_over_model.get(name, 1.0) - 1.0
+        estimate = gain_estimates.get(name, 1.0) - 1.0
         has_unknown_scale = isinf(channel.gain_deviation)
         if has_unknown_scale and channel.quantity is Quantity.SIGNAL and not fixed_gain:
             # amplitudes of releases and an unknown gain cannot both be fitted: fix the first gain
@@ -252,7 +252,7 @@ def global_unknowns(
     centre, scale, precision = np.array(priors, dtype=np.float64).reshape(-1, 3).T
     ranges = [(parameter.low, parameter.high) for parameter in model.parameters]
     low, high = np.array(ranges, dtype=np.float64).reshape(-1, 2).T
-    return GlobalUnknowns(
+    return SharedUnknowns(
         centre=centre,
         scale=scale,
         precision=precision,
@@ -294,14 +294,14 @@ def local_unknowns(
     time_zero_scale = np.zeros(0)
     if release is not None:
         initial_shape = (release.mode_count, 1 if release.at_rest else 2)
-        deviation_of_entries = release.deviation if release.at_rest else FREE_MOTION
+        deviation_of_entries = release.deviation if release.at_rest else FREE_STATE_DEVIATION
         initial_scale = np.full(prod(initial_shape), deviation_of_entries)
         if release.time_zero_deviation > 0.0:
             time_zero_scale = np.full(1, release.time_zero_deviation)
     elif trial.begins is Start.UNKNOWN:
         sizes = model.initial_sizes(campaign, trial)
         initial_shape = (-(-len(sizes) // 2), 2)  # rounded up
-        initial_scale = FREE_MOTION * np.pad(sizes, (0, len(sizes) % 2))
+        initial_scale = FREE_STATE_DEVIATION * np.pad(sizes, (0, len(sizes) % 2))
     # constants of inputs
     offset_deviations = np.array([recorded.offset_deviation for recorded in trial.inputs])
     offset_inputs = np.flatnonzero(offset_deviations > 0.0)
@@ -341,24 +341,24 @@ class TrialData:
     deviation : (C,) array
         The noise standard deviation s0 of each column [unit of the channel]. If the column is
         whitened, it is that of the whitened samples.
-    groups : (C,) array of int
-        The index of each column's channel among those of the campaign.
+    channel_indices : (C,) array of int
+        The index, among the channels of the campaign, of the channel of each column.
     unknowns : LocalUnknowns
         The layout of the unknowns of this trial.
     weight : (N, C) array
         1 for a sample that is compared with the model, else 0.
-    noise : tuple of NoiseModel
+    noise_models : tuple of NoiseModel
         The noise model of each column.
     """
 
     trial: Trial
     deviation: FloatArray
-    groups: IntArray
+    channel_indices: IntArray
     unknowns: LocalUnknowns
     weight: FloatArray
-    noise: tuple[NoiseModel, ...]
+    noise_models: tuple[NoiseModel, ...]
 
-    def standardised(self, columns: FloatArray) -> FloatArray:
+    def standardise(self, columns: FloatArray) -> FloatArray:
         """Return readings or their derivatives in units of the noise, whitened.
 
         Parameters
@@ -373,14 +373,18 @@ class TrialData:
             0 for samples that are not compared.
         """
         scaled = columns / self.deviation
-        for number, noise in enumerate(self.noise):
+        for number, noise in enumerate(self.noise_models):
             if noise.applies(self.trial.whitened_at):
                 scaled[..., number] = noise.whiten(scaled[..., number], self.trial.whitened_at)
         return np.asarray(scaled * self.weight)
 
     @classmethod
     def prepare(
-        cls, campaign: Campaign, trial: Trial, models: Mapping[str, NoiseModel], model: Model
+        cls,
+        campaign: Campaign,
+        trial: Trial,
+        models_by_channel: Mapping[str, NoiseModel],
+        model: Model,
     ) -> "TrialData":
         """Return a trial with its noise, its unknowns, and the samples that are compared.
 
@@ -390,16 +394,18 @@ class TrialData:
             The campaign of the trial.
         trial : Trial
             The trial.
-        models : mapping of str to NoiseModel
+        models_by_channel : mapping of str to NoiseModel
             The noise model of each channel.
         model : Model
             The model that the trial is compared with.
         """
         channel_names = list(campaign.channels)
-        noise = tuple(models[name] for name in trial.channels)
-        is_whitened = [channel_noise.applies(trial.whitened_at) for channel_noise in noise]
-        sample_deviation = [channel_noise.static_deviation for channel_noise in noise]
-        innovation_deviation = [channel_noise.standard_deviation for channel_noise in noise]
+        noise_models = tuple(models_by_channel[name] for name in trial.channels)
+        # a coloured noise is whitened if its coefficients hold for the sampling interval of the
+        # trial; the whitened samples then have the deviation of its innovations
+        is_whitened = [noise.applies(trial.whitened_at) for noise in noise_models]
+        sample_deviation = [noise.static_deviation for noise in noise_models]
+        innovation_deviation = [noise.standard_deviation for noise in noise_models]
         deviation = trial.noise_factor * np.where(
             is_whitened, innovation_deviation, sample_deviation
         )
@@ -407,16 +413,16 @@ class TrialData:
         # is not compared if one of them is left out
         weight = trial.used.astype(np.float64)
         for column in np.flatnonzero(is_whitened):
-            order = len(noise[column].autoregression)
+            order = len(noise_models[column].autoregression)
             for row in np.flatnonzero(~trial.used[:, column]):
                 weight[row : row + order + 1, column] = 0.0
         return cls(
             trial=trial,
             deviation=deviation,
-            groups=np.array([channel_names.index(name) for name in trial.channels]),
+            channel_indices=np.array([channel_names.index(name) for name in trial.channels]),
             unknowns=local_unknowns(campaign, trial, deviation, model),
             weight=weight,
-            noise=noise,
+            noise_models=noise_models,
         )
 
 

@@ -40,7 +40,11 @@ def verdict_under_coloured_noise(comparison: SimulationComparison) -> VerdictOut
         return _nothing_under_coloured_noise(
             conclusion, no_effect, no_effect_gate, probability_of_none
         )
-    if not best.candidate.terms or best.candidate.is_family or not _leaves_recorded_colour(best):
+    if (
+        not best.candidate.terms
+        or best.candidate.has_free_shape
+        or not _leaves_recorded_colour(best)
+    ):
         return None
     probability = comparison.probability(best)
     held_out_residuals = comparison.residuals(replace(best, residual_process=None))

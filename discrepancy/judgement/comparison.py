@@ -18,13 +18,13 @@ from scipy.stats import chi2
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, CandidateKey, EffectTerm, Point
-from discrepancy.fits.fitting import CandidateFit, attempt
-from discrepancy.fits.gates import ABSOLUTE_LEVEL, check_absolute_fit
+from discrepancy.fits.fitting import CandidateFit, try_fit
+from discrepancy.fits.gates import ABSOLUTE_FIT_LEVEL, check_absolute_fit
 from discrepancy.fits.predictive import residual_set
 from discrepancy.location.residuals import ResidualSet
 from discrepancy.missing_force.gap_share import GapShare
 from discrepancy.proof_record import ClosedShare
-from discrepancy.search.starts import acts_within
+from discrepancy.search.starts import changes_structure
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
 from discrepancy.verdict import Gate
@@ -140,7 +140,7 @@ class Comparison(ABC, Generic[H]):
         simulation = self.search.exact_fits.get(hypothesis.candidate.key)
         if simulation is None:
             start = self.start_point(hypothesis)
-            simulation = attempt(self.problem, hypothesis.candidate, start)
+            simulation = try_fit(self.problem, hypothesis.candidate, start)
         if simulation is None:
             return False
         return check_absolute_fit(self.problem, simulation).passed is not False
@@ -186,20 +186,20 @@ class Comparison(ABC, Generic[H]):
         """
         if self.has_held_out:
             held_out_share = self.share(hypothesis, held_out=True)
-            if held_out_share.tested:
+            if held_out_share.is_tested:
                 return held_out_share
         return self.share(hypothesis, held_out=False)
 
     def acts_on_structure(self, term: EffectTerm) -> bool:
         """Return whether an effect changes the structure or its loads, and not only readings."""
-        return acts_within(term.effect, self.problem.setting)
+        return changes_structure(term.effect, self.problem.setting)
 
     def objection(self, hypothesis: H) -> str:
         """Return the reason why a hypothesis may not be named; empty if it may be named."""
         candidate = hypothesis.candidate
         if not any(self.acts_on_structure(term) for term in candidate.terms):
             return "it describes readings, causes nothing and leaves more than noise"
-        if candidate.is_family and len(candidate.terms) > 1:
+        if candidate.has_free_shape and len(candidate.terms) > 1:
             return "beside another law a shape of its own imitates nearly anything"
         fitted_share = self.share(hypothesis, held_out=False)
         if _is_small(fitted_share, self.least_low_end):
@@ -223,12 +223,12 @@ class Comparison(ABC, Generic[H]):
         shared = self.problem.shared
         has_prior = shared.precision > 0.0
         indices_by_kind = {
-            "calibrated parameters": slice(shared.count),
-            "gains": slice(shared.count, None),
+            "calibrated parameters": slice(shared.parameter_count),
+            "gains": slice(shared.parameter_count, None),
         }
         for kind, indices in indices_by_kind.items():
             u = hypothesis.shared[indices][has_prior[indices]]
-            if u.size and chi2.sf(u @ u / SEARCH.widened**2, u.size) < ABSOLUTE_LEVEL:
+            if u.size and chi2.sf(u @ u / SEARCH.widened**2, u.size) < ABSOLUTE_FIT_LEVEL:
                 return kind
         return ""
 
@@ -246,7 +246,7 @@ class Comparison(ABC, Generic[H]):
             The least lower end of the interval of its share in held-out trials.
         """
         share = self.share(hypothesis, held_out=True)
-        if share.tested:
+        if share.is_tested:
             return not _is_small(share, least_low_end)
         return share.value > LEAST_CONTRADICTING
 
@@ -278,7 +278,7 @@ class Comparison(ABC, Generic[H]):
 
         It is None if these terms cannot be fitted alone.
         """
-        candidate, effect = hypothesis.candidate.subset(numbers, hypothesis.effect)
+        candidate, effect = hypothesis.candidate.subset_of_terms(numbers, hypothesis.effect)
         key = candidate.key
         for known in self.ranked:
             if known.candidate.key == key:
@@ -375,7 +375,7 @@ class Comparison(ABC, Generic[H]):
             is_same_family = families_at_places(hypothesis) == families_at_places(best)
             is_longer = len(candidate.terms) > len(best.candidate.terms)
             # the same law with a free shape is no other cause, and more effects are no simpler one
-            if (candidate.is_family and is_same_family) or is_longer:
+            if (candidate.has_free_shape and is_same_family) or is_longer:
                 continue
             if self.score(hypothesis) <= least_competing_score:
                 continue

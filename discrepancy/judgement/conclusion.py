@@ -118,7 +118,7 @@ class Conclusion:
         no_effect = search.compared_no_effect
         log_bayes_factor = float(best.log_evidence - log_places - no_effect.log_evidence)
         hypotheses = [
-            WeightedHypothesis(search.best_of(names), probability)
+            WeightedHypothesis(search.best_fit_of_set(names), probability)
             for names, probability in probabilities.items()
         ]
         return cls(search, log_bayes_factor, hypotheses)
@@ -267,7 +267,7 @@ def hypothesis_record(
     freedom = nan
     if isinstance(hypothesis, CandidateFit):
         chi_square = hypothesis.chi_square
-        freedom = float(problem.counts.sum() - hypothesis.spent.sum())
+        freedom = float(problem.sample_counts.sum() - hypothesis.absorbed_freedom.sum())
     return Hypothesis(
         effects=named_effects(problem, hypothesis),
         log_evidence=hypothesis.log_evidence,
@@ -286,7 +286,7 @@ def named_effects(problem: Problem, hypothesis: ComparedHypothesis) -> tuple[Nam
     low, high = _scaled_interval(hypothesis)
     first_parameter = 0
     effects = []
-    for term, values in hypothesis.candidate.split(hypothesis.effect):
+    for term, values in hypothesis.candidate.split_by_term(hypothesis.effect):
         estimates = []
         for index, parameter in enumerate(term.parameters):
             bounds = (float(low[first_parameter + index]), float(high[first_parameter + index]))
@@ -350,8 +350,8 @@ def calibrated_parameters(
     """Return the calibrated parameters of the model in a hypothesis, within their ranges."""
     layout = problem.shared
     values = layout.parameters(hypothesis.shared)
-    variances = np.diag(hypothesis.covariance)[: layout.count]
-    deviations = layout.scale[: layout.count] * np.sqrt(np.maximum(variances, 0.0))
+    variances = np.diag(hypothesis.covariance)[: layout.parameter_count]
+    deviations = layout.scale[: layout.parameter_count] * np.sqrt(np.maximum(variances, 0.0))
     parameters = []
     for parameter, value, deviation in zip(
         problem.model.parameters, values, deviations, strict=True

@@ -176,14 +176,14 @@ def _projected_directions(
     group : mapping of str to Direction
         The directions by their names.
     """
-    sign = screen.sign
+    sign = screen.inner_product_signs
     labels = []
     vectors = []
     scores = []
     for label, direction in group.items():
         changes = {}
         for number, change in direction.items():
-            changes[number] = problem.trials[number].standardised(change)
+            changes[number] = problem.trials[number].standardise(change)
         vector, score, _ = screen.project(changes)
         length = float(np.linalg.norm(vector[sign > 0.0]))
         if length > 0.0:
@@ -220,12 +220,12 @@ def _noise_freedom(
     for direction in group:
         for number, change in direction.items():
             is_changed = np.any(change != 0.0, axis=0)
-            channels.update(problem.trials[number].groups[is_changed].tolist())
+            channels.update(problem.trials[number].channel_indices[is_changed].tolist())
     channel_numbers = sorted(channels)
-    freedom = problem.freedom[channel_numbers] + problem.counts[channel_numbers]
+    freedom = problem.record_freedom[channel_numbers] + problem.sample_counts[channel_numbers]
     if np.any(np.isinf(freedom)):
         return _NoiseFreedom(np.inf, 1.0)
-    residual_freedom = float(np.sum(freedom - fit.spent[channel_numbers]))
+    residual_freedom = float(np.sum(freedom - fit.absorbed_freedom[channel_numbers]))
     return _NoiseFreedom(residual_freedom, residual_freedom / float(freedom.sum()))
 
 
@@ -439,7 +439,7 @@ def _zero_scale(problem: Problem, quantity: Quantity) -> float:
     deviations = []
     for channel in problem.campaign.channels.values():
         if channel.quantity is quantity:
-            deviations.append(problem.noise[channel.name].static_deviation)
+            deviations.append(problem.noise_models[channel.name].static_deviation)
     return min(deviations)
 
 
@@ -479,7 +479,7 @@ def _own_channels(problem: Problem, fit: CandidateFit) -> Sequence[str]:
 
 def _own_channel(problem: Problem, term: EffectTerm) -> str:
     """Return the only sensor channel that a term acts on; empty if it acts on anything else."""
-    patch = term.patch(problem.setting, term.start() + 1.0)
+    patch = term.patch(problem.setting, term.start_values() + 1.0)
     if not all(isinstance(primitive, SENSORS) for primitive in patch):
         return ""
     channels = {getattr(primitive, "channel", "") for primitive in patch}

@@ -141,12 +141,12 @@ def _channel_derivatives(
         if name not in data.trial.channels:
             continue
         column = data.trial.channels.index(name)
-        response = problem.response_with(number, no_effect.point, no_effect.candidate)
+        response = problem.response_of_candidate(number, no_effect.point, no_effect.candidate)
         by_nuisance = np.ones_like(response) if nuisance is _ZERO else response
         derivatives.append(
             _ChannelDerivative(
                 residual=no_effect.residuals[number][:, column],
-                derivative=data.standardised(by_nuisance)[:, column],
+                derivative=data.standardise(by_nuisance)[:, column],
             )
         )
     return derivatives
@@ -169,9 +169,9 @@ def _closed_share(
     campaign = replace(problem.campaign, channels=channels)
     setting = replace(problem.setting, campaign=campaign)
     free_problem = Problem(campaign, problem.model, setting)
-    free_fit = fit(free_problem, Candidate(), free_problem.start(Candidate()))
+    free_fit = fit(free_problem, Candidate(), free_problem.prior_mean_point(Candidate()))
     free_fit = refit_from_first_readings(free_problem, free_fit)
-    reading_count = float(problem.counts.sum())
+    reading_count = float(problem.sample_counts.sum())
     excess_before = no_effect.chi_square - reading_count
     if excess_before <= 0.0:
         return 0.0

@@ -47,7 +47,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
     @property
     def no_effect(self) -> ForceHypothesis:
         """The hypothesis of free missing forces without any law."""
-        return self.force_search.whole
+        return self.force_search.hypothesis_of_all_ports
 
     @property
     def ranked(self) -> Sequence[ForceHypothesis]:
@@ -56,14 +56,16 @@ class ForceComparison(Comparison[ForceHypothesis]):
 
     def _gap_share(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
         """Return the share of the missing force that a hypothesis explains."""
-        return self._force_shares.share_of(hypothesis, held_out=held_out)
+        return self._force_shares.gap_share(hypothesis, held_out=held_out)
 
     def fit_followed(self, candidate: Candidate, effect: FloatArray) -> ForceHypothesis | None:
         """Return the fit of a further candidate, from scaled effect parameters (E,).
 
         None if the candidate cannot be fitted.
         """
-        return self.force_search.followed(self.force_search.whole, candidate, effect)
+        return self.force_search.fit_along_motion(
+            self.force_search.hypothesis_of_all_ports, candidate, effect
+        )
 
     def with_free_shape(self, hypothesis: ForceHypothesis) -> ForceHypothesis | None:
         """Return the hypothesis of a single law with its shape free; None if there is none."""
@@ -73,7 +75,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
 
     def start_point(self, hypothesis: ForceHypothesis) -> Point:
         """Return the values of all unknowns of a hypothesis as fitted to the missing force."""
-        return self.force_search.whole_point(hypothesis)
+        return self.force_search.point_with_effects(hypothesis)
 
     def failed_check(self, hypothesis: ForceHypothesis) -> str:
         """Return an empty reason, as there are no further tests with a missing force."""
@@ -116,7 +118,7 @@ class ForceComparison(Comparison[ForceHypothesis]):
 
     def gap_sentence(self) -> str:
         """Return a sentence on the size and port of the missing force, and on what it depends."""
-        missing = missing_force(self.force_search, self.force_search.best())
+        missing = missing_force(self.force_search, self.force_search.hypothesis_of_best_port())
         if missing is None:
             return ""
         force = missing.at_port

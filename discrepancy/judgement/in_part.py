@@ -79,7 +79,7 @@ def _missing_force_vanishes(search: Search) -> bool:
     trials are in motion, as trials at rest show no missing force, and if every channel has a noise
     record.
     """
-    if not search.is_all_in_motion or not np.all(search.problem.freedom > 0.0):
+    if not search.is_all_in_motion or not np.all(search.problem.record_freedom > 0.0):
         return False
     simulations = [fit for fit in search.exact_fits.values() if fit.candidate.terms]
     scores = [search.score_under_recorded_noise(fit) for fit in simulations]

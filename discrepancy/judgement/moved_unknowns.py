@@ -67,7 +67,7 @@ def _gains(problem: Problem, fit: CandidateFit) -> list[MovedUnknown]:
     shared = problem.shared
     unknowns = []
     for gain_number, channel in enumerate(shared.gain_channels):
-        shared_number = shared.count + gain_number
+        shared_number = shared.parameter_count + gain_number
         if shared.precision[shared_number] > 0.0:
             u = float(fit.point.shared[shared_number])
             scale = float(shared.scale[shared_number])
@@ -81,7 +81,7 @@ def _zeros_and_constants(problem: Problem, fit: CandidateFit) -> list[MovedUnkno
     for data, local in zip(problem.trials, fit.point.local, strict=True):
         layout = data.unknowns
         names_and_units = _names_of_zeros_and_constants(problem, data)
-        zeros_end, initial_end, inputs_end, _ = layout.ends
+        zeros_end, initial_end, inputs_end, _ = layout.ends_by_kind
         numbers = [*range(zeros_end), *range(initial_end, inputs_end)]
         for (name, unit), number in zip(names_and_units, numbers, strict=True):
             if layout.precision[number] > 0.0:

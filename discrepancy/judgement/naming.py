@@ -5,10 +5,10 @@ from dataclasses import replace
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.predictive import residual_set
 from discrepancy.fits.problem import Problem
-from discrepancy.search.starts import OnProgress, acts_within, no_progress
+from discrepancy.search.starts import OnProgress, changes_structure, ignore_progress
 from discrepancy.search.strategy import Search
 from discrepancy.search.whole_search import OnSearch, ignore_search, search
 from discrepancy.search_settings import SEARCH
@@ -34,7 +34,7 @@ INSTRUMENTS = (LoadGain, *SENSORS)
 def reach_verdict(
     problem: Problem,
     effects: Sequence[Effect],
-    on_progress: OnProgress = no_progress,
+    on_progress: OnProgress = ignore_progress,
     on_search: OnSearch = ignore_search,
 ) -> VerdictOutcome:
     """Return the verdict on a campaign: what the model lacks, named if that is possible.
@@ -77,7 +77,7 @@ def _searched_verdict(
         return first
     on_progress("nothing follows the missing force: comparing whole simulations")
     # the first search may have refined the time steps, so fit again
-    no_effect = attempt(problem, Candidate(), first_search.no_effect.point)
+    no_effect = try_fit(problem, Candidate(), first_search.no_effect.point)
     second_search = Search(
         problem, first_search.effects, no_effect or first_search.no_effect, on_progress=on_progress
     )
@@ -90,7 +90,7 @@ def _searched_verdict(
     is_named = second.verdict.kind is VerdictKind.NAMED_IN_PART
     has_law = any(_acts_on_structure(problem, second.fit))
     # held-out trials alone are not enough: most of the gap in fitted trials must be closed too
-    count = float(problem.counts.sum())
+    count = float(problem.sample_counts.sum())
     gap = second_search.no_effect.chi_square - count
     remaining = second.fit.chi_square - count
     closes_gap = gap > 0.0 and remaining < (1.0 - SEARCH.least_share) * gap
@@ -99,7 +99,7 @@ def _searched_verdict(
 
 def _acts_on_structure(problem: Problem, fit: CandidateFit) -> list[bool]:
     """Return for each effect of a fit whether it changes the structure, and not only readings."""
-    return [acts_within(term.effect, problem.setting) for term in fit.candidate.terms]
+    return [changes_structure(term.effect, problem.setting) for term in fit.candidate.terms]
 
 
 def _verdict_on_search(search: Search) -> VerdictOutcome:
@@ -149,7 +149,7 @@ def verdict_by_simulations(search: Search) -> VerdictOutcome:
         rough = [names for names in most_probable_sets(probabilities) if names not in exact]
         if not rough:
             break
-        search.fit_exactly(search.best_of(rough[0]))
+        search.fit_exactly(search.best_fit_of_set(rough[0]))
         probabilities = search.set_probabilities()
     return decide(Case(search, probabilities))
 

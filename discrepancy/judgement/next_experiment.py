@@ -120,8 +120,8 @@ def mutual_information(
     trial_problem = problem.with_trials((proposal.trial,), model)
     # without a noise record, the rms residual of the most probable hypothesis, which is the first,
     # is taken for the noise deviation; a precision is (recorded / actual deviation)^2
-    recorded_over_residual = np.sqrt(problem.precisions(fits[0].sums))
-    noise_scale = np.where(problem.freedom > 0.0, 1.0, recorded_over_residual)
+    recorded_over_residual = np.sqrt(problem.noise_precisions(fits[0].squares_by_channel))
+    noise_scale = np.where(problem.record_freedom > 0.0, 1.0, recorded_over_residual)
     predictions = [_predicted_trial(trial_problem, fit, noise_scale) for fit in fits]
     gaussians = _reduced(predictions, weights)
     return _information_of(gaussians, weights)
@@ -160,7 +160,7 @@ def _predicted_trial(
         The recorded noise deviation of each channel, divided by the actual one.
     """
     data = trial_problem.trials[0]
-    local_count = data.unknowns.size
+    local_count = data.unknowns.unknown_count
     # the trial's own unknowns are at their prior means: no reading has determined them
     point = Point(fit.point.shared, (np.zeros(local_count),), fit.point.effect)
     derivatives = trial_problem.linearise(0, point, fit.candidate)
@@ -168,13 +168,13 @@ def _predicted_trial(
         0, point, derivatives, fit.candidate
     )
     # derivatives of the readings, by the trial's own unknowns first, in actual noise deviations
-    reading_scale = np.broadcast_to(noise_scale[data.groups], data.weight.shape).ravel()
+    reading_scale = np.broadcast_to(noise_scale[data.channel_indices], data.weight.shape).ravel()
     jacobian = (
-        data.standardised(by_unknowns).reshape(len(by_unknowns), reading_scale.size) * reading_scale
+        data.standardise(by_unknowns).reshape(len(by_unknowns), reading_scale.size) * reading_scale
     )
     local_jacobian, shared_jacobian = np.split(jacobian, [local_count])
     prediction = trial_problem.prediction(0, point, derivatives.response)
-    mean = data.standardised(prediction).ravel() * reading_scale
+    mean = data.standardise(prediction).ravel() * reading_scale
     # factors S of the covariance S^T S: with C = R R^T the posterior covariance of the shared
     # unknowns and J their derivatives, J^T C J = (R^T J)^T (R^T J); own unknowns are independent
     # with the variance 1 / precision

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from discrepancy.fits.fitting import CandidateFit, fit_free_shape
-from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit, check_shape
+from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit, check_shape
 from discrepancy.fits.predictive import with_draws
 from discrepancy.search.strategy import Search
 from discrepancy.search_settings import SEARCH
@@ -73,7 +73,7 @@ class Case:
         self.leading = next(iter(probabilities)) if leading is None else leading
         self.best = search.best()
         if self.leading:
-            self.best = search.fit_exactly(search.best_of(self.leading))
+            self.best = search.fit_exactly(search.best_fit_of_set(self.leading))
         self.conclusion = Conclusion.from_probabilities(search, self.best, probabilities)
         self.probability_of_none = probabilities.get((), 0.0)
         self.has_evidence = self.conclusion.log_bayes_factor >= SEARCH.bayes_factor
@@ -102,7 +102,9 @@ class Case:
         for names, probability in self.probabilities.items():
             if leading <= set(plain_names(names)):
                 total += probability
-        if self.best.candidate.is_family:  # one family is reached from several members or places
+        if (
+            self.best.candidate.has_free_shape
+        ):  # one family is reached from several members or places
             family = self.best.candidate.terms[0].effect.family
             total = max(total, _family_probability(self.search, family))
         return min(total, 1.0)
@@ -149,7 +151,7 @@ class Case:
     @property
     def family_fit(self) -> CandidateFit | None:
         """The fit with a free shape, if its evidence is enough to name the family instead."""
-        return self._best_free_shape if self.shape_gate.statistic > SHAPE_GAIN else None
+        return self._best_free_shape if self.shape_gate.statistic > LEAST_SHAPE_GAIN else None
 
     @property
     def all_gates(self) -> tuple[Gate, ...]:
@@ -157,7 +159,7 @@ class Case:
 
         The test of shape is left out if a shape is free already.
         """
-        if self.best.candidate.is_family:
+        if self.best.candidate.has_free_shape:
             return self.tested.absolute, self.tested.consistency
         return self.tested.absolute, self.shape_gate, self.tested.consistency
 
@@ -174,7 +176,7 @@ class Case:
         A law of free shape together with a second law could fit nearly anything.
         """
         candidate = self.best.candidate
-        family_fit = None if candidate.is_family else self.family_fit
+        family_fit = None if candidate.has_free_shape else self.family_fit
         patches = candidate.patches(self.problem.setting, self.best.effect)
         law_count = sum(len(patch.of(*INTERNAL_FORCES)) > 0 for patch in patches)
         if family_fit is None or law_count > 1 or len(patches) == SEARCH.largest_set:
@@ -233,7 +235,7 @@ class Case:
             return self._below_limit()
         members = []
         for names in self.probable_sets:
-            fit = self.search.fit_exactly(self.search.best_of(names))
+            fit = self.search.fit_exactly(self.search.best_fit_of_set(names))
             members.append(FittedMember(names, fit, check_absolute_fit(self.problem, fit)))
         # sets that fail the test are no members, and their probability is not counted
         fitting = [member for member in members if member.absolute.passed is not False]
@@ -334,7 +336,7 @@ class Case:
         reason = tested.absolute.reason
         if tested.absolute.passed is not False and tested.consistency.passed is False:
             reason = tested.consistency.reason
-        if self.best.candidate.is_family:
+        if self.best.candidate.has_free_shape:
             sentence = f"There is a gap that no effect of the catalogue fits. {reason}"
             gates = (tested.absolute, tested.consistency)
             return self._unexplained(sentence, self.probability, gates)
@@ -379,7 +381,7 @@ def decide(case: Case) -> VerdictOutcome:
     if not case.is_sure:
         return case.common_effects() or case.open()
     if case.passes:
-        return case.family() if case.best.candidate.is_family else case.named()
+        return case.family() if case.best.candidate.has_free_shape else case.named()
     family = case.tested_family
     if family is None or _any_fails((family.absolute, family.consistency)):
         return case.unfit()

@@ -117,7 +117,7 @@ def as_predicted(campaign: Campaign, model: Model, setting: Setting) -> Campaign
     point = prior_point_with_initial_states(problem)
     predictions = {}
     for number, data in enumerate(problem.trials):
-        response = problem.response_with(number, point, Candidate())
+        response = problem.response_of_candidate(number, point, Candidate())
         predictions[data.trial.name] = problem.prediction(number, point, response)
     trials: list[Trial] = []
     for trial in campaign.trials:
@@ -148,7 +148,7 @@ def prior_point_with_initial_states(problem: Problem) -> Point:
     FitError
         If the model gives numbers that are not finite.
     """
-    start = problem.start(Candidate())
+    start = problem.prior_mean_point(Candidate())
     if not any(has_free_initial_state(data.trial) for data in problem.trials):
         return start
     # parameters are fitted, too: with a wrong frequency the initial motion would fade out
@@ -198,7 +198,7 @@ def separability(
             reason = "The structure cannot carry it at any size that was tried."
             detectability.append(Detectability(effect, reason))
             continue
-        small = _SmallChange(*screen.shrunk(best))
+        small = _SmallChange(*screen.shrink_change(best))
         distance = min(best.squared_size, small.change.squared_size / small.factor**2)
         detectability.append(_detectability(effect, best, distance))
         if best.squared_size > LEAST_VISIBLE:
@@ -238,7 +238,7 @@ def _all_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
     """Return the changes by an effect over the grid of its parameters, at all its places."""
     changes: list[ScreenedChange] = []
     for place in effect.places(screen.problem.setting):
-        changes.extend(screen.changes(EffectTerm(effect, place)))
+        changes.extend(screen.changes_on_grid(EffectTerm(effect, place)))
     return changes
 
 
@@ -278,18 +278,18 @@ def _changes_at_prior_median(screen: Screen, effect: Effect) -> list[ScreenedCha
     changes = []
     for place in effect.places(screen.problem.setting):
         term = EffectTerm(effect, place)
-        start = term.start()
+        start = term.start_values()
         for number, parameter in enumerate(term.parameters):
             if parameter.magnitude and parameter.prior.value(0.0) == 0.0:
                 start[number] = 1.0
         with suppress(DiscrepancyError):
-            changes.append(screen.change(term, start))
+            changes.append(screen.change_by_effect(term, start))
     return changes
 
 
 def _has_reference_magnitude(change: ScreenedChange) -> bool:
     """Return whether the magnitudes of a change are those of `_changes_at_prior_median`."""
-    for parameter, u in zip(change.term.parameters, change.start, strict=True):
+    for parameter, u in zip(change.term.parameters, change.effect_values, strict=True):
         if parameter.magnitude and abs(u) not in (0.0, 1.0):
             return False
     return True
@@ -312,7 +312,7 @@ def _detectability(effect: Effect, change: ScreenedChange, distance: float) -> D
     """
     for number, parameter in enumerate(change.term.parameters):
         if parameter.magnitude:
-            typical = abs(parameter.prior.value(float(change.start[number])))
+            typical = abs(parameter.prior.value(float(change.effect_values[number])))
             detectable = typical * sqrt(DETECTED / distance) if distance > 0.0 else inf
             return Detectability(
                 effect=effect,
@@ -342,7 +342,8 @@ def _distances(screen: Screen, effects: Sequence[_VisibleEffect]) -> FloatArray:
         The distances, see `Separability.distance` [sigma^2].
     """
     small_options = [
-        [_SmallChange(*screen.shrunk(change)) for change in effect.options] for effect in effects
+        [_SmallChange(*screen.shrink_change(change)) for change in effect.options]
+        for effect in effects
     ]
     distance = np.zeros((len(effects), len(effects)))
     for i, effect in enumerate(effects):
@@ -378,7 +379,7 @@ def _squared_distance(
     options : sequence of ScreenedChange
         The changes by the effect over a grid of its parameters.
     """
-    sign = screen.sign
+    sign = screen.inner_product_signs
     if target.squared_size <= 0.0:
         return 0.0
 
@@ -393,11 +394,11 @@ def _squared_distance(
         return target.squared_size
     # spanning changes: the nearest option, and its differences by the parameters
     changes = [nearest.vector]
-    for number in range(len(nearest.start)):
-        stepped = nearest.start.copy()
+    for number in range(len(nearest.effect_values)):
+        stepped = nearest.effect_values.copy()
         stepped[number] += 10.0 * PARAMETER_STEP
         with suppress(DiscrepancyError):  # the option may be at the limit of the model
-            change = screen.change(nearest.term, stepped)
+            change = screen.change_by_effect(nearest.term, stepped)
             changes.append(change.vector - nearest.vector)
     # least squares by normal equations, scaled to unit length and regularised
     spanning_changes = np.stack(changes)

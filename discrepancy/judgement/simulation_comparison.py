@@ -7,11 +7,11 @@ import numpy as np
 
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate, CandidateKey, Point
-from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
-from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit
+from discrepancy.fits.fitting import CandidateFit, fit_free_shape, try_fit
+from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit
 from discrepancy.location.residuals import FittedTrial
 from discrepancy.missing_force.gap_share import OF_READINGS, GapShare
-from discrepancy.missing_force.shares import SHORTEST, WINDOWS
+from discrepancy.missing_force.shares import LEAST_BLOCK_SAMPLES, MOST_BLOCKS
 from discrepancy.search.starts import are_related
 from discrepancy.search.strategy import Search
 from discrepancy.search.wide_noise import refit_under_wide_noise, unrecorded_noise_levels
@@ -58,8 +58,8 @@ class SimulationComparison(Comparison[CandidateFit]):
         estimated from second differences.
         """
         problem = self.problem
-        has_record = problem.freedom > 0.0
-        precisions = problem.precisions(self.search.no_effect.sums)
+        has_record = problem.record_freedom > 0.0
+        precisions = problem.noise_precisions(self.search.no_effect.squares_by_channel)
         relative_variances = np.where(
             has_record, 1.0, precisions * unrecorded_noise_levels(problem, self.search.best())
         )
@@ -87,7 +87,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             sample_count = len(before.used)
             block_count = 1
             if before.trial.is_dynamic:
-                block_count = min(WINDOWS, max(1, sample_count // SHORTEST))
+                block_count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
             for block in np.array_split(np.arange(sample_count), block_count):
                 sums = [
                     float(squares[block].sum())
@@ -97,15 +97,15 @@ class SimulationComparison(Comparison[CandidateFit]):
             trial_count += 1
         sums_before, sums_after, noise_sums = np.array(blocks).T
         return GapShare(
-            before=sums_before,
-            after=sums_after,
-            noise=noise_sums,
+            squares_before=sums_before,
+            squares_after=sums_after,
+            noise_squares=noise_sums,
             held_out=held_out,
             trial_count=trial_count,
             remaining_rms=_rms_beyond_noise(sums_after, noise_sums),
             total_rms=_rms_beyond_noise(sums_before, noise_sums),
             kind=OF_READINGS,
-            tested=True,
+            is_tested=True,
         )
 
     def fit_followed(self, candidate: Candidate, effect: FloatArray) -> CandidateFit | None:
@@ -117,7 +117,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         fitted = self.search.exact_fits.get(candidate.key)
         if fitted is None:
             start = Point(no_effect.point.shared, no_effect.point.local, effect)
-            fitted = attempt(self.problem, candidate, start)
+            fitted = try_fit(self.problem, candidate, start)
         return None if fitted is None else self._under_wide_noise(fitted)
 
     def _under_wide_noise(self, fitted: CandidateFit) -> CandidateFit | None:
@@ -129,7 +129,7 @@ class SimulationComparison(Comparison[CandidateFit]):
         """Add laws of free shape to the compared fits, if the best hypothesis is a single law.
 
         The best law and those that are easily mistaken for it are fitted with a free shape. A fit
-        is added if its evidence is above that of the best law by more than `SHAPE_GAIN`.
+        is added if its evidence is above that of the best law by more than `LEAST_SHAPE_GAIN`.
         """
         best = self.search.best()
         if len(best.candidate.terms) != 1 or not self.acts_on_structure(best.candidate.terms[0]):
@@ -141,7 +141,7 @@ class SimulationComparison(Comparison[CandidateFit]):
             if wide_free is None:
                 continue
             self._free_shape_fits[single.candidate.key] = wide_free
-            if wide_free.log_evidence > best.log_evidence + SHAPE_GAIN:
+            if wide_free.log_evidence > best.log_evidence + LEAST_SHAPE_GAIN:
                 compared[wide_free.candidate.key] = wide_free
         self.search.wide_fits = compared
 
@@ -167,7 +167,7 @@ class SimulationComparison(Comparison[CandidateFit]):
 
     def with_free_shape(self, hypothesis: CandidateFit) -> CandidateFit | None:
         """Return the fit of a single law with its shape free; None if there is none."""
-        if hypothesis.candidate.is_family:
+        if hypothesis.candidate.has_free_shape:
             return hypothesis
         return self._free_shape_fits.get(hypothesis.candidate.key)
 

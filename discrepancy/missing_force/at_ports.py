@@ -15,14 +15,14 @@ from discrepancy.fits.problem import Problem
 from fe.runtime.laws.interface import PortForce
 from fe.runtime.patch import ModelPatch
 
-from .explained import NOTHING, ForceHypothesis, with_most_probable_forces
+from .explained import NO_EFFECTS, ForceHypothesis, fit_missing_forces
 from .filtered import Process
-from .hypotheses import ColumnBuilder, scaled
-from .view import View
+from .hypotheses import ColumnBuilder, scale_processes
+from .linear_trials import LinearTrials
 
 MOST_PORTS = 4
 """Largest number of ports at which forces are missing at once."""
-BESIDE = 0.1
+FURTHER_PORT_FACTOR = 0.1
 """Factor on the size of a further port's missing force, estimated alone, with which the search for
 all of them together begins."""
 
@@ -37,77 +37,83 @@ class MissingForces:
 
     Attributes
     ----------
-    at : dict of str to ForceHypothesis
-        The missing force at each port alone. It is estimated twice: first along the motion of the
-        model, for the initial states of the trials; then along the motion estimated so, with the
-        parameters linear about their estimates, and with the model's own laws.
+    hypothesis_by_port : dict of str to ForceHypothesis
+        The missing force at each port alone, by the name of the port. It is estimated twice: first
+        along the motion of the model, which gives the initial states of the trials; then along the
+        motion that was estimated first, with the model's own laws and with the parameters linear
+        about their first estimates.
     ports : tuple of str
         The names of the ports.
-    laws : ModelPatch
+    model_laws : ModelPatch
         The model's own laws at its ports, which its linear system does not contain.
     point : Point
         The unknowns about which the trials are linear.
-    columns : ColumnBuilder
-        The builder of the columns of effects in these trials.
+    column_builder : ColumnBuilder
+        The object that computes the columns of effects in these trials.
     """
 
     def __init__(self, problem: Problem) -> None:
-        linear_model, self.laws = problem.model.apart()
+        linear_model, self.model_laws = problem.model.apart()
         trials = tuple(data.trial for data in problem.trials)
         self.model = problem.model
         self.problem = problem.with_trials(trials, linear_model)
-        self.numbers = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
+        self.trial_indices = [k for k, data in enumerate(problem.trials) if data.trial.is_dynamic]
         self.ports = tuple(linear_model.ports)
-        self.at: dict[str, ForceHypothesis] = {}
-        self.point = self.problem.start(NOTHING)
-        view = self._linear_view()
+        self.hypothesis_by_port: dict[str, ForceHypothesis] = {}
+        # first estimate, along the motion of the model at the prior means
+        self.point = self.problem.prior_mean_point(NO_EFFECTS)
+        linear_trials = self._linearise_trials()
         for port, name in enumerate(self.ports):
             processes = self.prior_processes((port,))
-            self.at[name] = with_most_probable_forces(view, processes, processes)
-        self.point = self._point(self.best())
-        view = self._linear_view()
+            self.hypothesis_by_port[name] = fit_missing_forces(linear_trials, processes, processes)
+        # second estimate, about the unknowns of the best port
+        self.point = self._clipped_point(self.hypothesis_of_best_port())
+        linear_trials = self._linearise_trials()
         for port, name in enumerate(self.ports):
-            last_processes = self.at[name].processes
-            _, _, motions = view.smoothed(last_processes)
-            along_motion = self.columns.along(view, motions)
+            last_processes = self.hypothesis_by_port[name].processes
+            motions = linear_trials.smooth(last_processes).motions
+            along_motion = self.column_builder.trials_along_motions(linear_trials, motions)
             median = self.prior_processes((port,))
-            self.at[name] = with_most_probable_forces(along_motion, median, last_processes)
+            self.hypothesis_by_port[name] = fit_missing_forces(along_motion, median, last_processes)
 
     # ---------------------------------------------------------------- where a force is missing
 
     @cached_property
-    def whole(self) -> ForceHypothesis:
+    def hypothesis_of_all_ports(self) -> ForceHypothesis:
         """The missing forces at all ports at once.
 
         If there are more than `MOST_PORTS` ports, those with the most evidence are taken.
         """
-        best = self.best()
-        best_ports = sorted(self.at.values(), key=lambda at_port: -at_port.log_evidence)[
-            :MOST_PORTS
-        ]
+        best = self.hypothesis_of_best_port()
+        best_ports = sorted(
+            self.hypothesis_by_port.values(), key=lambda at_port: -at_port.log_evidence
+        )[:MOST_PORTS]
         if len(best_ports) == 1:
             return best
-        begin = dict(best.processes)
+        initial = dict(best.processes)
         for at_port in best_ports[1:]:
-            begin |= scaled(at_port.processes, BESIDE, 1.0)
-        view = best.view
-        # the second time along the motion that the first one has estimated
-        for near in (False, True):
-            median = self.prior_processes(begin)
-            hypothesis = with_most_probable_forces(view, median, begin, near=near)
-            view = self.columns.along(view, hypothesis.motions)
-            begin = dict(hypothesis.processes)
+            initial |= scale_processes(at_port.processes, FURTHER_PORT_FACTOR, 1.0)
+        linear_trials = best.linear_trials
+        # twice: the second estimate is along the motion of the first one
+        for skip_grid in (False, True):
+            median = self.prior_processes(initial)
+            hypothesis = fit_missing_forces(linear_trials, median, initial, skip_grid=skip_grid)
+            linear_trials = self.column_builder.trials_along_motions(
+                linear_trials, hypothesis.motions
+            )
+            initial = dict(hypothesis.processes)
         return hypothesis
 
-    def best(self) -> ForceHypothesis:
+    def hypothesis_of_best_port(self) -> ForceHypothesis:
         """Return the missing force at one port that has the largest evidence."""
-        return max(self.at.values(), key=lambda at_port: at_port.log_evidence)
+        return max(self.hypothesis_by_port.values(), key=lambda at_port: at_port.log_evidence)
 
     def prior_processes(self, ports: Iterable[int]) -> dict[int, Process]:
         """Return the prior medians of missing forces, by the number of the port.
 
-        The median size is 5 % of the elastic force at the port; the median time is that of a radian
-        of the vibration, or the duration of the trials if there is no frequency.
+        The median standard deviation is 5 % of the elastic force at the port. The median
+        correlation time is that of one radian of the vibration, or the duration of the trials if
+        the port has no frequency.
 
         Parameters
         ----------
@@ -122,12 +128,12 @@ class MissingForces:
             processes[port] = Process(0.05 * scale.stiffness * scale.displacement, 1.0 / rate)
         return processes
 
-    def own_laws(self, shared: FloatArray) -> ModelPatch:
+    def evaluate_model_laws(self, shared: FloatArray) -> ModelPatch:
         """Return the model's own laws at values (K,) of the shared unknowns."""
         parameters = self.problem.shared.parameters(shared)
         return self.model.own_laws(parameters) + self.model.patch.of(PortForce)
 
-    def whole_size(self, port: int) -> float:
+    def force_deviation(self, port: int) -> float:
         """Return the standard deviation of the missing force at a port without any effect.
 
         Its unit is N, N m or the port's flow. It is the prior median if no force was estimated
@@ -138,36 +144,36 @@ class MissingForces:
         port : int
             The number of the port.
         """
-        process = self.whole.processes.get(port)
+        process = self.hypothesis_of_all_ports.processes.get(port)
         if process is None:
             process = self.prior_processes((port,))[port]
-        return process.size
+        return process.standard_deviation
 
-    def rough(self, port: str) -> ForceHypothesis:
+    def hypothesis_with_jumps(self, port: str) -> ForceHypothesis:
         """Return the missing force at a port as a process that may jump.
 
-        The trials are made linear about the motion that it gives, twice.
+        The trials are linearised twice, the second time about the motion of the first estimate.
 
         Parameters
         ----------
         port : str
             The name of the port.
         """
-        hypothesis = self.at[port]
+        hypothesis = self.hypothesis_by_port[port]
         for _ in range(2):
-            self.point = self._point(hypothesis)
-            view = self._linear_view()
-            # the model's own laws and the motion depend on each other: twice
+            self.point = self._clipped_point(hypothesis)
+            linear_trials = self._linearise_trials()
+            # the model's own laws depend on the motion, and it on them: iterate twice
             for _ in range(2):
-                _, _, motions = view.smoothed(hypothesis.processes)
-                view = self.columns.along(view, motions)
-            begin = {}
-            for number, process in hypothesis.processes.items():
-                begin[number] = replace(process, rough=True)
-            hypothesis = with_most_probable_forces(view, self.prior_processes(begin), begin)
+                motions = linear_trials.smooth(hypothesis.processes).motions
+                linear_trials = self.column_builder.trials_along_motions(linear_trials, motions)
+            initial = {}
+            for port_number, process in hypothesis.processes.items():
+                initial[port_number] = replace(process, may_jump=True)
+            hypothesis = fit_missing_forces(linear_trials, self.prior_processes(initial), initial)
         return hypothesis
 
-    def whole_point(self, hypothesis: ForceHypothesis) -> Point:
+    def point_with_effects(self, hypothesis: ForceHypothesis) -> Point:
         """Return the unknowns of a hypothesis with its effects, from which a fit may begin.
 
         Parameters
@@ -175,20 +181,22 @@ class MissingForces:
         hypothesis : ForceHypothesis
             The hypothesis.
         """
-        point = self._point(hypothesis)
+        point = self._clipped_point(hypothesis)
         return Point(hypothesis.shared.copy(), point.local, hypothesis.effect.copy())
 
-    def _linear_view(self) -> View:
-        """Return the trials, linear about `point`, and rebuild `columns` there."""
-        self.columns = ColumnBuilder(self.problem, self.numbers, self.point, self.laws)
-        return self.columns.bare()
+    def _linearise_trials(self) -> LinearTrials:
+        """Return the trials, linear about `point`, and rebuild `column_builder` there."""
+        self.column_builder = ColumnBuilder(
+            self.problem, self.trial_indices, self.point, self.model_laws
+        )
+        return self.column_builder.trials_without_effects()
 
-    def _point(self, hypothesis: ForceHypothesis) -> Point:
+    def _clipped_point(self, hypothesis: ForceHypothesis) -> Point:
         """Return the unknowns of a hypothesis without its effects, clipped to their ranges."""
-        local = [np.zeros(data.unknowns.size) for data in self.problem.trials]
-        for number, values in zip(self.numbers, hypothesis.local, strict=True):
+        local = [np.zeros(data.unknowns.unknown_count) for data in self.problem.trials]
+        for number, values in zip(self.trial_indices, hypothesis.local, strict=True):
             local[number] = values
-        low, high = self.problem.shared.ends
+        low, high = self.problem.shared.bounds
         # a margin of one difference step, so that derivatives by parameters stay in the ranges; and
         # within two prior standard deviations
         low = np.maximum(low + PARAMETER_STEP, -2.0)

@@ -1,7 +1,7 @@
-"""Backward passes over a record: what later readings say of the state at a moment.
+"""Backward passes over a record: the information on a state from later readings.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
-derivatives by unknowns), S different steps, B places. A place is a sample whose state is asked for.
+derivatives by unknowns), S different steps, B queried samples (samples whose state is asked for).
 Readings are divided by the deviation of the white part of their noise.
 """
 
@@ -14,16 +14,16 @@ from .covariances import is_steady
 
 
 @compiled
-def later(
+def smoother_corrections(
     transitions: FloatArray,
     step_of_sample: IntArray,
-    rows: FloatArray,
+    output_rows: FloatArray,
     used: BoolArray,
-    white: FloatArray,
+    whitened: FloatArray,
     gains: FloatArray,
     variances: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return, for each sample, the vector and matrix by which later readings correct its state.
+    """Return the vector and matrix by which later readings correct the state at each sample.
 
     This is the fixed-interval smoother of de Jong (1989, J. American Statistical Association 84,
     1085-1088), which inverts no covariance. In his letters the addition is r, the information N,
@@ -35,35 +35,35 @@ def later(
         The transitions of the different steps.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
-    rows : (c, n) ndarray
+    output_rows : (c, n) ndarray
         The readings for a unit of each state.
     used : (N, c) ndarray of bool
         Whether each reading counts.
-    white, gains, variances : (N, c, 1), (N, c, n), (N, c) ndarray
-        The results of `forward` for all samples of one column: innovations divided by their
+    whitened, gains, variances : (N, c, 1), (N, c, n), (N, c) ndarray
+        The results of `filter_forward` for all samples of one column: innovations divided by their
         deviations, gains, and variances of the innovations.
 
     Returns
     -------
-    additions, informations : (N, n), (N, n, n) ndarray
+    corrections, informations : (N, n), (N, n, n) ndarray
         The smoothed state is the predicted one plus its covariance C times the addition. After the
         readings of the sample the covariance C becomes C - C information C.
     """
     sample_count = len(step_of_sample)
-    n = rows.shape[1]
-    additions = np.zeros((sample_count, n))
+    n = output_rows.shape[1]
+    corrections = np.zeros((sample_count, n))
     informations = np.zeros((sample_count, n, n))
-    addition = np.zeros(n)
+    correction = np.zeros(n)
     information = np.zeros((n, n))
     for k in range(sample_count - 1, -1, -1):
         informations[k] = information
         # take in the readings of the sample, in reverse order
-        for c in range(len(rows) - 1, -1, -1):
+        for c in range(len(output_rows) - 1, -1, -1):
             if used[k, c]:
-                row = rows[c]
+                row = output_rows[c]
                 gain = gains[k, c]
-                scaled_innovation = white[k, c, 0] / np.sqrt(variances[k, c])
-                addition = addition + row * (scaled_innovation - gain @ addition)
+                scaled_innovation = whitened[k, c, 0] / np.sqrt(variances[k, c])
+                correction = correction + row * (scaled_innovation - gain @ correction)
                 information_gain = information @ gain
                 innovation_information = gain @ information_gain + 1.0 / variances[k, c]
                 information = (
@@ -72,23 +72,23 @@ def later(
                     - np.outer(information_gain, row)
                     + innovation_information * np.outer(row, row)
                 )
-        additions[k] = addition
+        corrections[k] = correction
         # carry both back over the step
         transition = transitions[step_of_sample[k]]
-        addition = transition.T @ addition
+        correction = transition.T @ correction
         information = transition.T @ information @ transition
-    return additions, informations
+    return corrections, informations
 
 
 @compiled
-def backward(
+def filter_backward(
     transitions: FloatArray,
     noise_roots: FloatArray,
     step_of_sample: IntArray,
-    rows: FloatArray,
+    output_rows: FloatArray,
     used: BoolArray,
     columns: FloatArray,
-    places: IntArray,
+    query_samples: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the information on the state from all readings at and after some samples.
 
@@ -106,24 +106,24 @@ def backward(
         The roots of the covariances of their process noise: root @ root.T is the covariance.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
-    rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+    output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
-    places : (B,) ndarray
+    query_samples : (B,) ndarray
         The samples whose information is asked for, ascending.
 
     Returns
     -------
     J, h, c, half : (B, n, n), (B, n, W), (B, W, W), (B,) ndarray
         The information matrix, the information vectors of the columns, the products of the columns,
-        and half a log determinant. All are zero for a place N, after which there are no readings.
+        and half a log determinant. All are zero for the queried sample N, after the last reading.
     """
     sample_count = len(step_of_sample)
-    n = rows.shape[1]
+    n = output_rows.shape[1]
     column_count = columns.shape[2]
-    all_J = np.zeros((len(places), n, n))
-    all_h = np.zeros((len(places), n, column_count))
-    all_c = np.zeros((len(places), column_count, column_count))
-    halves = np.zeros(len(places))
+    all_J = np.zeros((len(query_samples), n, n))
+    all_h = np.zeros((len(query_samples), n, column_count))
+    all_c = np.zeros((len(query_samples), column_count, column_count))
+    half_log_determinants = np.zeros(len(query_samples))
 
     J = np.zeros((n, n))
     h = np.zeros((n, column_count))
@@ -135,30 +135,30 @@ def backward(
     carry_back = np.zeros((n, n))
     half_of_step = 0.0
 
-    place = np.searchsorted(places, sample_count) - 1
+    query = np.searchsorted(query_samples, sample_count) - 1
     next_step = -1
     steady = False
     for k in range(sample_count - 1, -1, -1):
         reads_like_next = k < sample_count - 1 and bool(np.all(used[k] == used[k + 1]))
         # take in the readings of the sample
-        for channel in range(len(rows)):
+        for channel in range(len(output_rows)):
             if used[k, channel]:
-                h += np.outer(rows[channel], columns[k, channel])
+                h += np.outer(output_rows[channel], columns[k, channel])
                 c += np.outer(columns[k, channel], columns[k, channel])
         next_J = J
         if not (steady and reads_like_next):
             J_with_readings = J.copy()
-            for channel in range(len(rows)):
+            for channel in range(len(output_rows)):
                 if used[k, channel]:
-                    J_with_readings += np.outer(rows[channel], rows[channel])
-        # store the results at a place
-        if place >= 0 and places[place] == k:
-            all_J[place] = J_with_readings
-            all_h[place] = h
-            all_c[place] = c
-            halves[place] = half_log_determinant
-            place -= 1
-        if place < 0:
+                    J_with_readings += np.outer(output_rows[channel], output_rows[channel])
+        # store the results at a queried sample
+        if query >= 0 and query_samples[query] == k:
+            all_J[query] = J_with_readings
+            all_h[query] = h
+            all_c[query] = c
+            half_log_determinants[query] = half_log_determinant
+            query -= 1
+        if query < 0:
             break
         # carry the information back over the step, with the process noise integrated out: with
         # noise G G^T and D = I + G^T J G, J - J G D^-1 G^T J in Joseph form, and half log det D
@@ -183,4 +183,4 @@ def backward(
         half_log_determinant += half_of_step
         h = carry_back @ h
         next_step = step
-    return all_J, all_h, all_c, halves
+    return all_J, all_h, all_c, half_log_determinants

@@ -8,6 +8,7 @@ than the price of the changes. A path (N,) says for each sample whether the forc
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 from scipy.optimize import minimize
@@ -15,42 +16,44 @@ from scipy.optimize import minimize
 from discrepancy.campaign.records import BoolArray, FloatArray
 
 from .filtered import Process
-from .process_search import SIZE_DEVIATION, TIME_DEVIATION
+from .linear_trials import LinearTrials
+from .process_search import PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME
 from .switched_record import (
     EventTrials,
-    Forces,
-    Products,
+    ForcePair,
     SwitchedRecord,
-    changes,
+    TrialProducts,
+    change_samples,
     price_of_changes,
 )
-from .view import View
 
-FINE = 4000
-"""Approximate number of places of a change in a short record, which then lie between its samples
-too."""
-WORK = 4000
+CHANGE_GRID_SIZE = 4000
+"""Least number of points of a record at which a change is looked for, when its time is determined.
+In a shorter record some of them lie between samples."""
+MOST_SAMPLES = 4000
 """Largest number of samples of all records together in which events are looked for. Of longer
 records only every k-th sample is used, except in the last step."""
 MOST_EVENTS = 6
 """Largest number of stretches of a record; more of them are a force that varies, not events."""
-EVENT_SIZE, STEADY_SIZE = 3.0, 0.003
+INITIAL_EVENT_DEVIATION, INITIAL_STEADY_DEVIATION = 3.0, 0.003
 """Initial standard deviations of the force of events and of the force throughout, over that of the
 given process."""
-NONE = 1e-3
+NEGLIGIBLE_DEVIATION = 1e-3
 """Standard deviation that stands for no force, over that of the given process."""
-GROUND = 3.0
+LEAST_EVIDENCE = 3.0
 """Log evidence over no missing force [nat] from which on there is one in a record."""
-FEW_PASSES, MOST_PASSES = 30, 60
+FIRST_EVALUATIONS, LATER_EVALUATIONS = 30, 60
 """Numbers of evaluations of the evidence in the first fit of the forces, and in later fits."""
-ROUNDS = 5
+MOST_ROUNDS = 5
 """Largest number of rounds; each looks for stretches with the forces of the last one."""
 LEAST_GAIN = 0.5
 """Least gain of log evidence in a round after which another one follows [nat]."""
-FIRST_MOVES = np.array([0.9, 0.7, 0.9, 0.7])
+SIMPLEX_STEPS = np.array([0.9, 0.7, 0.9, 0.7])
 """Initial steps of the simplex search in the logarithms of the forces: size and time of the event,
 size and time of the force throughout."""
-PRIOR_DEVIATIONS = np.array([SIZE_DEVIATION, 3.0, SIZE_DEVIATION, TIME_DEVIATION])
+PRIOR_DEVIATIONS = np.array(
+    [PRIOR_LOG_DEVIATION_OF_SIZE, 3.0, PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME]
+)
 """Prior standard deviations of these logarithms. That of the event's time is wide, as an event may
 be a force that stays constant."""
 LARGEST_LOGARITHM = 14.0
@@ -62,38 +65,40 @@ class EventSearch(EventTrials):
 
     Parameters
     ----------
-    view : View
-        The trials, and the columns of all unknowns and of the forces known to act.
+    linear_trials : LinearTrials
+        The trials with the columns of all unknowns.
     port : int
         The number of the port.
     process : Process
         A force that acts throughout; its size and time are the prior medians of both forces.
-    every : int
+    stride : int
         The step between samples that are used; 1 uses all.
     """
 
-    def __init__(self, view: View, port: int, process: Process, *, every: int = 1) -> None:
-        super().__init__(view, port, every=every)
+    def __init__(
+        self, linear_trials: LinearTrials, port: int, process: Process, *, stride: int = 1
+    ) -> None:
+        super().__init__(linear_trials, port, stride=stride)
         self.process = process
 
-    def products(self, forces: Forces, paths: Sequence[BoolArray]) -> list[Products]:
+    def products(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[TrialProducts]:
         """Return the information of each trial on the shared unknowns, given forces and paths."""
         return [
             SwitchedRecord(self, number, forces).products(on) for number, on in enumerate(paths)
         ]
 
-    def fitted(
-        self, begin: Forces, paths: Sequence[BoolArray], passes: int
-    ) -> tuple[Forces, float]:
+    def fit_forces(
+        self, initial: ForcePair, paths: Sequence[BoolArray], evaluations: int
+    ) -> tuple[ForcePair, float]:
         """Return the most probable forces for given events, by a simplex search.
 
         Parameters
         ----------
-        begin : (Process, Process)
+        initial : (Process, Process)
             The forces to begin with: that of events, and that throughout.
         paths : sequence of (N,) array of bool
             The events: whether the force is on at each sample, for each trial.
-        passes : int
+        evaluations : int
             The largest number of evaluations of the evidence.
 
         Returns
@@ -103,31 +108,39 @@ class EventSearch(EventTrials):
         score : float
             The log evidence with the priors of the forces, minus the price of all changes [nat].
         """
-        scale = np.tile((self.process.size, self.process.time), 2)
-        initial_values = [value for force in begin for value in (force.size, force.time)]
+        scale = np.tile((self.process.standard_deviation, self.process.correlation_time), 2)
+        initial_values = [
+            value
+            for force in initial
+            for value in (force.standard_deviation, force.correlation_time)
+        ]
         initial_logarithms = np.log(np.array(initial_values) / scale)
 
-        def forces(moves: FloatArray) -> Forces:
-            """Return both forces at moves (4,) of their logarithms in units of `FIRST_MOVES`."""
+        def forces(moves: FloatArray) -> ForcePair:
+            """Return both forces at moves (4,) of their logarithms in units of `SIMPLEX_STEPS`."""
             logs = np.clip(
-                initial_logarithms + moves * FIRST_MOVES, -LARGEST_LOGARITHM, LARGEST_LOGARITHM
+                initial_logarithms + moves * SIMPLEX_STEPS, -LARGEST_LOGARITHM, LARGEST_LOGARITHM
             )
             event_size, event_time, steady_size, steady_time = (np.exp(logs) * scale).tolist()
-            event = replace(self.process, size=event_size, time=event_time)
-            return event, replace(self.process, size=steady_size, time=steady_time)
+            event = replace(
+                self.process, standard_deviation=event_size, correlation_time=event_time
+            )
+            return event, replace(
+                self.process, standard_deviation=steady_size, correlation_time=steady_time
+            )
 
         def objective(moves: FloatArray) -> float:
             minus_log_prior = float(
-                0.5 * np.sum(((initial_logarithms + moves * FIRST_MOVES) / PRIOR_DEVIATIONS) ** 2)
+                0.5 * np.sum(((initial_logarithms + moves * SIMPLEX_STEPS) / PRIOR_DEVIATIONS) ** 2)
             )
-            return minus_log_prior - float(self.evidence(self.products(forces(moves), paths)))
+            return minus_log_prior - float(self.log_evidence(self.products(forces(moves), paths)))
 
         simplex = np.vstack((np.zeros(4), np.eye(4)))
-        options = {"xatol": 0.05, "fatol": 0.2, "maxfev": passes, "initial_simplex": simplex}
+        options = {"xatol": 0.05, "fatol": 0.2, "maxfev": evaluations, "initial_simplex": simplex}
         fit = minimize(objective, simplex[0], method="Nelder-Mead", options=options)
         return forces(fit.x), -float(fit.fun) - price_of_changes(paths)
 
-    def switched(self, forces: Forces, paths: Sequence[BoolArray]) -> list[BoolArray]:
+    def improve_paths(self, forces: ForcePair, paths: Sequence[BoolArray]) -> list[BoolArray]:
         """Return more probable paths, by inverting one stretch after the other.
 
         Parameters
@@ -146,8 +159,8 @@ class EventSearch(EventTrials):
             for _ in range(2 * MOST_EVENTS):
                 if better_path is None:
                     break
-                new_paths[number] = record.with_changes_placed(better_path)
-                better_path = record.with_best_stretch_switched(new_paths[number])
+                new_paths[number] = record.place_changes(better_path)
+                better_path = record.invert_best_stretch(new_paths[number])
             products[number] = record.products(new_paths[number])
         return new_paths
 
@@ -159,7 +172,7 @@ class Events:
     Attributes
     ----------
     search : EventSearch
-        The search that found them.
+        The search in which they were found.
     forces : (Process, Process)
         The force of events, and the force that may be missing throughout.
     paths : sequence of (N,) ndarray of bool
@@ -169,115 +182,124 @@ class Events:
     """
 
     search: EventSearch
-    forces: Forces
+    forces: ForcePair
     paths: Sequence[BoolArray]
     score: float
 
-    def record(self, number: int, parts: int) -> SwitchedRecord:
+    def switched_record(self, trial_index: int, substeps: int) -> SwitchedRecord:
         """Return a trial with its filters, in which changes may lie between samples.
 
         Parameters
         ----------
-        number : int
+        trial_index : int
             The index of the trial.
-        parts : int
+        substeps : int
             The number of steps into which an interval between samples is divided.
         """
         products = self.search.products(self.forces, self.paths)
-        products_of_others = products[:number] + products[number + 1 :]
-        return SwitchedRecord(self.search, number, self.forces, products_of_others, parts)
+        products_of_others = products[:trial_index] + products[trial_index + 1 :]
+        return SwitchedRecord(self.search, trial_index, self.forces, products_of_others, substeps)
 
-    def moments(self, number: int) -> FloatArray:
+    def change_times(self, trial_index: int) -> FloatArray:
         """Return median and ends of the 90 % interval (C, 3) of the C changes in a trial [s]."""
-        on = self.paths[number]
-        time = self.search.trials[number].time
-        parts = max(1, FINE // len(on))
-        record = self.record(number, parts)
-        fine_path = np.repeat(on, parts)[: (len(on) - 1) * parts + 1]
-        moments = np.zeros((len(changes(on)), 3))
-        for change in range(len(moments)):
-            places, log_evidence = record.evidence_by_place(fine_path, change)
-            place_times = np.interp(places / parts, np.arange(len(on)), time)
+        on = self.paths[trial_index]
+        time = self.search.trials[trial_index].time
+        substeps = max(1, CHANGE_GRID_SIZE // len(on))
+        record = self.switched_record(trial_index, substeps)
+        fine_path = np.repeat(on, substeps)[: (len(on) - 1) * substeps + 1]
+        times_of_changes = np.zeros((len(change_samples(on)), 3))
+        for change in range(len(times_of_changes)):
+            samples, log_evidence = record.evidence_of_change_samples(fine_path, change)
+            sample_times = np.interp(samples / substeps, np.arange(len(on)), time)
             # the posterior density of the moment, integrated by the trapezoidal rule
             density = np.exp(log_evidence - log_evidence.max())
-            probabilities = 0.5 * (density[1:] + density[:-1]) * np.diff(place_times)
+            probabilities = 0.5 * (density[1:] + density[:-1]) * np.diff(sample_times)
             distribution = np.r_[0.0, np.cumsum(probabilities)]
-            moments[change] = np.interp(
-                (0.5, 0.05, 0.95), distribution / distribution[-1], place_times
+            times_of_changes[change] = np.interp(
+                (0.5, 0.05, 0.95), distribution / distribution[-1], sample_times
             )
-        return moments
+        return times_of_changes
 
 
-def events(view: View, port: int, process: Process, least: float = -np.inf) -> Events:
+def find_events(
+    linear_trials: LinearTrials, port: int, process: Process, least_score: float = -np.inf
+) -> Events:
     """Return the most probable events at a port, or a force throughout if that is more probable.
 
     Parameters
     ----------
-    view : View
-        The trials, and the columns of all unknowns and of the forces known to act.
+    linear_trials : LinearTrials
+        The trials with the columns of all unknowns.
     port : int
         The number of the port.
     process : Process
         A force that acts throughout.
-    least : float
+    least_score : float
         The log evidence of another explanation [nat]; events with a lower score are not returned.
 
     Returns
     -------
     Events
-        Events with changes if these are more probable than `least` and than a force that acts
+        Events with changes if these are more probable than `least_score` and than a force that acts
         throughout the records that have one; otherwise such a force.
     """
-    # rounded up
-    every = -(-sum(len(trial.time) for trial in view.trials) // WORK)
-    search = EventSearch(view, port, process, every=every)
+    sample_count = sum(len(trial.time) for trial in linear_trials.trials)
+    stride = ceil(sample_count / MOST_SAMPLES)
+    search = EventSearch(linear_trials, port, process, stride=stride)
     never = [np.zeros(len(trial.time), dtype=bool) for trial in search.trials]
-    steady = _throughout_some(search, never)
-    event = Process(EVENT_SIZE * process.size, process.time, rough=True)
-    forces = (event, replace(process, size=STEADY_SIZE * process.size))
-    best = _round(search, forces, never, FEW_PASSES)
-    for _ in range(ROUNDS):
-        next_events = _round(search, best.forces, best.paths, MOST_PASSES)
+    steady = _steady_force_where_needed(search, never)
+    # stretches with a large force that may jump, besides a small force throughout
+    event_deviation = INITIAL_EVENT_DEVIATION * process.standard_deviation
+    steady_deviation = INITIAL_STEADY_DEVIATION * process.standard_deviation
+    event_force = Process(event_deviation, process.correlation_time, may_jump=True)
+    steady_force = replace(process, standard_deviation=steady_deviation)
+    best = _search_round(search, (event_force, steady_force), never, FIRST_EVALUATIONS)
+    for _ in range(MOST_ROUNDS):
+        next_events = _search_round(search, best.forces, best.paths, LATER_EVALUATIONS)
         if next_events.score < best.score + LEAST_GAIN:
             break
         best = next_events
-    if every > 1:
-        best = _among_all_samples(best, every)
-        steady = _among_all_samples(steady, every)
-    has_changes = any(len(changes(on)) for on in best.paths)
-    return best if has_changes and best.score > max(least, steady.score) else steady
+    if stride > 1:
+        best = _refine_to_all_samples(best, stride)
+        steady = _refine_to_all_samples(steady, stride)
+    has_changes = any(len(change_samples(on)) for on in best.paths)
+    if has_changes and best.score > max(least_score, steady.score):
+        return best
+    return steady
 
 
-def throughout(view: View, port: int, process: Process) -> Events:
+def events_throughout(linear_trials: LinearTrials, port: int, process: Process) -> Events:
     """Return a force that acts in all records from the first sample to the last, as events."""
-    always = [np.ones(len(trial.time), dtype=bool) for trial in view.trials]
-    return Events(EventSearch(view, port, process), (process, process), always, -np.inf)
+    always = [np.ones(len(trial.time), dtype=bool) for trial in linear_trials.trials]
+    return Events(EventSearch(linear_trials, port, process), (process, process), always, -np.inf)
 
 
-def _among_all_samples(coarse: Events, every: int) -> Events:
-    """Return events of a part of the samples, with changes placed among all samples.
+def _refine_to_all_samples(coarse: Events, stride: int) -> Events:
+    """Return events that were found in every `stride`-th sample, with changes among all samples.
 
     Parameters
     ----------
     coarse : Events
-        The events.
-    every : int
-        The step between the samples in which they were found.
+        The events, with paths over the samples that were used.
+    stride : int
+        The step between these samples.
     """
-    search = EventSearch(coarse.search.view, coarse.search.port, coarse.search.process)
+    search = EventSearch(coarse.search.linear_trials, coarse.search.port, coarse.search.process)
     paths = [
-        np.repeat(on, every)[: len(trial.time)]
+        np.repeat(on, stride)[: len(trial.time)]
         for on, trial in zip(coarse.paths, search.trials, strict=True)
     ]
     events_of_all = Events(search, coarse.forces, paths, -np.inf)
-    for number in range(len(paths)):
-        paths[number] = events_of_all.record(number, 1).with_changes_placed(paths[number])
-    log_evidence = float(search.evidence(search.products(coarse.forces, paths)))
+    # `events_of_all` refers to `paths`, so that each trial is placed given those before it
+    for trial_index in range(len(paths)):
+        record = events_of_all.switched_record(trial_index, 1)
+        paths[trial_index] = record.place_changes(paths[trial_index])
+    log_evidence = float(search.log_evidence(search.products(coarse.forces, paths)))
     return replace(events_of_all, score=log_evidence - price_of_changes(paths))
 
 
-def _throughout_some(search: EventSearch, never: Sequence[BoolArray]) -> Events:
-    """Return a force that acts throughout those records whose evidence needs it.
+def _steady_force_where_needed(search: EventSearch, never: Sequence[BoolArray]) -> Events:
+    """Return a force that acts throughout those records whose evidence is larger with it.
 
     Parameters
     ----------
@@ -286,20 +308,26 @@ def _throughout_some(search: EventSearch, never: Sequence[BoolArray]) -> Events:
     never : sequence of (N,) array of bool
         The path of each trial without any force.
     """
-    negligible_force = replace(search.process, size=NONE * search.process.size)
+    negligible_force = replace(
+        search.process, standard_deviation=NEGLIGIBLE_DEVIATION * search.process.standard_deviation
+    )
     paths = [~off for off in never]
-    (event, _), score = search.fitted((search.process, negligible_force), paths, FEW_PASSES)
+    (event, _), score = search.fit_forces(
+        (search.process, negligible_force), paths, FIRST_EVALUATIONS
+    )
     forces = (event, negligible_force)
-    for number, off in enumerate(never):
-        paths_without = [*paths[:number], off, *paths[number + 1 :]]
-        evidence_without = search.evidence(search.products(forces, paths_without))
-        evidence_with = search.evidence(search.products(forces, paths))
-        if evidence_without > evidence_with - GROUND:
+    for trial_index, off in enumerate(never):
+        paths_without = [*paths[:trial_index], off, *paths[trial_index + 1 :]]
+        evidence_without = search.log_evidence(search.products(forces, paths_without))
+        evidence_with = search.log_evidence(search.products(forces, paths))
+        if evidence_without > evidence_with - LEAST_EVIDENCE:
             paths = paths_without
     return Events(search, forces, paths, score)
 
 
-def _round(search: EventSearch, forces: Forces, paths: Sequence[BoolArray], passes: int) -> Events:
+def _search_round(
+    search: EventSearch, forces: ForcePair, paths: Sequence[BoolArray], evaluations: int
+) -> Events:
     """Return events after one round: new stretches, then the forces fitted to them.
 
     Parameters
@@ -310,9 +338,9 @@ def _round(search: EventSearch, forces: Forces, paths: Sequence[BoolArray], pass
         The force of events, and the force throughout.
     paths : sequence of (N,) array of bool
         The path of each trial to begin with.
-    passes : int
+    evaluations : int
         The largest number of evaluations of the evidence in the fit.
     """
-    new_paths = search.switched(forces, paths)
-    new_forces, score = search.fitted(forces, new_paths, passes)
+    new_paths = search.improve_paths(forces, paths)
+    new_forces, score = search.fit_forces(forces, new_paths, evaluations)
     return Events(search, new_forces, new_paths, score)

@@ -10,21 +10,21 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import Candidate
 
 from .filtered import Solution
+from .linear_trials import LinearTrials, TrialMotion
 from .process_search import MOST_STEPS, Processes
-from .view import TrialMotion, View
 
-NOTHING = Candidate()
+NO_EFFECTS = Candidate()
 """The candidate without effects."""
-NO_VALUES = np.zeros(0)
+NO_EFFECT_VALUES = np.zeros(0)
 """The effect parameters of the candidate without effects."""
-HIDDEN_PART = 0.5
-"""Share of the remaining force that may be hidden along a law of the hypothesis. Without it, the
-intervals of a weaker law contain only 4 of 9 hidden values."""
+HIDDEN_SHARE = 0.5
+"""Share of the unexplained force that may look like a law of the hypothesis. Without it, the
+intervals of a weaker law contain only 4 of 9 true values."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForceHypothesis:
-    """A hypothesis fitted to the missing force: effects that act along the estimated motion.
+    """A hypothesis that is fitted to the missing force, with effects along the estimated motion.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class ForceHypothesis:
         The forces that remain missing with the effects, by the numbers of their ports.
     log_evidence : float
         The log evidence, with the prior of the processes [nat].
-    view : View
+    linear_trials : LinearTrials
         The trials, with the columns of the effects.
     solution : Solution
         The K shared unknowns, then the E effect parameters.
@@ -50,7 +50,7 @@ class ForceHypothesis:
     effect: FloatArray
     processes: Processes
     log_evidence: float
-    view: View
+    linear_trials: LinearTrials
     solution: Solution
     local: Sequence[FloatArray]
     motions: Sequence[TrialMotion]
@@ -58,17 +58,17 @@ class ForceHypothesis:
     @property
     def effect_covariance(self) -> FloatArray:
         """The covariance (E, E) of the effect parameters, given the missing force's process."""
-        first_effect = len(self.view.shared_precision)
+        first_effect = len(self.linear_trials.shared_precision)
         return self.solution.covariance[first_effect:, first_effect:]
 
     @cached_property
     def shared(self) -> FloatArray:
-        """The shared unknowns (K,) given the values `effect` of the effect parameters.
+        """The conditional mean (K,) of the shared unknowns given the effect parameters `effect`.
 
-        The iteration may have ended before `effect` reached the mean of the solution. The shared
-        unknowns are then moved along: to their conditional mean given `effect`.
+        It differs from the mean of the solution if the iteration ended before `effect` reached that
+        mean.
         """
-        first_effect = len(self.view.shared_precision)
+        first_effect = len(self.linear_trials.shared_precision)
         mean = self.solution.mean
         covariance = self.solution.covariance
         if not len(self.effect):
@@ -83,14 +83,14 @@ class ForceHypothesis:
     def covariance(self) -> FloatArray:
         """The covariance (K + E, K + E) of all unknowns, widened for a hidden force.
 
-        The process of a missing force is independent of the motion. If another law is missing, its
-        force does depend on the motion, and a part of it may look like the laws of the hypothesis.
-        It is assumed that the rms of that part is `HIDDEN_PART` times that of the remaining force.
+        The process of a missing force is independent of the motion. But if another law is missing,
+        its force depends on the motion, and a part of it may look like the laws of the hypothesis.
+        The rms of this hidden part is taken as `HIDDEN_SHARE` times that of the unexplained force.
         """
         covariance = self.solution.covariance
         if not len(self.effect):
             return covariance
-        first_effect = len(self.view.shared_precision)
+        first_effect = len(self.linear_trials.shared_precision)
         hidden = self._covariance_of_hidden_force()
         effect_covariance = covariance[first_effect:, first_effect:]
         # all unknowns follow the effect parameters by their regression on these
@@ -101,74 +101,79 @@ class ForceHypothesis:
         """Return the covariance (E, E) that a hidden force adds to the effect parameters."""
         hidden = np.zeros((len(self.effect),) * 2)
         for port, process in self.processes.items():
-            forces_by_parameter = self._effect_forces(port)
+            forces_by_parameter = self._force_by_parameter(port)
             acting = np.flatnonzero(forces_by_parameter.any(axis=1))
             if not len(acting):
                 continue
-            variance = (HIDDEN_PART * process.size) ** 2
+            variance = (HIDDEN_SHARE * process.standard_deviation) ** 2
             mean_products = (
                 forces_by_parameter[acting]
                 @ forces_by_parameter[acting].T
                 / forces_by_parameter.shape[1]
             )
-            # one parameter: the change whose force has the hidden rms has the variance (hidden
-            # variance) / (mean square force per unit); the added variance keeps it below the prior
-            # variance of one
+            # With one parameter the added variance is (hidden variance) / (mean square force per
+            # unit), that of a change whose force has the hidden rms. The hidden variance in the
+            # denominator keeps it below the prior variance of one.
             regularised = mean_products + variance * np.eye(len(acting))
             hidden[np.ix_(acting, acting)] += variance * np.linalg.inv(regularised)
         return hidden
 
-    def _effect_forces(self, port: int) -> FloatArray:
+    def _force_by_parameter(self, port: int) -> FloatArray:
         """Return the forces (E, T) for a unit of each effect parameter at a port.
 
         T is the number of samples of all trials together.
         """
         by_trial = []
-        for number, trial in enumerate(self.view.trials):
+        for number, trial in enumerate(self.linear_trials.trials):
             no_force = np.zeros(len(trial.fine_time))
-            forces = [column[number].forces.get(port, no_force) for column in self.view.effects]
-            by_trial.append(np.array([np.asarray(force)[:: trial.parts] for force in forces]))
+            forces = [
+                column[number].forces.get(port, no_force)
+                for column in self.linear_trials.effect_columns
+            ]
+            by_trial.append(np.array([np.asarray(force)[:: trial.substeps] for force in forces]))
         return np.concatenate(by_trial, axis=-1)
 
 
-def with_most_probable_forces(
-    view: View,
+def fit_missing_forces(
+    linear_trials: LinearTrials,
     median: Processes,
-    begin: Processes,
-    candidate: Candidate = NOTHING,
-    effect: FloatArray = NO_VALUES,
+    initial: Processes,
+    candidate: Candidate = NO_EFFECTS,
+    effect: FloatArray = NO_EFFECT_VALUES,
     *,
-    near: bool = False,
+    skip_grid: bool = False,
     most_steps: int = MOST_STEPS,
 ) -> ForceHypothesis:
     """Return a hypothesis with the most probable sizes and times of its missing forces.
 
     Parameters
     ----------
-    view : View
+    linear_trials : LinearTrials
         The trials, with the columns of the effects.
     median : mapping of int to Process
         The prior medians of the missing forces, by the numbers of their ports.
-    begin : mapping of int to Process
+    initial : mapping of int to Process
         The missing forces from which the search for the most probable ones begins.
     candidate : Candidate
         The effects.
     effect : (E,) array
-        The scaled effect parameters about which the view is linear.
-    near : bool
-        Whether the search begins at `begin` itself, not at the best point of a grid around it.
+        The scaled effect parameters about which the trials are linear.
+    skip_grid : bool
+        Whether the search begins at `initial` itself, not at the best point of a grid around it.
     most_steps : int
         The largest number of steps of Newton's method.
     """
-    processes, log_evidence = view.most_probable(median, begin, near=near, most_steps=most_steps)
-    solution, local, motions = view.smoothed(processes)
+    processes, log_evidence = linear_trials.most_probable_processes(
+        median, initial, skip_grid=skip_grid, most_steps=most_steps
+    )
+    smoothed = linear_trials.smooth(processes)
     return ForceHypothesis(
         candidate=candidate,
         effect=effect,
         processes=processes,
         log_evidence=log_evidence,
-        view=view,
-        solution=solution,
-        local=local,
-        motions=motions,
+        linear_trials=linear_trials,
+        solution=smoothed.solution,
+        local=smoothed.local,
+        motions=smoothed.motions,
     )

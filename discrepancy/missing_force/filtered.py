@@ -18,9 +18,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from discrepancy.campaign.records import FloatArray
 
-from .backward import later
-from .kalman import FilterSteps, discretised, forward
-from .trial import SeenTrial
+from .backward import smoother_corrections
+from .kalman import RecordFilter, discretise, filter_forward
+from .trial import PortedTrial
 
 
 @dataclass(frozen=True)
@@ -29,30 +29,37 @@ class Process:
 
     Attributes
     ----------
-    size : float
+    standard_deviation : float
         The standard deviation of the force [N, N m or the port's flow].
-    time : float
+    correlation_time : float
         The correlation time [s].
-    rough : bool
+    may_jump : bool
         Whether the force may jump (Matern 1/2). Otherwise it is differentiable (Matern 3/2).
     """
 
-    size: float
-    time: float
-    rough: bool = False
+    standard_deviation: float
+    correlation_time: float
+    may_jump: bool = False
 
     @property
     def generator(self) -> FloatArray:
-        """The rate matrix (1 or 2 rows) [1/s]; the first state is the force over `size`."""
-        if self.rough:
-            return np.array([[-1.0 / self.time]])
-        rate = np.sqrt(3.0) / self.time
+        """The rate matrix [1/s] of one or two states.
+
+        The first state is the force over its standard deviation.
+        """
+        if self.may_jump:
+            return np.array([[-1.0 / self.correlation_time]])
+        rate = np.sqrt(3.0) / self.correlation_time
         return np.asarray(rate * np.array([[0.0, 1.0], [-1.0, -2.0]]))
 
     @property
     def intensity(self) -> float:
         """Spectral density of the white noise that drives the last state."""
-        return 2.0 / self.time if self.rough else 4.0 * np.sqrt(3.0) / self.time
+        return (
+            2.0 / self.correlation_time
+            if self.may_jump
+            else 4.0 * np.sqrt(3.0) / self.correlation_time
+        )
 
 
 class ForceStateSpace(NamedTuple):
@@ -67,35 +74,36 @@ class ForceStateSpace(NamedTuple):
     output_rows : (C, n) ndarray
         The readings for a unit of each state, divided by the deviation of the white part of their
         noise.
-    start_covariance : (n, n) ndarray
+    initial_covariance : (n, n) ndarray
         The covariance of the state at the first sample.
     """
 
     generator: FloatArray
     intensity: FloatArray
     output_rows: FloatArray
-    start_covariance: FloatArray
+    initial_covariance: FloatArray
 
 
-class Smoothed(NamedTuple):
+class SmoothedForces(NamedTuple):
     """The added state and the missing forces of a trial given all of its readings.
 
     Shapes: F fine stamps, N samples, n states of the system, P missing forces.
 
     Attributes
     ----------
-    state : (F, n) ndarray
+    added_state : (F, n) ndarray
         The state that the missing forces add to the response of the model.
     forces : (P, F) ndarray
         The missing forces [N, N m or the port's flow].
-    deviations : (2 P, N) ndarray
-        The posterior standard deviations at the samples: of the forces, then of the speeds of their
+    force_deviations, speed_deviations : (P, N) ndarray
+        The posterior standard deviations, at the samples, of the forces and of the speeds of their
         ports.
     """
 
-    state: FloatArray
+    added_state: FloatArray
     forces: FloatArray
-    deviations: FloatArray
+    force_deviations: FloatArray
+    speed_deviations: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,21 +112,21 @@ class ForceFilter:
 
     Attributes
     ----------
-    trial : SeenTrial
+    trial : PortedTrial
         The trial.
     processes : sequence of (int, Process)
         The missing forces, each with the number of its port. Several may act at one port.
     """
 
-    trial: SeenTrial
+    trial: PortedTrial
     processes: Sequence[tuple[int, Process]]
 
     @cached_property
-    def units(self) -> FloatArray:
-        """The unit (n,) of each state of the system, by which the state is divided.
+    def state_units(self) -> FloatArray:
+        """The unit (n,) by which each state of the structure is divided, so that it is near one.
 
-        A force of `size` at the highest natural frequency moves a speed by (force / frequency) and
-        a position by that over the frequency, so that scaled states are about of size one.
+        A missing force of one standard deviation at the highest natural frequency moves a speed by
+        the rate that it causes over that frequency, and a position by the speed over the frequency.
         """
         system = self.trial.system
         state_count = len(system.generator)
@@ -126,7 +134,7 @@ class ForceFilter:
             float(np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)), 1e-9
         )
         largest_rates = [
-            np.abs(system.actions[port]).max(initial=0.0) * process.size
+            np.abs(system.actions[port]).max(initial=0.0) * process.standard_deviation
             for port, process in self.processes
         ]
         largest_rate = max(*largest_rates, 1e-300)
@@ -138,10 +146,10 @@ class ForceFilter:
         return units
 
     @cached_property
-    def places(self) -> list[int]:
-        """The index of each missing force in the whole state.
+    def force_state_indices(self) -> list[int]:
+        """The index of each missing force in the state.
 
-        A force that may not jump has a second state, which follows it.
+        A force that may not jump has a second state, its scaled rate, which follows it.
         """
         state_counts = [len(process.generator) for _, process in self.processes]
         first_force_state = len(self.trial.system.generator)
@@ -150,84 +158,130 @@ class ForceFilter:
         ]
 
     @cached_property
-    def white(self) -> FloatArray:
+    def white_noise_scale(self) -> FloatArray:
         """The standard deviation (C,) of each channel's noise divided by that of its white part.
 
-        The filter counts readings in deviations of the white part, while `SeenTrial` counts them in
-        deviations of the whole noise: this is the factor between both.
+        The filter counts readings in deviations of the white part, while `PortedTrial` counts them
+        in deviations of the whole noise: this is the factor between both.
         """
         ratios = np.ones(len(self.trial.deviation))
-        for channel, coloured_share, _ in self.trial.coloured:
-            ratios[channel] = 1.0 / np.sqrt(1.0 - coloured_share)
+        for noise in self.trial.coloured_noises:
+            ratios[noise.channel] = 1.0 / np.sqrt(1.0 - noise.share)
         return ratios
 
     @cached_property
-    def system(self) -> ForceStateSpace:
-        """The state space: states of the system, missing forces, coloured noises, in this order."""
+    def state_space(self) -> ForceStateSpace:
+        """The state space with the states of the structure, missing forces, and coloured noises."""
         trial = self.trial
-        system_states = slice(0, len(trial.system.generator))
-        first_noise_state = system_states.stop + sum(
-            len(process.generator) for _, process in self.processes
+        force_state_count = sum(len(process.generator) for _, process in self.processes)
+        first_noise_state = len(trial.system.generator) + force_state_count
+        state_count = first_noise_state + len(trial.coloured_noises)
+        state_space = ForceStateSpace(
+            generator=np.zeros((state_count, state_count)),
+            intensity=np.zeros((state_count, state_count)),
+            output_rows=np.zeros((len(trial.deviation), state_count)),
+            initial_covariance=np.zeros((state_count, state_count)),
         )
-        state_count = first_noise_state + len(trial.coloured)
-        generator = np.zeros((state_count, state_count))
-        intensity = np.zeros((state_count, state_count))
-        start_covariance = np.zeros((state_count, state_count))
-        output_rows = np.zeros((len(trial.deviation), state_count))
-        # the system
-        generator[system_states, system_states] = (
-            trial.system.generator * self.units / self.units[:, None]
+        self._fill_structure(state_space)
+        for (port, process), index in zip(self.processes, self.force_state_indices, strict=True):
+            self._fill_missing_force(state_space, port, process, index)
+        self._fill_coloured_noises(state_space, first_noise_state)
+        # readings in deviations of the white part of their noise
+        return state_space._replace(
+            output_rows=state_space.output_rows * self.white_noise_scale[:, None]
         )
-        output_rows[:, system_states] = trial.system.outputs * self.units / trial.deviation[:, None]
-        # the missing forces: they drive the system, and an acceleration shows them directly
-        for (port, process), index in zip(self.processes, self.places, strict=True):
-            force_states = slice(index, index + len(process.generator))
-            generator[system_states, index] = (
-                -trial.system.actions[port] * process.size / self.units
-            )
-            generator[force_states, force_states] = process.generator
-            intensity[force_states.stop - 1, force_states.stop - 1] = process.intensity
-            output_rows[:, index] = -trial.system.through[port] * process.size / trial.deviation
-            start_covariance[force_states, force_states] = np.eye(len(process.generator))
-            # a settled trial begins at rest under the missing force f: A s + b f = 0
-            if trial.settled:
-                at_rest = np.linalg.lstsq(
-                    generator[system_states, system_states],
-                    -generator[system_states, index],
-                    rcond=1e-12,
-                )[0]
-                start_covariance[system_states, system_states] += np.outer(at_rest, at_rest)
-                start_covariance[system_states, index] = at_rest
-                start_covariance[index, system_states] = at_rest
-        # the correlated parts of noises: first-order processes of variance one
-        for index, (channel, coloured_share, rate) in enumerate(trial.coloured, first_noise_state):
-            generator[index, index] = -rate
-            intensity[index, index] = 2.0 * rate
-            start_covariance[index, index] = 1.0
-            output_rows[channel, index] = np.sqrt(coloured_share)
-        output_rows *= self.white[:, None]
-        return ForceStateSpace(generator, intensity, output_rows, start_covariance)
+
+    def _fill_structure(self, state_space: ForceStateSpace) -> None:
+        """Fill the rates and outputs of the structure's own states, in units of these states."""
+        system = self.trial.system
+        structure = slice(0, len(system.generator))
+        units = self.state_units
+        state_space.generator[structure, structure] = system.generator * units / units[:, None]
+        state_space.output_rows[:, structure] = (
+            system.outputs * units / self.trial.deviation[:, None]
+        )
+
+    def _fill_missing_force(
+        self, state_space: ForceStateSpace, port: int, process: Process, index: int
+    ) -> None:
+        """Fill the states of a missing force, which drives the structure.
+
+        Parameters
+        ----------
+        state_space : ForceStateSpace
+            The state space, whose structure is filled already.
+        port : int
+            The number of the port of the force.
+        process : Process
+            The statistics of the force.
+        index : int
+            The index of the force in the state.
+        """
+        trial = self.trial
+        generator = state_space.generator
+        covariance = state_space.initial_covariance
+        structure = slice(0, len(trial.system.generator))
+        force_states = slice(index, index + len(process.generator))
+        generator[structure, index] = (
+            -trial.system.actions[port] * process.standard_deviation / self.state_units
+        )
+        generator[force_states, force_states] = process.generator
+        last_state = force_states.stop - 1
+        state_space.intensity[last_state, last_state] = process.intensity
+        # an acceleration shows the force directly
+        state_space.output_rows[:, index] = (
+            -trial.system.through[port] * process.standard_deviation / trial.deviation
+        )
+        covariance[force_states, force_states] = np.eye(len(process.generator))
+        # a trial that begins at rest does so under the missing force f: A s + b f = 0
+        if trial.begins_at_rest:
+            state_at_rest = np.linalg.lstsq(
+                generator[structure, structure], -generator[structure, index], rcond=1e-12
+            )[0]
+            covariance[structure, structure] += np.outer(state_at_rest, state_at_rest)
+            covariance[structure, index] = state_at_rest
+            covariance[index, structure] = state_at_rest
+
+    def _fill_coloured_noises(self, state_space: ForceStateSpace, first_state: int) -> None:
+        """Fill the correlated parts of noises: first-order processes of variance one.
+
+        Parameters
+        ----------
+        state_space : ForceStateSpace
+            The state space.
+        first_state : int
+            The index of the first of them in the state.
+        """
+        for index, noise in enumerate(self.trial.coloured_noises, first_state):
+            state_space.generator[index, index] = -noise.decay_rate
+            state_space.intensity[index, index] = 2.0 * noise.decay_rate
+            state_space.initial_covariance[index, index] = 1.0
+            state_space.output_rows[noise.channel, index] = np.sqrt(noise.share)
 
     @property
-    def key(self) -> tuple[bytes, ...]:
+    def filter_key(self) -> tuple[bytes, ...]:
         """A key that is equal for trials with the same system, steps and used readings.
 
         Such trials have the same gains, and are filtered in one pass.
         """
         return tuple(
-            array.tobytes() for array in (*self.system, *self.trial.steps, self.trial.used)
+            array.tobytes() for array in (*self.state_space, *self.trial.intervals, self.trial.used)
         )
 
-    def steps(self, columns: FloatArray) -> FilterSteps:
+    def record_filter(self, columns: FloatArray) -> RecordFilter:
         """Return the filter's matrices by kind of step, with columns (K, N, C) to filter."""
-        lengths, _ = self.trial.steps
-        transitions, noises = discretised(self.system.generator, self.system.intensity, lengths)
-        scaled_columns = np.ascontiguousarray(np.moveaxis(columns, 0, -1) * self.white[:, None])
-        return FilterSteps(
-            transitions, noises, self.system.output_rows, self.trial.used, scaled_columns
+        lengths, _ = self.trial.intervals
+        transitions, noises = discretise(
+            self.state_space.generator, self.state_space.intensity, lengths
+        )
+        scaled_columns = np.ascontiguousarray(
+            np.moveaxis(columns, 0, -1) * self.white_noise_scale[:, None]
+        )
+        return RecordFilter(
+            transitions, noises, self.state_space.output_rows, self.trial.used, scaled_columns
         )
 
-    def products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def whitened_products(self, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the products of whitened columns, and half the log determinant of the readings.
 
         Parameters
@@ -243,15 +297,17 @@ class ForceFilter:
             Half the sum of the logarithms of the variances of the readings, each given those before
             it [nat]. It is infinite if a force is so large that rounding loses the readings.
         """
-        steps = self.steps(columns)
-        _, step_of_sample = self.trial.steps
+        record_filter = self.record_filter(columns)
+        _, step_of_sample = self.trial.intervals
+        begin = record_filter.initial_state(self.state_space.initial_covariance)
         end = np.array([len(step_of_sample)])
-        begin = steps.begin(self.system.start_covariance)
-        _, _, products, half_log_determinants = steps.before(step_of_sample, 0, begin, end)
-        # the filter's readings are multiplied by `white`, which multiplies their deviations too
-        return products[0], half_log_determinants[0] - np.sum(np.log(self.white) * self.trial.used)
+        at_end = record_filter.filter_before(step_of_sample, 0, begin, end)
+        # the filter's readings are multiplied by `white_noise_scale`, and their deviations with
+        # them
+        log_scale = np.sum(np.log(self.white_noise_scale) * self.trial.used)
+        return at_end.products[0], at_end.half_log_determinants[0] - log_scale
 
-    def smoothed(self, readings: FloatArray) -> Smoothed:
+    def smooth(self, readings: FloatArray) -> SmoothedForces:
         """Return the added state and the missing forces given all readings.
 
         Parameters
@@ -259,29 +315,46 @@ class ForceFilter:
         readings : (N, C) array
             The residuals that the missing forces are to explain, divided by the noise deviations.
         """
-        steps = self.steps(readings[None])
-        _, step_of_sample = self.trial.steps
-        covariance, mean, *_ = steps.begin(self.system.start_covariance)
-        every_sample = np.arange(1, len(readings) + 1)
-        record = (steps.moves, steps.noises, step_of_sample, steps.rows, steps.used)
-        covariances, means, white, _, gains, variances = forward(
-            *record, steps.columns, 0, covariance, mean, every_sample
+        record_filter = self.record_filter(readings[None])
+        _, step_of_sample = self.trial.intervals
+        begin = record_filter.initial_state(self.state_space.initial_covariance)
+        # the state before sample k + 1 is that after the readings of sample k
+        after_every_sample = np.arange(1, len(readings) + 1)
+        covariances, means, whitened, _, gains, variances = filter_forward(
+            record_filter.transitions,
+            record_filter.noises,
+            step_of_sample,
+            record_filter.output_rows,
+            record_filter.used,
+            record_filter.columns,
+            0,
+            begin.covariance,
+            begin.mean,
+            after_every_sample,
         )
-        additions, informations = later(
-            steps.moves, step_of_sample, steps.rows, steps.used, white, gains, variances
+        corrections, informations = smoother_corrections(
+            record_filter.transitions,
+            step_of_sample,
+            record_filter.output_rows,
+            record_filter.used,
+            whitened,
+            gains,
+            variances,
         )
-        states = self._between_samples(means, covariances, additions)
-        # de Jong's smoother: the covariance given all readings, see `later`
+        states = self._states_at_fine_stamps(means, covariances, corrections)
+        # de Jong's smoother: the covariance given all readings, see `smoother_corrections`
         posterior = covariances - covariances @ informations @ covariances
-        sizes = np.array([process.size for _, process in self.processes])
-        return Smoothed(
-            state=states[:, : len(self.units)] * self.units,
-            forces=states[:, self.places].T * sizes[:, None],
-            deviations=self._deviations(posterior),
+        units_of_forces = np.array([process.standard_deviation for _, process in self.processes])
+        force_deviations, speed_deviations = np.split(self._deviations(posterior), 2)
+        return SmoothedForces(
+            added_state=states[:, : len(self.state_units)] * self.state_units,
+            forces=states[:, self.force_state_indices].T * units_of_forces[:, None],
+            force_deviations=force_deviations,
+            speed_deviations=speed_deviations,
         )
 
-    def _between_samples(
-        self, means: FloatArray, covariances: FloatArray, additions: FloatArray
+    def _states_at_fine_stamps(
+        self, means: FloatArray, covariances: FloatArray, corrections: FloatArray
     ) -> FloatArray:
         """Return the smoothed state (F, n) at all fine stamps, from the results at the samples.
 
@@ -289,36 +362,39 @@ class ForceFilter:
         ----------
         means, covariances : (N, n, 1), (N, n, n) ndarray
             The filtered state: after the readings of each sample.
-        additions : (N, n) ndarray
+        corrections : (N, n) ndarray
             De Jong's vector r of each sample, by which later readings correct the state; see
-            `later`.
+            `smoother_corrections`.
         """
-        parts = self.trial.parts
-        lengths, step_of_sample = self.trial.steps
-        fine_transitions, fine_noises = discretised(
-            self.system.generator, self.system.intensity, lengths / parts
+        substeps = self.trial.substeps
+        lengths, step_of_sample = self.trial.intervals
+        fine_transitions, fine_noises = discretise(
+            self.state_space.generator, self.state_space.intensity, lengths / substeps
         )
         step_kind = step_of_sample[1:]
         transitions = fine_transitions[step_kind]
         # what later readings add, carried back from the next sample to each fine stamp before it
-        carried_back = [additions[1:, :, None]]
-        for _ in range(parts):
+        carried_back = [corrections[1:, :, None]]
+        for _ in range(substeps):
             carried_back.append(transitions.mT @ carried_back[-1])
-        # the state, carried forward from each sample with what it may have gathered on the way
+        # predict from each sample: the correction acts by the covariance of the sample, and by that
+        # of the process noise since the sample
         state = means[:-1] + covariances[:-1] @ carried_back[-1]
-        gathered_noise = np.zeros_like(fine_transitions)
+        noise_since_sample = np.zeros_like(fine_transitions)
         fine_states = []
         for correction in carried_back[:0:-1]:
-            fine_states.append(state + gathered_noise[step_kind] @ correction)
+            fine_states.append(state + noise_since_sample[step_kind] @ correction)
             state = transitions @ state
-            gathered_noise = fine_transitions @ gathered_noise @ fine_transitions.mT + fine_noises
+            noise_since_sample = (
+                fine_transitions @ noise_since_sample @ fine_transitions.mT + fine_noises
+            )
         state_count = means.shape[1]
         return np.concatenate(
             (np.stack(fine_states, axis=1).reshape(-1, state_count), means[-1:, :, 0])
         )
 
     def _deviations(self, covariances: FloatArray) -> FloatArray:
-        """Return the deviations (2 P, N) of the forces, then of the speeds of their ports.
+        """Return the standard deviations (2 P, N) of the P forces, then of their ports' speeds.
 
         Parameters
         ----------
@@ -328,18 +404,19 @@ class ForceFilter:
         force_count = len(self.processes)
         output_rows = np.zeros((2 * force_count, covariances.shape[-1]))
         for number, (port, process) in enumerate(self.processes):
-            output_rows[number, self.places[number]] = process.size
-            output_rows[force_count + number, : len(self.units)] = (
-                self.trial.system.speeds[port] * self.units
+            output_rows[number, self.force_state_indices[number]] = process.standard_deviation
+            output_rows[force_count + number, : len(self.state_units)] = (
+                self.trial.system.speeds[port] * self.state_units
             )
         variances = np.sum((output_rows @ covariances) * output_rows, axis=-1)
         return np.asarray(np.sqrt(np.maximum(variances, 0.0)).T)
 
 
 ROUNDING = 1e-12
-"""Relative error of the squared norm of a column by rounding."""
+"""Relative rounding error of the squared norm of a column. It is added to the diagonal of the
+normal equations, so that equal columns do not make them singular."""
 LEAST_PRECISION = 1e-10
-"""Prior precision that stands for an unknown of which nothing is known in advance."""
+"""Prior precision of an unknown with a flat prior, whose exact precision of zero is singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +425,7 @@ class Solution:
 
     Attributes
     ----------
-    evidence : float
+    log_evidence : float
         The log evidence [nat], up to a constant.
     mean : (K,) ndarray
         The posterior mean.
@@ -356,7 +433,7 @@ class Solution:
         The posterior covariance.
     """
 
-    evidence: float
+    log_evidence: float
     mean: FloatArray
     covariance: FloatArray
 
@@ -370,25 +447,25 @@ class Regression:
     products : (1 + K, 1 + K) ndarray
         The inner products of the whitened residual (first) and of the whitened columns of the
         unknowns. Unknowns of single trials have been eliminated.
-    log_determinant : float
+    half_log_determinant : float
         Half the log determinant of the covariance of the readings, with the contribution of the
         eliminated unknowns [nat].
     """
 
     products: FloatArray
-    log_determinant: float
+    half_log_determinant: float
 
-    def solve(self, chosen: Sequence[int], precision: FloatArray) -> Solution:
-        """Return evidence and values of some of the unknowns; the others are zero.
+    def solve(self, unknowns: Sequence[int], precision: FloatArray) -> Solution:
+        """Return values and evidence of a model with only some of the unknowns; others are zero.
 
         Parameters
         ----------
-        chosen : sequence of int
-            The K numbers of the unknowns.
-        precision : (K,) array
+        unknowns : sequence of int
+            The numbers of these unknowns.
+        precision : (len(unknowns),) array
             Their prior precisions.
         """
-        rows = np.array([0, *(1 + k for k in chosen)])
+        rows = np.array([0, *(1 + k for k in unknowns)])
         products = self.products[np.ix_(rows, rows)]
         prior_precision = np.maximum(precision, LEAST_PRECISION)
         # columns may be of any scale and nearly equal: scale the normal equations to unit diagonal
@@ -406,15 +483,15 @@ class Regression:
         misfit = float(
             residual_weights @ products @ residual_weights + mean @ (prior_precision * mean)
         )
-        evidence = -0.5 * misfit - self.log_determinant
+        evidence = -0.5 * misfit - self.half_log_determinant
         # half the log determinant of the unscaled normal equations
         log_determinant = np.sum(np.log(np.diag(factor[0]) / column_scale))
         evidence -= float(log_determinant - 0.5 * np.sum(np.log(prior_precision)))
         return Solution(evidence, mean, covariance)
 
 
-def without(
-    products: FloatArray, halves: FloatArray, precision: FloatArray
+def integrate_out_last(
+    products: FloatArray, half_log_determinants: FloatArray, precision: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return products and half log determinants with the last unknowns integrated out.
 
@@ -422,7 +499,7 @@ def without(
     ----------
     products : (..., W, W) array
         The inner products of the whitened residual and the columns of the unknowns.
-    halves : (...) array
+    half_log_determinants : (...) array
         Half the log determinants of the covariance of the readings [nat].
     precision : (L,) array
         The prior precisions of the last L unknowns.
@@ -431,46 +508,50 @@ def without(
     -------
     products : (..., W - L, W - L) array
         The products with the last L columns projected out (Schur complement).
-    halves : (...) array
+    half_log_determinants : (...) array
         Half the log determinants, with the contribution of these unknowns [nat].
     """
     if not len(precision):
-        return products, halves
+        return products, half_log_determinants
     prior_precision = np.maximum(precision, LEAST_PRECISION)
     kept_count = products.shape[-1] - len(prior_precision)
     # Schur complement of the last columns
     root = np.linalg.cholesky(products[..., kept_count:, kept_count:] + np.diag(prior_precision))
     projected = np.asarray(np.linalg.solve(root, products[..., kept_count:, :kept_count]))
-    half_log_determinants = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
-    remaining_halves = halves + half_log_determinants - 0.5 * np.log(prior_precision).sum()
-    return products[..., :kept_count, :kept_count] - projected.mT @ projected, remaining_halves
+    half_log_det_of_block = np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(-1)
+    remaining_half_log_dets = (
+        half_log_determinants + half_log_det_of_block - 0.5 * np.log(prior_precision).sum()
+    )
+    return products[
+        ..., :kept_count, :kept_count
+    ] - projected.mT @ projected, remaining_half_log_dets
 
 
-def regression(filtered: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:
+def sum_regressions(filters: Sequence[ForceFilter], rows: Sequence[FloatArray]) -> Regression:
     """Return the normal equations of all trials, without the unknowns of single trials.
 
     Parameters
     ----------
-    filtered : sequence of ForceFilter
+    filters : sequence of ForceFilter
         The filter of each trial.
     rows : sequence of (1 + K + L, N, C) array
         The residual of each trial, and its columns of the K common and the trial's own L unknowns.
     """
     groups: dict[tuple[bytes, ...], list[tuple[ForceFilter, FloatArray]]] = {}
-    for trial_filter, columns in zip(filtered, rows, strict=True):
-        groups.setdefault(trial_filter.key, []).append((trial_filter, columns))
+    for trial_filter, columns in zip(filters, rows, strict=True):
+        groups.setdefault(trial_filter.filter_key, []).append((trial_filter, columns))
     total: FloatArray | float = 0.0
     log_determinant = 0.0
     # trials of one group have the same gains: one pass of the filter whitens the columns of all
     for group in groups.values():
         first_filter, _ = group[0]
-        products_of_group, half_log_determinant = first_filter.products(
+        products_of_group, half_log_determinant = first_filter.whitened_products(
             np.concatenate([columns for _, columns in group])
         )
         ends = np.cumsum([0, *(len(columns) for _, columns in group)]).tolist()
         for (trial_filter, _), (begin, end) in zip(group, pairwise(ends), strict=True):
             products_of_trial = products_of_group[begin:end, begin:end]
-            products, half_with_local_unknowns = without(
+            products, half_with_local_unknowns = integrate_out_last(
                 products_of_trial, half_log_determinant, trial_filter.trial.local_precision
             )
             total = total + products

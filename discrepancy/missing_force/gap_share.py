@@ -24,9 +24,9 @@ class GapShare:
 
     Attributes
     ----------
-    before, after : (B,) array
-        The sum of squares of the gap in each of B blocks, without and with the hypothesis.
-    noise : (B,) array
+    squares_before, squares_after : (B,) array
+        The sum of squares of the gap in each of B blocks of time, without and with the hypothesis.
+    noise_squares : (B,) array
         The sum of squares that the noise of the readings alone gives in each block.
     held_out : bool
         Whether the trials were held out.
@@ -40,24 +40,26 @@ class GapShare:
         The gap, one of `OF_FORCE` (forces, weighted by what they do to the state), `OF_PREDICTIONS`
         (changes of the readings by the forces in a block, from its start) and `OF_READINGS`
         (differences between readings and simulation).
-    tested : bool
-        Whether the force of the law is large enough in these trials to be seen.
+    is_tested : bool
+        Whether the force of the law is so large in these trials that they test it.
     """
 
-    before: FloatArray
-    after: FloatArray
-    noise: FloatArray
+    squares_before: FloatArray
+    squares_after: FloatArray
+    noise_squares: FloatArray
     held_out: bool
     trial_count: int
     remaining_rms: float
     total_rms: float
     kind: str
-    tested: bool
+    is_tested: bool
 
     @property
     def value(self) -> float:
         """The share over all blocks."""
-        return float(_share_of(self.before.sum(), self.after.sum(), self.noise.sum()))
+        return float(
+            _share_of(self.squares_before.sum(), self.squares_after.sum(), self.noise_squares.sum())
+        )
 
     def bootstrap_draws(self) -> FloatArray:
         """Return the share (DRAWS,) of random sets of blocks, drawn with replacement.
@@ -65,13 +67,15 @@ class GapShare:
         A block bootstrap (Kuensch 1989, Ann. Statist. 17, 1217-1241). The seed is fixed, so that
         all shares of the same number of blocks draw the same ones and can be compared draw by draw.
         """
-        block_count = len(self.before)
+        block_count = len(self.squares_before)
         generator = np.random.default_rng(SEED)
         times_drawn = generator.multinomial(
             block_count, np.full(block_count, 1.0 / block_count), DRAWS
         )
         return _share_of(
-            times_drawn @ self.before, times_drawn @ self.after, times_drawn @ self.noise
+            times_drawn @ self.squares_before,
+            times_drawn @ self.squares_after,
+            times_drawn @ self.noise_squares,
         )
 
     def is_larger_than(self, other: "GapShare") -> bool:

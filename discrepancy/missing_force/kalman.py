@@ -1,38 +1,39 @@
-"""The Kalman filter of a record, forwards and backwards, and how both are joined.
+"""The Kalman filter of a record, forwards and backwards in time, and how both are joined.
 
-The forward filter says what is known of the state before a moment, the backward one what the
-readings after it say (Fraser and Potter 1969, IEEE Transactions on Automatic Control 14, 387-390).
-Together they give the evidence of all readings, and the state at that moment. Readings are taken in
-one at a time, so that the forward filter inverts no matrix. Covariance and information are updated
-in Joseph form; once they have converged they are kept.
+The forward filter gives the state at a moment by the readings before it, the backward filter the
+information on that state by the readings after it (Fraser and Potter 1969, IEEE Transactions on
+Automatic Control 14, 387-390). Together they give the evidence of all readings, and the state at
+that moment. Readings are taken in one at a time, so that the forward filter inverts no matrix.
+Covariance and information are updated in Joseph form; once they have converged they are kept.
 
 Shapes: n states, c channels, N samples, W columns that are filtered together (the residual and the
-derivatives by unknowns), S different steps, B places (samples whose state is asked for). Readings
-are divided by the deviation of the white part of their noise, which therefore has variance one.
+derivatives by unknowns), S different steps, B queried samples (samples whose state is asked for).
+Readings are divided by the deviation of the white part of their noise, which therefore has variance
+one.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 from fe.compilation import callable_when_compiled, compiled
 
-from .backward import backward
+from .backward import filter_backward
 from .covariances import is_steady
 
-SMALL_PART, ORDERS = 0.25, 12
+SERIES_NORM, SERIES_TERMS = 0.25, 12
 """Norm of the rate matrix times the time up to which its exponential is summed as a series, and the
 number of terms: the remainder is 1e-16."""
-LEAST_SIZE = 0.5
-"""Variance of an innovation over that of the noise below which a far too large force has lost it to
-rounding. Exactly it is at least one."""
+LEAST_INNOVATION_VARIANCE = 0.5
+"""Least variance of an innovation over that of the noise. The exact variance is at least one; with
+a missing force that is far too large, rounding errors make the computed one smaller."""
 
 
 @compiled
-def discretised(
+def discretise(
     generator: FloatArray, intensity: FloatArray, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return transitions and process noises (J, n, n) of steps of given lengths.
@@ -57,7 +58,7 @@ def discretised(
     for k in range(len(lengths)):
         doublings = 0
         part_length = lengths[k]
-        while norm * part_length > SMALL_PART:
+        while norm * part_length > SERIES_NORM:
             doublings += 1
             part_length = 0.5 * part_length
         # Taylor series of both for the part
@@ -65,7 +66,7 @@ def discretised(
         transition_term = np.eye(n)
         noise = intensity * part_length
         noise_term = intensity * part_length
-        for order in range(1, ORDERS):
+        for order in range(1, SERIES_TERMS):
             transition_term = (generator @ transition_term) * (part_length / order)
             transition = transition + transition_term
             noise_term = (generator @ noise_term + noise_term @ generator.T) * (
@@ -134,21 +135,21 @@ def update_mean(gain: FloatArray, innovation: FloatArray, mean: FloatArray) -> N
 
 
 @compiled
-def forward(
+def filter_forward(
     transitions: FloatArray,
     noises: FloatArray,
     step_of_sample: IntArray,
-    rows: FloatArray,
+    output_rows: FloatArray,
     used: BoolArray,
     columns: FloatArray,
     first: int,
     covariance: FloatArray,
     mean: FloatArray,
-    places: IntArray,
+    query_samples: IntArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the filtered state before some samples, from the readings since sample `first`.
 
-    Each such sample is a place: the readings of the sample before it are the last ones taken in.
+    The readings of the sample before a queried one are the last ones that its state contains.
 
     Parameters
     ----------
@@ -156,37 +157,37 @@ def forward(
         The transitions of the different steps, and the covariances of their process noise.
     step_of_sample : (N,) ndarray
         The step that leads to each sample.
-    rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+    output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     first : int
         The first sample whose readings are taken in.
     covariance, mean : (n, n), (n, W) ndarray
         The state after the sample before `first`; for the first sample of a record, the state at
         that sample before its readings.
-    places : (B,) ndarray
+    query_samples : (B,) ndarray
         The samples before which the state is asked for, ascending.
 
     Returns
     -------
     covariances, means : (B, n, n), (B, n, W) ndarray
-        The state after the last sample before each place.
-    white : (places[-1] - first, c, W) ndarray
+        The state after the last sample before each queried one.
+    whitened : (query_samples[-1] - first, c, W) ndarray
         The innovations of the columns, divided by their standard deviations.
-    halves : (B,) ndarray
+    half_log_determinants : (B,) ndarray
         Half the sum of the logarithms of the variances of the innovations; infinite if a variance
         has been lost to rounding.
     gains, variances : (B, c, n), (B, c) ndarray
         The gains and the variances of the innovations of that last sample.
     """
     n, column_count = mean.shape
-    channel_count = len(rows)
-    place_count = len(places)
-    covariances = np.zeros((place_count, n, n))
-    means = np.zeros((place_count, n, column_count))
-    white = np.zeros((places[-1] - first, channel_count, column_count))
-    halves = np.full(place_count, np.inf)
-    all_gains = np.zeros((place_count, channel_count, n))
-    all_variances = np.ones((place_count, channel_count))
+    channel_count = len(output_rows)
+    query_count = len(query_samples)
+    covariances = np.zeros((query_count, n, n))
+    means = np.zeros((query_count, n, column_count))
+    whitened = np.zeros((query_samples[-1] - first, channel_count, column_count))
+    half_log_determinants = np.full(query_count, np.inf)
+    all_gains = np.zeros((query_count, channel_count, n))
+    all_variances = np.ones((query_count, channel_count))
 
     covariance = covariance.copy()
     mean = mean.copy()
@@ -194,18 +195,18 @@ def forward(
     gains = np.zeros((channel_count, n))
     variances = np.ones(channel_count)
     half_log_determinant = 0.0
-    place = 0
+    query = 0
     steady = False
-    for k in range(first, places[-1] + 1):
-        # store the state before a place
-        while place < place_count and places[place] == k:
-            covariances[place] = covariance
-            means[place] = mean
-            halves[place] = half_log_determinant
-            all_gains[place] = gains
-            all_variances[place] = variances
-            place += 1
-        if place == place_count:
+    for k in range(first, query_samples[-1] + 1):
+        # store the state before a queried sample
+        while query < query_count and query_samples[query] == k:
+            covariances[query] = covariance
+            means[query] = mean
+            half_log_determinants[query] = half_log_determinant
+            all_gains[query] = gains
+            all_variances[query] = variances
+            query += 1
+        if query == query_count:
             break
         # a steady covariance stays so while the step and the used readings are the same
         same_step = k > first + 1 and step_of_sample[k] == step_of_sample[k - 1]
@@ -225,108 +226,158 @@ def forward(
             if not used[k, c]:
                 continue
             if not steady:
-                variances[c] = update_covariance(covariance, rows[c], gains[c])
-                # this place and later ones keep their infinite half log determinant
-                if not variances[c] > LEAST_SIZE:
-                    return covariances, means, white, halves, all_gains, all_variances
-            innovation = white[k - first, c]
+                variances[c] = update_covariance(covariance, output_rows[c], gains[c])
+                # this query and later ones keep their infinite half log determinant
+                if not variances[c] > LEAST_INNOVATION_VARIANCE:
+                    return (
+                        covariances,
+                        means,
+                        whitened,
+                        half_log_determinants,
+                        all_gains,
+                        all_variances,
+                    )
+            innovation = whitened[k - first, c]
             innovation[:] = columns[k, c]
-            subtract_prediction(rows[c], mean, innovation)
+            subtract_prediction(output_rows[c], mean, innovation)
             update_mean(gains[c], innovation, mean)
             innovation /= np.sqrt(variances[c])
             half_log_determinant += 0.5 * np.log(variances[c])
         steady = steady or (is_like_previous and is_steady(covariance, previous_covariance))
-    return covariances, means, white, halves, all_gains, all_variances
+    return covariances, means, whitened, half_log_determinants, all_gains, all_variances
 
 
 @compiled
-def driven(
-    parts: int,
+def simulate_inputs(
+    substeps: int,
     transitions: FloatArray,
-    push_at_begin: FloatArray,
-    push_at_end: FloatArray,
+    by_input_at_begin: FloatArray,
+    by_input_at_end: FloatArray,
     step_of_sample: IntArray,
     start: FloatArray,
-    pushes: FloatArray,
+    inputs: FloatArray,
 ) -> FloatArray:
     """Return the state (F, n) at the fine stamps under inputs that are linear between these.
 
     Parameters
     ----------
-    parts : int
+    substeps : int
         The number of fine steps between two samples.
     transitions : (J, n, n) ndarray
         The transitions of the fine steps of different lengths.
-    push_at_begin, push_at_end : (J, n, d) ndarray
+    by_input_at_begin, by_input_at_end : (J, n, d) ndarray
         The change of the state over a fine step for a unit of an input at its start, or at its end.
     step_of_sample : (N,) ndarray
         The index of the length of the interval that ends at each sample.
     start : (n,) ndarray
         The state at the first fine stamp.
-    pushes : (F, d) ndarray
+    inputs : (F, d) ndarray
         The d inputs at the fine stamps.
     """
-    n, input_count = push_at_begin.shape[1], pushes.shape[1]
-    states = np.zeros((len(pushes), n))
+    n, input_count = by_input_at_begin.shape[1], inputs.shape[1]
+    states = np.zeros((len(inputs), n))
     states[0] = start
-    for k in range(len(pushes) - 1):
-        step = step_of_sample[k // parts + 1]
+    for k in range(len(inputs) - 1):
+        step = step_of_sample[k // substeps + 1]
         for i in range(n):
             next_state = 0.0
             for j in range(n):
                 next_state += transitions[step, i, j] * states[k, j]
             for d in range(input_count):
                 next_state += (
-                    push_at_begin[step, i, d] * pushes[k, d]
-                    + push_at_end[step, i, d] * pushes[k + 1, d]
+                    by_input_at_begin[step, i, d] * inputs[k, d]
+                    + by_input_at_end[step, i, d] * inputs[k + 1, d]
                 )
             states[k + 1, i] = next_state
     return states
 
 
-FilterState = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-"""State of a filter with its sums: covariance or information matrix (.., n, n), means or
-information vectors (.., n, W), products of whitened columns (.., W, W), and half a log determinant
-(..)."""
-
-
-@dataclass(frozen=True, eq=False)
-class FilterSteps:
-    """The arrays of a record that `forward` and `backward` take, without the step of each sample.
+class FilterState(NamedTuple):
+    """What the readings up to a moment say of the state, and their part of the evidence.
 
     Attributes
     ----------
-    moves, noises : (S, n, n) ndarray
+    covariance : (..., n, n) ndarray
+        The covariance of the state.
+    mean : (..., n, W) ndarray
+        The mean of the state for a unit of each column.
+    products : (..., W, W) ndarray
+        The inner products of the whitened columns of these readings.
+    half_log_determinants : (...) ndarray
+        Half the log determinant of the covariance of these readings [nat].
+    """
+
+    covariance: FloatArray
+    mean: FloatArray
+    products: FloatArray
+    half_log_determinants: FloatArray
+
+
+class StateInformation(NamedTuple):
+    """What the readings from a moment on say of the state; see `filter_backward` for the density.
+
+    Attributes
+    ----------
+    matrix : (..., n, n) ndarray
+        The information matrix J.
+    vectors : (..., n, W) ndarray
+        The information vectors h, one for each column.
+    products : (..., W, W) ndarray
+        The inner products c of the whitened columns of these readings.
+    half_log_determinants : (...) ndarray
+        Half a log determinant [nat].
+    """
+
+    matrix: FloatArray
+    vectors: FloatArray
+    products: FloatArray
+    half_log_determinants: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class RecordFilter:
+    """A Kalman filter of a record, forwards and backwards in time.
+
+    The kind of the step that leads to each sample is given to its methods, so that one filter can
+    be used for several paths of a switched force.
+
+    Attributes
+    ----------
+    transitions, noises : (S, n, n) ndarray
         The transitions of the different steps, and the covariances of their process noise.
-    rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
+    output_rows, used, columns : (c, n), (N, c), (N, c, W) ndarray
         The readings for a unit of each state; whether each reading counts; the columns.
     """
 
-    moves: FloatArray
+    transitions: FloatArray
     noises: FloatArray
-    rows: FloatArray
+    output_rows: FloatArray
     used: BoolArray
     columns: FloatArray
 
     @cached_property
     def noise_roots(self) -> FloatArray:
         """The roots (S, n, n) of the process noises: root @ root.T is the covariance."""
-        return _roots(self.noises)
+        return _covariance_roots(self.noises)
 
-    def begin(self, covariance: FloatArray) -> FilterState:
+    def initial_state(self, covariance: FloatArray) -> FilterState:
         """Return the state of the filter before the first sample, with a covariance (n, n)."""
-        n, column_count = self.rows.shape[1], self.columns.shape[2]
-        return (
-            covariance,
-            np.zeros((n, column_count)),
-            np.zeros((column_count, column_count)),
-            np.zeros(()),
+        n, column_count = self.output_rows.shape[1], self.columns.shape[2]
+        return FilterState(
+            covariance=covariance,
+            mean=np.zeros((n, column_count)),
+            products=np.zeros((column_count, column_count)),
+            half_log_determinants=np.zeros(()),
         )
 
-    def before(
-        self, step_of_sample: IntArray, first: int, state: Sequence[FloatArray], places: IntArray
+    def filter_before(
+        self,
+        step_of_sample: IntArray,
+        first: int,
+        state: FilterState,
+        query_samples: IntArray,
     ) -> FilterState:
-        """Return the states of the filter before the steps into some samples.
+        """Return the states (B, ...) of the filter before the steps that lead to some samples.
 
         Parameters
         ----------
@@ -334,69 +385,77 @@ class FilterSteps:
             The step that leads to each sample.
         first : int
             The first sample whose readings are taken in.
-        state : sequence of array
-            The state of the filter before that sample, as `FilterState`.
-        places : (B,) array
+        state : FilterState
+            The state of the filter before that sample.
+        query_samples : (B,) array
             The samples before which the state is asked for, ascending.
         """
-        covariance, mean, products_before, halves_before = state
-        covariances, means, white, halves, *_ = forward(
-            self.moves,
+        covariances, means, whitened, half_log_determinants, *_ = filter_forward(
+            self.transitions,
             self.noises,
             step_of_sample,
-            self.rows,
+            self.output_rows,
             self.used,
             self.columns,
             first,
-            covariance,
-            mean,
-            places,
+            state.covariance,
+            state.mean,
+            query_samples,
         )
-        # sums of the products of whitened columns, from the first sample up to each place
-        white_by_place = np.split(
-            white.reshape(-1, white.shape[-1]), len(self.rows) * (places[:-1] - first)
+        # products of the readings since `first`: between two queried samples, then summed up
+        whitened_rows = whitened.reshape(-1, whitened.shape[-1])
+        row_of_query = len(self.output_rows) * (query_samples[:-1] - first)
+        products_between = [rows.T @ rows for rows in np.split(whitened_rows, row_of_query)]
+        products = np.cumsum(products_between, axis=0)
+        return FilterState(
+            covariance=covariances,
+            mean=means,
+            products=products + state.products,
+            half_log_determinants=half_log_determinants + state.half_log_determinants,
         )
-        products = np.cumsum(
-            [white_columns.T @ white_columns for white_columns in white_by_place], axis=0
-        )
-        return covariances, means, products + products_before, halves + halves_before
 
-    def after(self, step_of_sample: IntArray, places: IntArray) -> FilterState:
-        """Return the information on the state at some samples, from these and later readings.
+    def information_after(
+        self, step_of_sample: IntArray, query_samples: IntArray
+    ) -> StateInformation:
+        """Return the information (B, ...) on the state at some samples, from readings since then.
 
         Parameters
         ----------
         step_of_sample : (N,) array
             The step that leads to each sample.
-        places : (B,) array
+        query_samples : (B,) array
             The samples, ascending.
         """
-        return backward(
-            self.moves, self.noise_roots, step_of_sample, self.rows, self.used, self.columns, places
+        matrix, vectors, products, half_log_determinants = filter_backward(
+            self.transitions,
+            self.noise_roots,
+            step_of_sample,
+            self.output_rows,
+            self.used,
+            self.columns,
+            query_samples,
         )
+        return StateInformation(matrix, vectors, products, half_log_determinants)
 
 
-def _roots(covariances: FloatArray) -> FloatArray:
+def _covariance_roots(covariances: FloatArray) -> FloatArray:
     """Return roots (..., n, n) of covariances: root @ root.T is the covariance."""
     eigenvalues, eigenvectors = np.linalg.eigh(covariances)
     return np.ascontiguousarray(eigenvectors * np.sqrt(np.maximum(eigenvalues, 0.0))[..., None, :])
 
 
-def joined(
-    before: Sequence[FloatArray], after: Sequence[FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """Return the products and half log determinants of whole records from those of two parts.
+def join_filters(before: FilterState, after: StateInformation) -> tuple[FloatArray, FloatArray]:
+    """Return the products and half log determinants of whole records, from those of two parts.
 
-    The state z at the joint is integrated out. It is Gaussian given the readings before; those
-    after have the log density of `backward`.
+    The state z at the moment between both parts is integrated out. Given the readings before, it is
+    Gaussian; the readings after have the log density that `filter_backward` gives.
 
     Parameters
     ----------
-    before : sequence of array
-        Covariance, means, products and half log determinants of the readings before.
-    after : sequence of array
-        Information matrix, information vectors, products and half log determinants of the readings
-        after.
+    before : FilterState
+        The state z by the readings before the moment.
+    after : StateInformation
+        The information on z by the readings after the moment.
 
     Returns
     -------
@@ -405,21 +464,25 @@ def joined(
     half_log_determinants : (...) array
         Half the log determinant of the covariance of all its readings [nat].
     """
-    covariance, mean, products, earlier_half = before
-    J, h, later_products, later_half = after
+    mean = before.mean
+    J = after.matrix
+    h = after.vectors
     # with covariance R R^T and residual information h - J m of the mean m, completing the square
     # in z leaves (h - J m)^T R (I + R^T J R)^-1 R^T (h - J m), and half log det (I + R^T J R)
-    root = _roots(covariance)
-    inner_root = np.linalg.cholesky(np.eye(covariance.shape[-1]) + root.mT @ J @ root)
+    root = _covariance_roots(before.covariance)
+    inner_root = np.linalg.cholesky(np.eye(before.covariance.shape[-1]) + root.mT @ J @ root)
     explained = np.asarray(np.linalg.solve(inner_root, root.mT @ (h - J @ mean)))
     mean_by_h = mean.mT @ h
-    all_products = (
-        products
-        + later_products
+    products = (
+        before.products
+        + after.products
         - mean_by_h
         - mean_by_h.mT
         + mean.mT @ J @ mean
         - explained.mT @ explained
     )
     half_log_determinant = np.log(np.diagonal(inner_root, axis1=-2, axis2=-1)).sum(-1)
-    return all_products, earlier_half + later_half + half_log_determinant
+    half_log_determinants = (
+        before.half_log_determinants + after.half_log_determinants + half_log_determinant
+    )
+    return products, half_log_determinants

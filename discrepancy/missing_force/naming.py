@@ -25,38 +25,38 @@ from discrepancy.fits.candidate import (
 from discrepancy.fits.fitting import LARGEST_EFFECT
 
 from .at_ports import MissingForces
-from .explained import ForceHypothesis, with_most_probable_forces
-from .hypotheses import log_prior, scaled, trial_values
+from .explained import ForceHypothesis, fit_missing_forces
+from .hypotheses import log_prior, scale_processes, values_to_try
+from .linear_trials import EffectColumn, LinearTrials, TrialMotion, sum_of_columns
 from .process_search import MOST_STEPS
-from .view import EffectColumn, TrialMotion, View, combined
 
-WIDE = 3.0
-"""Prior standard deviation of the factor on an effect, relative to the factor that would explain
-all of the gap."""
-SIZES = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
-"""Sizes of the missing forces with which effects are screened, over the most probable ones without
-effects."""
-TIMES = (0.5, 1.5)
+FACTOR_DEVIATION = 3.0
+"""Prior standard deviation of the factor on an effect in the screening, over the factor with
+which the effect would be as large as the gap. It is wide, so that the screening prefers no size."""
+SCREENED_DEVIATIONS = (1.0, 0.3, 0.1, 0.03, 0.01, 0.003)
+"""Standard deviations of the missing forces with which effects are screened, over the most
+probable ones without effects: an effect leaves only a part of the force."""
+SCREENED_TIMES = (0.5, 1.5)
 """Correlation times of these forces, over the most probable ones without effects."""
 LARGEST_RATIO = 1e100
 """Ratio of an effect to the gap that stands for infinity, if the gap is zero."""
-WIDTHS = (10, 4, 4)
-"""Number of effects that are followed after the screening: as single effects, as second ones and as
-third ones."""
-TIED = 1.0
-"""Difference of log evidence to the best values of an effect, up to which other values of it are
-followed too [nat]."""
-BEAM = 3
+FOLLOWED_COUNTS = (10, 4, 4)
+"""Numbers of effects that are fitted after the screening: as single effects, as second ones and as
+third ones of a set."""
+TIED_EVIDENCE = 1.0
+"""Difference to the log evidence of the best values of an effect up to which fits begin at its
+other values, too [nat]."""
+BEAM_WIDTH = 3
 """Number of most probable sets to which one more effect is added."""
-ROUNDS = 8
+MOST_ITERATIONS = 8
 """Largest number of steps of the parameters of an effect."""
 LONGEST_STEP = 1.5
 """Longest step of a parameter, in prior standard deviations."""
-SETTLED = 0.05
+CONVERGED_STEP = 0.05
 """Step of a parameter below which the iteration ends, in prior standard deviations."""
-LEAST_PART = 0.2
-"""Least part of a step that is taken if successive steps have opposite directions."""
-SLOPE = 0.05
+LEAST_DAMPING = 0.2
+"""Least fraction of a step that is taken if successive steps have opposite directions."""
+HALF_DIFFERENCE = 0.05
 """Half the difference of a standard normal parameter in derivatives of an effect."""
 
 
@@ -70,12 +70,20 @@ class ScreenedEffect(NamedTuple):
     term : EffectTerm
         The effect at its place.
     starts : list of (E,) array
-        The scaled parameters from which the effect is followed.
+        The scaled parameters from which fits of the effect begin.
     """
 
     log_evidence: float
     term: EffectTerm
     starts: list[FloatArray]
+
+
+class _TriedEffect(NamedTuple):
+    """An effect at its place, the scaled values (E,) at which it is tried, and its column there."""
+
+    term: EffectTerm
+    values: FloatArray
+    column: EffectColumn
 
 
 class _WeighedColumn(NamedTuple):
@@ -85,12 +93,19 @@ class _WeighedColumn(NamedTuple):
     factor: float
 
 
+class _WeighedStart(NamedTuple):
+    """The log evidence of an effect [nat], and the scaled parameters (E,) at which a fit begins."""
+
+    log_evidence: float
+    start: FloatArray
+
+
 class ForceSearch(MissingForces):
     """The search for the effects that explain the missing forces of a problem."""
 
     # ---------------------------------------------------------------- what the force is
 
-    def name(
+    def rank_hypotheses(
         self,
         effects: Sequence[Effect],
         on_progress: Callable[[str], None] = lambda message: None,
@@ -107,30 +122,32 @@ class ForceSearch(MissingForces):
         on_progress : callable
             The function that takes a line on what is compared, and how much remains.
         """
-        count = len(effects)
-        hypotheses: dict[CandidateKey, ForceHypothesis] = {(): self.whole}
-        beam = [self.whole]
-        for width in WIDTHS:
-            best = self._ranked(hypotheses, count)[0]
+        effect_count = len(effects)
+        hypotheses: dict[CandidateKey, ForceHypothesis] = {(): self.hypothesis_of_all_ports}
+        beam = [self.hypothesis_of_all_ports]
+        for followed_count in FOLLOWED_COUNTS:
+            best = self._sort_by_score(hypotheses, effect_count)[0]
             extended_hypotheses: dict[CandidateKey, ForceHypothesis] = {}
             for base in beam:
-                self._follow_beside(base, effects, width, extended_hypotheses, on_progress)
+                self._fit_promising_effects(
+                    base, effects, followed_count, extended_hypotheses, on_progress
+                )
             hypotheses |= extended_hypotheses
-            ranked = self._ranked(extended_hypotheses, count)
-            if not ranked or self.score(ranked[0], count) <= self.score(best, count):
+            ranked = self._sort_by_score(extended_hypotheses, effect_count)
+            if not ranked or self.score(ranked[0], effect_count) <= self.score(best, effect_count):
                 break
-            beam = ranked[:BEAM]
-        return self._ranked(hypotheses, count)
+            beam = ranked[:BEAM_WIDTH]
+        return self._sort_by_score(hypotheses, effect_count)
 
-    def _follow_beside(
+    def _fit_promising_effects(
         self,
         base: ForceHypothesis,
         effects: Sequence[Effect],
-        width: int,
-        longer: dict[CandidateKey, ForceHypothesis],
+        followed_count: int,
+        extended_hypotheses: dict[CandidateKey, ForceHypothesis],
         on_progress: Callable[[str], None],
     ) -> None:
-        """Follow the most promising effects in addition to a base, and store them in `longer`.
+        """Fit the most promising effects, each added to a base, and store the hypotheses.
 
         Parameters
         ----------
@@ -138,61 +155,65 @@ class ForceSearch(MissingForces):
             The hypothesis to which an effect is added.
         effects : sequence of Effect
             The effects.
-        width : int
-            The number of effects that are followed.
-        longer : dict of CandidateKey to ForceHypothesis
+        followed_count : int
+            The number of effects that are fitted.
+        extended_hypotheses : dict of CandidateKey to ForceHypothesis
             The hypotheses with one more effect, to which results are added.
         on_progress : callable
             The function that takes a line on what is compared.
         """
         base_in_words = f" beside {base.candidate.description}" if base.candidate.terms else ""
         on_progress(f"comparing all effects{base_in_words} with the missing force")
-        promising = self.screened(base, effects)[:width]
+        promising = self.screen_effects(base, effects)[:followed_count]
         for number, screened_effect in enumerate(promising):
             candidate = base.candidate.with_term(screened_effect.term)
-            if candidate.key in longer:
+            if candidate.key in extended_hypotheses:
                 continue
             remaining_count = len(promising) - number - 1
             description = candidate.description
             on_progress(f"following {description} along the missing force, {remaining_count} more")
-            followed_hypotheses = []
+            fitted_hypotheses = []
             for start in screened_effect.starts:
                 effect = np.concatenate((base.effect, start))
-                hypothesis = self.followed(base, candidate, effect)
+                hypothesis = self.fit_along_motion(base, candidate, effect)
                 if hypothesis is not None:
-                    followed_hypotheses.append(hypothesis)
-            if followed_hypotheses:
-                best = max(followed_hypotheses, key=lambda hypothesis: hypothesis.log_evidence)
-                longer[candidate.key] = best
+                    fitted_hypotheses.append(hypothesis)
+            if fitted_hypotheses:
+                best = max(fitted_hypotheses, key=lambda hypothesis: hypothesis.log_evidence)
+                extended_hypotheses[candidate.key] = best
 
-    def score(self, hypothesis: ForceHypothesis, count: int) -> float:
+    def score(self, hypothesis: ForceHypothesis, effect_count: int) -> float:
         """Return the log of evidence times prior of a hypothesis [nat].
 
         Parameters
         ----------
         hypothesis : ForceHypothesis
             The hypothesis.
-        count : int
+        effect_count : int
             The number of effects that are compared.
         """
-        prior = log_prior(hypothesis.candidate, count, self.problem.setting)
+        prior = log_prior(hypothesis.candidate, effect_count, self.problem.setting)
         return hypothesis.log_evidence + prior
 
-    def _ranked(
-        self, hypotheses: Mapping[CandidateKey, ForceHypothesis], count: int
+    def _sort_by_score(
+        self, hypotheses: Mapping[CandidateKey, ForceHypothesis], effect_count: int
     ) -> list[ForceHypothesis]:
-        """Return hypotheses, the most probable first; `count` effects are compared."""
-        return sorted(hypotheses.values(), key=lambda hypothesis: -self.score(hypothesis, count))
+        """Return hypotheses, the most probable first; `effect_count` effects are compared."""
+        return sorted(
+            hypotheses.values(), key=lambda hypothesis: -self.score(hypothesis, effect_count)
+        )
 
     # ---------------------------------------------------------------- screen of one more effect
 
-    def screened(self, base: ForceHypothesis, effects: Iterable[Effect]) -> list[ScreenedEffect]:
+    def screen_effects(
+        self, base: ForceHypothesis, effects: Iterable[Effect]
+    ) -> list[ScreenedEffect]:
         """Return the effects that may be added to a hypothesis, the most promising first.
 
-        Each effect is tried at each of its places, with several values of its parameters. It is
-        followed from all values whose evidence is within `TIED` of the best. For example, dead
-        zones of different stiffness act alike if only their amplitude is fitted, but lead to
-        different ends.
+        Each effect is tried at each of its places, with several values of its parameters. All
+        values whose evidence is within `TIED_EVIDENCE` of the best are starts of later fits. For
+        example, dead zones of different stiffness act alike if only their amplitude is fitted, but
+        fits that begin with them lead to different ends.
 
         Parameters
         ----------
@@ -201,33 +222,49 @@ class ForceSearch(MissingForces):
         effects : iterable of Effect
             The effects.
         """
-        terms: list[EffectTerm] = []
-        values_of_columns: list[FloatArray] = []
-        columns: list[EffectColumn] = []
-        for term in self._terms_beside(base, effects):
-            for values in trial_values(term):
-                candidate = Candidate((term,))
-                column = self.columns.of(base.view, base.motions, candidate, values)
-                if column is not None and any(np.any(change.readings) for change in column):
-                    terms.append(term)
-                    values_of_columns.append(values)
-                    columns.append(column)
-        starts_of_terms: dict[EffectTerm, list[tuple[float, FloatArray]]] = {}
-        for number, (log_evidence, factor) in self._weighed(base, columns, terms).items():
-            term = terms[number]
-            values = values_of_columns[number]
-            start = term.rescaled(values, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
-            starts_of_terms.setdefault(term, []).append((log_evidence, start))
+        tried_effects = self._try_effects(base, effects)
+        weighed_columns = self._weigh_columns(base, tried_effects)
+        weighed_by_term: dict[EffectTerm, list[_WeighedStart]] = {}
+        for index, (log_evidence, factor) in weighed_columns.items():
+            tried = tried_effects[index]
+            start = tried.term.multiply_magnitudes(
+                tried.values, factor, -LARGEST_EFFECT, LARGEST_EFFECT
+            )
+            weighed_by_term.setdefault(tried.term, []).append(_WeighedStart(log_evidence, start))
         screened_effects = []
-        for term, starts in starts_of_terms.items():
-            best_log_evidence = max(log_evidence for log_evidence, _ in starts)
-            nearly_best_starts = [
-                start for log_evidence, start in starts if log_evidence > best_log_evidence - TIED
+        for term, weighed_starts in weighed_by_term.items():
+            best_evidence = max(weighed.log_evidence for weighed in weighed_starts)
+            starts = [
+                weighed.start
+                for weighed in weighed_starts
+                if weighed.log_evidence > best_evidence - TIED_EVIDENCE
             ]
-            screened_effects.append(ScreenedEffect(best_log_evidence, term, nearly_best_starts))
+            screened_effects.append(ScreenedEffect(best_evidence, term, starts))
         return sorted(screened_effects, key=lambda effect: -effect.log_evidence)
 
-    def _terms_beside(
+    def _try_effects(self, base: ForceHypothesis, effects: Iterable[Effect]) -> list[_TriedEffect]:
+        """Return the columns of all effects that may be added, at several values of each.
+
+        Columns that change no reading are left out.
+
+        Parameters
+        ----------
+        base : ForceHypothesis
+            The hypothesis to which an effect is added, with the motion along which effects act.
+        effects : iterable of Effect
+            The effects.
+        """
+        tried_effects = []
+        for term in self._terms_to_add(base, effects):
+            for values in values_to_try(term):
+                column = self.column_builder.column_of_candidate(
+                    base.linear_trials, base.motions, Candidate((term,)), values
+                )
+                if column is not None and any(np.any(change.readings) for change in column):
+                    tried_effects.append(_TriedEffect(term, values, column))
+        return tried_effects
+
+    def _terms_to_add(
         self, base: ForceHypothesis, effects: Iterable[Effect]
     ) -> Iterator[EffectTerm]:
         """Yield the effects at places where a hypothesis lacks them, also with a free shape.
@@ -248,54 +285,53 @@ class ForceSearch(MissingForces):
                 if effect.shape:
                     yield EffectTerm(effect, place, free_shape=True)
 
-    def _weighed(
-        self,
-        base: ForceHypothesis,
-        columns: Sequence[EffectColumn],
-        terms: Sequence[EffectTerm],
+    def _weigh_columns(
+        self, base: ForceHypothesis, tried_effects: Sequence[_TriedEffect]
     ) -> dict[int, _WeighedColumn]:
         """Return the best evidence and factor of each column, added alone to a hypothesis.
 
-        The best is taken over several sizes and times of the remaining missing forces.
+        The best is taken over several deviations and times of the remaining missing forces.
 
         Parameters
         ----------
         base : ForceHypothesis
             The hypothesis to which an effect is added.
-        columns : sequence of EffectColumn
-            The columns, each of an effect at one set of values of its parameters.
-        terms : sequence of EffectTerm
-            The effect of each column.
+        tried_effects : sequence of _TriedEffect
+            The effects with their columns.
 
         Returns
         -------
         dict of int to _WeighedColumn
-            The evidence and factor, by the index of the column. A column is left out if its factor
-            always has a sign that its effect cannot have.
+            The evidence and factor, by the index of the tried effect. One is left out if its factor
+            always has a sign that the effect cannot have.
         """
-        if not columns:
+        if not tried_effects:
             return {}
-        view_with_columns = replace(
-            base.view,
+        columns = [tried.column for tried in tried_effects]
+        with_columns = replace(
+            base.linear_trials,
             motions=base.motions,
-            effects=(*base.view.effects, *columns),
-            precision=(*base.view.precision, *self._prior_precisions(base, columns)),
+            effect_columns=(*base.linear_trials.effect_columns, *columns),
+            effect_precision=(
+                *base.linear_trials.effect_precision,
+                *self._prior_precisions(base, columns),
+            ),
         )
-        known_count = len(base.view.precisions)
+        base_count = len(base.linear_trials.prior_precision)
         best: dict[int, _WeighedColumn] = {}
-        for size_factor, time_factor in product(SIZES, TIMES):
-            normal_equations = view_with_columns.products(
-                scaled(base.processes, size_factor, time_factor)
+        for size_factor, time_factor in product(SCREENED_DEVIATIONS, SCREENED_TIMES):
+            normal_equations = with_columns.regression(
+                scale_processes(base.processes, size_factor, time_factor)
             )
-            # the unknowns of the base are fitted again with each column
-            for number, term in enumerate(terms):
-                unknowns = [*range(known_count), known_count + number]
-                solution = normal_equations.solve(unknowns, view_with_columns.precisions[unknowns])
+            for index, tried in enumerate(tried_effects):
+                # the unknowns of the base are fitted again, with this column alone
+                unknowns = [*range(base_count), base_count + index]
+                solution = normal_equations.solve(unknowns, with_columns.prior_precision[unknowns])
                 factor = float(solution.mean[-1])
-                is_better = number not in best or best[number].log_evidence < solution.evidence
-                has_possible_sign = factor > 0.0 or term.may_be_negative
-                if is_better and np.isfinite(solution.evidence) and has_possible_sign:
-                    best[number] = _WeighedColumn(solution.evidence, factor)
+                is_better = index not in best or best[index].log_evidence < solution.log_evidence
+                has_possible_sign = factor > 0.0 or tried.term.may_be_negative
+                if is_better and np.isfinite(solution.log_evidence) and has_possible_sign:
+                    best[index] = _WeighedColumn(solution.log_evidence, factor)
         return best
 
     def _prior_precisions(
@@ -303,9 +339,9 @@ class ForceSearch(MissingForces):
     ) -> list[float]:
         """Return the prior precisions of the factors of columns.
 
-        The prior standard deviation of a factor is `WIDE` times the factor with which the effect
-        would be as large as the gap: of forces for an effect with a force, of readings for another
-        one.
+        The prior standard deviation of a factor is `FACTOR_DEVIATION` times the factor with which
+        the effect would be as large as the gap: of forces for an effect with a force, of readings
+        for another one.
 
         Parameters
         ----------
@@ -314,7 +350,7 @@ class ForceSearch(MissingForces):
         columns : sequence of EffectColumn
             The columns.
         """
-        gap_of_readings = _rms([trial.residual for trial in base.view.trials])
+        gap_of_readings = _rms([trial.residual for trial in base.linear_trials.trials])
         gap_of_forces = _rms([force for motion in base.motions for force in motion.forces.values()])
         precisions = []
         for column in columns:
@@ -325,17 +361,17 @@ class ForceSearch(MissingForces):
             else:
                 effect_rms = _rms([change.readings for change in column])
                 gap_rms = gap_of_readings
-            precisions.append(min(effect_rms / (WIDE * gap_rms), LARGEST_RATIO) ** 2)
+            precisions.append(min(effect_rms / (FACTOR_DEVIATION * gap_rms), LARGEST_RATIO) ** 2)
         return precisions
 
     # ---------------------------------------------------------------- most probable values
 
-    def followed(
+    def fit_along_motion(
         self, base: ForceHypothesis, candidate: Candidate, effect: FloatArray
     ) -> ForceHypothesis | None:
         """Return a hypothesis at its most probable values, by steps of an iterated smoother.
 
-        Each step evaluates the laws along the motion that the last one has estimated.
+        Each step evaluates the laws along the motion that was estimated by the previous one.
 
         Parameters
         ----------
@@ -353,61 +389,64 @@ class ForceSearch(MissingForces):
         """
         processes = base.processes
         motions = base.motions
-        is_settled = False
+        has_converged = False
         damping = 1.0
         last_step = np.zeros(len(effect))
         best_hypothesis: ForceHypothesis | None = None
-        for step_number in range(ROUNDS):
-            view = self.linear(base.view, motions, candidate, effect)
-            if view is None:
+        for step_number in range(MOST_ITERATIONS):
+            linear_trials = self.linearise_effects(base.linear_trials, motions, candidate, effect)
+            if linear_trials is None:
                 break
-            # missing forces: from the best point of a grid in the first step, unchanged in those
-            # that follow, and by Newton's method in the last one
-            is_last = is_settled or step_number == ROUNDS - 1
-            hypothesis = with_most_probable_forces(
-                view,
+            # missing forces: the best point of a grid in the first step, unchanged in later ones,
+            # and by Newton's method in the last one
+            is_last = has_converged or step_number == MOST_ITERATIONS - 1
+            hypothesis = fit_missing_forces(
+                linear_trials,
                 self.prior_processes(processes),
                 processes,
                 candidate,
                 effect,
-                near=step_number > 0,
+                skip_grid=step_number > 0,
                 most_steps=MOST_STEPS if is_last else 0,
             )
-            step = hypothesis.solution.mean[len(view.shared_precision) :] - effect
-            hypothesis = _without_unreached_evidence(hypothesis, step)
-            # the last iteration adds the step that remains
-            if is_settled:
+            step = hypothesis.solution.mean[len(linear_trials.shared_precision) :] - effect
+            hypothesis = _with_evidence_before_step(hypothesis, step)
+            # the last iteration takes the step that remains
+            if has_converged:
                 return replace(hypothesis, effect=effect + step)
-            # the motion of the first step is that of the base, which follows the readings: its
-            # evidence is too large, so that the second step replaces it in any case
+            # The motion of the first step is that of the base, which follows the readings without
+            # the effects. So its evidence is too large: the second step replaces it in any case.
             is_better = (
                 best_hypothesis is None or hypothesis.log_evidence > best_hypothesis.log_evidence
             )
             if is_better or step_number == 1:
                 best_hypothesis = hypothesis
             # shorter steps if the direction reverses, longer ones again if not
-            reverses = step @ last_step < -0.5 * (last_step @ last_step)
-            damping = max(0.5 * damping, LEAST_PART) if reverses else min(1.0, 1.5 * damping)
-            move = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
-            effect = np.clip(candidate.stepped(effect, move), -LARGEST_EFFECT, LARGEST_EFFECT)
-            is_settled = step_number > 0 and _is_last_step(step, last_step)
+            if step @ last_step < -0.5 * (last_step @ last_step):
+                damping = max(0.5 * damping, LEAST_DAMPING)
+            else:
+                damping = min(1.0, 1.5 * damping)
+            damped_step = damping * np.clip(step, -LONGEST_STEP, LONGEST_STEP)
+            effect = candidate.add_step(effect, damped_step)
+            effect = np.clip(effect, -LARGEST_EFFECT, LARGEST_EFFECT)
+            has_converged = step_number > 0 and _has_converged(step, last_step)
             processes = hypothesis.processes
             motions = hypothesis.motions
             last_step = step
         return best_hypothesis
 
-    def linear(
+    def linearise_effects(
         self,
-        view: View,
+        linear_trials: LinearTrials,
         motions: Sequence[TrialMotion],
         candidate: Candidate,
         effect: FloatArray,
-    ) -> View | None:
+    ) -> LinearTrials | None:
         """Return the trials, linear in the effect parameters of a hypothesis along motions.
 
         Parameters
         ----------
-        view : View
+        linear_trials : LinearTrials
             The trials.
         motions : sequence of TrialMotion
             The motion of each trial along which the effects act.
@@ -418,26 +457,40 @@ class ForceSearch(MissingForces):
 
         Returns
         -------
-        View or None
-            The view; None if the effects cannot act along the motions.
+        LinearTrials or None
+            The linear trials; None if the effects cannot act along the motions.
         """
         if not candidate.terms:
-            return replace(self.columns.along(view, motions, None), effects=(), precision=())
-        at_values = self.columns.of(view, motions, candidate, effect)
+            return replace(
+                self.column_builder.trials_along_motions(linear_trials, motions, None),
+                effect_columns=(),
+                effect_precision=(),
+            )
+        at_values = self.column_builder.column_of_candidate(
+            linear_trials, motions, candidate, effect
+        )
         if at_values is None:
             return None
         slopes = []
         for k in range(len(effect)):
-            above = self.columns.of(view, motions, candidate, with_step(effect, k, SLOPE))
-            below = self.columns.of(view, motions, candidate, with_step(effect, k, -SLOPE))
+            above = self.column_builder.column_of_candidate(
+                linear_trials, motions, candidate, with_step(effect, k, HALF_DIFFERENCE)
+            )
+            below = self.column_builder.column_of_candidate(
+                linear_trials, motions, candidate, with_step(effect, k, -HALF_DIFFERENCE)
+            )
             if above is None or below is None:
                 return None
-            slopes.append(combined((above, below), (0.5 / SLOPE, -0.5 / SLOPE)))
-        # a column for each parameter, and a known one: the linear effects at zero parameters, which
-        # are the effects at `effect` minus the sum of effect * slope
-        at_zero = combined((at_values, *slopes), (1.0, *-effect))
-        view = self.columns.along(view, motions, at_zero)
-        return replace(view, effects=tuple(slopes), precision=(1.0,) * len(effect))
+            slopes.append(
+                sum_of_columns((above, below), (0.5 / HALF_DIFFERENCE, -0.5 / HALF_DIFFERENCE))
+            )
+        # a column for each parameter, and a constant one: the linear effects at zero parameters,
+        # which are the effects at `effect` minus the sum of effect * slope
+        at_zero = sum_of_columns((at_values, *slopes), (1.0, *-effect))
+        linear_trials = self.column_builder.trials_along_motions(linear_trials, motions, at_zero)
+        return replace(
+            linear_trials, effect_columns=tuple(slopes), effect_precision=(1.0,) * len(effect)
+        )
 
 
 def _rms(series: Iterable[FloatArray]) -> float:
@@ -446,12 +499,12 @@ def _rms(series: Iterable[FloatArray]) -> float:
     return max(float(np.sqrt(np.mean(values**2))), 1e-300)
 
 
-def _without_unreached_evidence(hypothesis: ForceHypothesis, step: FloatArray) -> ForceHypothesis:
-    """Return a hypothesis whose evidence is that at its own parameters, before a step.
+def _with_evidence_before_step(hypothesis: ForceHypothesis, step: FloatArray) -> ForceHypothesis:
+    """Return a hypothesis with the log evidence at its own parameters, before a step.
 
-    The solution of the linear model is the result of a step of the parameters, and so is its
-    evidence. Before the step the log density is lower by half the squared step over the posterior
-    covariance. Entries below `SETTLED` are taken as zero.
+    The evidence of the linear model is that at the end of a step of the parameters. Before the step
+    the log density is lower by step^T covariance^-1 step / 2. Entries of the step below
+    `CONVERGED_STEP` are taken as zero.
 
     Parameters
     ----------
@@ -460,7 +513,7 @@ def _without_unreached_evidence(hypothesis: ForceHypothesis, step: FloatArray) -
     step : (E,) array
         The step from its effect parameters to the solution.
     """
-    unreached = np.where(np.abs(step) > SETTLED, step, 0.0)
+    unreached = np.where(np.abs(step) > CONVERGED_STEP, step, 0.0)
     if not unreached.any():
         return hypothesis
     weighted = np.linalg.lstsq(hypothesis.effect_covariance, unreached, rcond=None)[0]
@@ -468,18 +521,19 @@ def _without_unreached_evidence(hypothesis: ForceHypothesis, step: FloatArray) -
     return replace(hypothesis, log_evidence=hypothesis.log_evidence - loss)
 
 
-def _is_last_step(step: FloatArray, last_step: FloatArray) -> bool:
-    """Return whether the iteration may end after a step.
+def _has_converged(step: FloatArray, last_step: FloatArray) -> bool:
+    """Return whether a step of the effect parameters is so short that the iteration may end.
 
-    The limit is ten times lower for steps that hardly become smaller: slow convergence has far to
-    go.
+    The limit is ten times lower if the step is not half as long as the previous one, since after
+    slow convergence the sum of the steps that remain is large.
 
     Parameters
     ----------
     step, last_step : (E,) array
-        The present step of the effect parameters, and the one before.
+        The present step, and the previous one.
     """
     size = float(np.abs(step).max(initial=0.0))
     last_size = float(np.abs(last_step).max(initial=0.0))
-    becomes_smaller = size < 0.5 * last_size
-    return size < SETTLED * (1.0 if becomes_smaller else 0.1)
+    if size < 0.5 * last_size:
+        return size < CONVERGED_STEP
+    return size < CONVERGED_STEP * 0.1

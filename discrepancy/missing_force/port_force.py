@@ -14,24 +14,24 @@ from discrepancy.verdict import ForceAtPort, ForceLeft, ForceMoment
 
 from .explained import ForceHypothesis
 from .gap_share import GapShare
-from .hypotheses import scaled, sees_forces
+from .hypotheses import can_estimate_forces, scale_processes
 from .naming import ForceSearch
 from .shares import ForceShares
 
-UNSEEN_ERRORS = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
-"""Errors that mean that a missing force cannot be estimated. The verdict is then given without
-it."""
-BINS = 24
+ESTIMATION_ERRORS = (DiscrepancyError, np.linalg.LinAlgError, ValueError)
+"""Errors that mean that a missing force cannot be estimated. The verdict is then given without the
+force."""
+MOST_BINS = 24
 """Largest number of bins of a variable in the test of whether it orders a force."""
 LEAST_IN_BIN = 4
 """Least number of samples in a bin."""
 LEAST_ORDER = 0.3
 """Least share of a force's variance that a variable explains if it orders the force."""
-ALIKE = 0.05
+TIED_SHARE = 0.05
 """Difference of these shares up to which two variables order a force equally well."""
 
 
-# ---------------------------------------------------------------- what orders a force
+# ---------------------------------------------------------------- variables that order a force
 
 
 def explained_variance(variable: FloatArray, force: FloatArray) -> float:
@@ -45,7 +45,7 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
         The variable and the force at the same times.
     """
     count = len(force)
-    bin_count = min(BINS, count // LEAST_IN_BIN)
+    bin_count = min(MOST_BINS, count // LEAST_IN_BIN)
     if bin_count < 2 or not np.ptp(variable) > 0.0:
         return 0.0
     ascending = np.argsort(variable, kind="stable")
@@ -62,7 +62,7 @@ def explained_variance(variable: FloatArray, force: FloatArray) -> float:
 def ordering_variables(
     force: FloatArray, position: FloatArray, speed: FloatArray, time: FloatArray
 ) -> tuple[dict[str, float], tuple[str, ...]]:
-    """Return the variables that order a force: of which it is nearly a function.
+    """Return the variables that order a force: those of which the force is nearly a function.
 
     Parameters
     ----------
@@ -74,11 +74,12 @@ def ordering_variables(
     shares : dict of str to float
         The share of the force's variance that each variable explains.
     ordered_by : tuple of str
-        The variables whose share is at least `LEAST_ORDER`, and within `ALIKE` of the largest one.
+        The variables whose share is at least `LEAST_ORDER`, and within `TIED_SHARE` of the largest
+        one.
     """
     scaled_position = position / max(float(np.std(position)), 1e-300)
     scaled_speed = speed / max(float(np.std(speed)), 1e-300)
-    # of a vibration; its force is compared by magnitude, since it changes its sign in a cycle
+    # amplitude of a vibration; in a cycle the force changes its sign, but not its magnitude
     amplitude = np.hypot(scaled_position, scaled_speed)
     shares = {
         "displacement": explained_variance(position, force),
@@ -86,18 +87,18 @@ def ordering_variables(
         "amplitude": explained_variance(amplitude, np.abs(force)),
         "time": explained_variance(time, force),
     }
-    least_share = max(LEAST_ORDER, max(shares.values()) - ALIKE)
+    least_share = max(LEAST_ORDER, max(shares.values()) - TIED_SHARE)
     return shares, tuple(name for name, share in shares.items() if share >= least_share)
 
 
 # ---------------------------------------------------------------- the missing force at a port
 
-GROUND = 3.0
+LEAST_EVIDENCE = 3.0
 """Log evidence over no missing force from which on a force is missing [nat]."""
 
 
 @dataclass(frozen=True, eq=False)
-class ForceCourse:
+class TrialForce:
     """The missing force in one trial, at its samples.
 
     Attributes
@@ -136,14 +137,14 @@ class MissingForce:
     ----------
     at_port : ForceAtPort
         The record of the force in the verdict.
-    courses : sequence of ForceCourse
+    courses : sequence of TrialForce
         The force in each fitted trial.
     law : str
         The name of the effect at the port whose force is drawn with it; empty if there is none.
     """
 
     at_port: ForceAtPort
-    courses: Sequence[ForceCourse]
+    courses: Sequence[TrialForce]
     law: str = ""
 
 
@@ -165,11 +166,13 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
     MissingForce or None
         The missing force; None if no force is missing at any port.
     """
-    evidence_of_none = max(evidence_without_force(at_port) for at_port in search.at.values())
+    evidence_of_none = max(
+        evidence_without_force(at_port) for at_port in search.hypothesis_by_port.values()
+    )
     evidence_by_port = {}
-    for name, at_port in search.at.items():
+    for name, at_port in search.hypothesis_by_port.items():
         evidence_by_port[name] = at_port.log_evidence - evidence_of_none
-    if max(evidence_by_port.values()) < GROUND:
+    if max(evidence_by_port.values()) < LEAST_EVIDENCE:
         return None
     terms = hypothesis.candidate.terms
     law_ports = {term.place for term in terms if term.place in search.ports}
@@ -180,18 +183,18 @@ def missing_force(search: ForceSearch, hypothesis: ForceHypothesis) -> MissingFo
     number = search.ports.index(port)
     # a hypothesis without a missing force at this port: take the force at the port alone
     if number not in hypothesis.processes:
-        hypothesis = search.at[port]
-    law = " and ".join(
+        hypothesis = search.hypothesis_by_port[port]
+    law_name = " and ".join(
         term.name_in_words for term in hypothesis.candidate.terms if term.place == port
     )
-    courses = _force_courses(hypothesis, number, has_law=bool(law))
+    trial_forces = _forces_by_trial(hypothesis, number, has_law=bool(law_name))
     unit, *_ = search.problem.model.port_units(port)
-    correlation_time = hypothesis.processes[number].time
-    force = _force_at_port(courses, port, unit, evidence_by_port, correlation_time, law)
-    return MissingForce(force, courses, law)
+    correlation_time = hypothesis.processes[number].correlation_time
+    force = _force_at_port(trial_forces, port, unit, evidence_by_port, correlation_time, law_name)
+    return MissingForce(force, trial_forces, law_name)
 
 
-def _force_courses(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -> list[ForceCourse]:
+def _forces_by_trial(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -> list[TrialForce]:
     """Return the missing force at a port in each trial.
 
     Parameters
@@ -203,39 +206,38 @@ def _force_courses(hypothesis: ForceHypothesis, port: int, *, has_law: bool) -> 
     has_law : bool
         Whether the hypothesis has a law at the port.
     """
-    courses = []
-    for trial, motion in zip(hypothesis.view.trials, hypothesis.motions, strict=True):
-        samples = slice(None, None, trial.parts)
+    trial_forces = []
+    for trial, motion in zip(hypothesis.linear_trials.trials, hypothesis.motions, strict=True):
+        samples = slice(None, None, trial.substeps)
         force = motion.forces[port][samples]
-        law = force - motion.left[port][samples] if has_law else None
-        force_deviation, _ = motion.deviations[port]
-        courses.append(
-            ForceCourse(
+        law = force - motion.unexplained_forces[port][samples] if has_law else None
+        trial_forces.append(
+            TrialForce(
                 trial=trial.name,
                 time=trial.time,
                 position=motion.positions[samples, port],
                 speed=motion.speeds[samples, port],
                 force=force,
-                deviation=force_deviation,
+                deviation=motion.deviations_by_port[port].force,
                 law=law,
             )
         )
-    return courses
+    return trial_forces
 
 
 def _force_at_port(
-    courses: Sequence[ForceCourse],
+    trial_forces: Sequence[TrialForce],
     port: str,
     unit: str,
     evidence: Mapping[str, float],
     correlation_time: float,
-    law: str,
+    law_name: str,
 ) -> ForceAtPort:
     """Return the record of the missing force at a port for the verdict.
 
     Parameters
     ----------
-    courses : sequence of ForceCourse
+    trial_forces : sequence of TrialForce
         The force in each trial.
     port, unit : str
         The name of the port, and the unit of its force.
@@ -243,23 +245,23 @@ def _force_at_port(
         The log evidence of a missing force over none, by the name of the port [nat].
     correlation_time : float
         The correlation time of the force [s].
-    law : str
+    law_name : str
         The name of the law at the port; empty if there is none.
     """
-    force = np.concatenate([course.force for course in courses])
-    position = np.concatenate([course.position for course in courses])
-    speed = np.concatenate([course.speed for course in courses])
-    time = np.concatenate([course.time for course in courses])
+    force = np.concatenate([trial_force.force for trial_force in trial_forces])
+    position = np.concatenate([trial_force.position for trial_force in trial_forces])
+    speed = np.concatenate([trial_force.speed for trial_force in trial_forces])
+    time = np.concatenate([trial_force.time for trial_force in trial_forces])
     shares, ordered_by = ordering_variables(force, position, speed, time)
     # the trial and the sample with the largest force
-    course = max(courses, key=lambda course: float(np.abs(course.force).max()))
-    sample_of_largest = int(np.abs(course.force).argmax())
+    trial_force = max(trial_forces, key=lambda trial_force: float(np.abs(trial_force.force).max()))
+    sample_of_largest = int(np.abs(trial_force.force).argmax())
     largest = ForceMoment(
-        trial=course.trial,
-        time=float(course.time[sample_of_largest]),
-        force=float(course.force[sample_of_largest]),
-        displacement=float(course.position[sample_of_largest]),
-        speed=float(course.speed[sample_of_largest]),
+        trial=trial_force.trial,
+        time=float(trial_force.time[sample_of_largest]),
+        force=float(trial_force.force[sample_of_largest]),
+        displacement=float(trial_force.position[sample_of_largest]),
+        speed=float(trial_force.speed[sample_of_largest]),
     )
     return ForceAtPort(
         port=port,
@@ -272,7 +274,7 @@ def _force_at_port(
         correlation_time=correlation_time,
         orders=shares,
         ordered_by=ordered_by,
-        law=law,
+        law=law_name,
     )
 
 
@@ -287,10 +289,12 @@ def evidence_without_force(hypothesis: ForceHypothesis) -> float:
     The sizes of its missing forces are multiplied by 1e-9, since a process of size zero is
     singular.
     """
-    return hypothesis.view.solve(scaled(hypothesis.processes, 1e-9, 1.0)).evidence
+    return hypothesis.linear_trials.solve(
+        scale_processes(hypothesis.processes, 1e-9, 1.0)
+    ).log_evidence
 
 
-def seen_force(
+def missing_force_of_verdict(
     problem: Problem,
     search: ForceSearch | None,
     hypotheses: Sequence[ForceHypothesis],
@@ -318,42 +322,60 @@ def seen_force(
     terms = fit.candidate.terms
     try:
         ports = problem.model.ports
-        has_law = any(term.place in ports for term in terms)
-        if not sees_forces(problem) or (terms and not has_law):
+        laws = [term for term in terms if term.place in ports]
+        if not can_estimate_forces(problem) or (terms and not laws):
             return None
         search = search or ForceSearch(problem)
-        # the hypothesis with the effects of the fit, or one that is followed to them now
-        hypothesis = next(
-            (
-                fitted_hypothesis
-                for fitted_hypothesis in hypotheses
-                if fitted_hypothesis.candidate.key == fit.candidate.key
-            ),
-            None,
-        )
-        if hypothesis is None and terms:
-            hypothesis = search.followed(search.whole, fit.candidate, fit.point.effect)
-        force = missing_force(search, search.whole if hypothesis is None else hypothesis)
-    except UNSEEN_ERRORS:
+        hypothesis = _hypothesis_of_fit(search, hypotheses, fit)
+        force = missing_force(search, hypothesis or search.hypothesis_of_all_ports)
+    except ESTIMATION_ERRORS:
         return None
     if force is None or not force.law or hypothesis is None:
         return force
     at_port = force.at_port
-    laws = [(term.name_in_words, term.place) for term in terms if term.place in ports]
-    if len({place for _, place in laws}) > 1:
-        at_port = replace(at_port, law=" and ".join(f"{name} at {place}" for name, place in laws))
-    with suppress(*UNSEEN_ERRORS):
+    if len({law.place for law in laws}) > 1:
+        names_at_ports = [f"{law.name_in_words} at {law.place}" for law in laws]
+        at_port = replace(at_port, law=" and ".join(names_at_ports))
+    # without the shares, the force is returned as it is
+    with suppress(*ESTIMATION_ERRORS):
         shares = ForceShares(search)
         held_out = None
         if shares.has_held_out:
-            held_out = _force_left(shares.share_of(hypothesis, held_out=True))
-        fitted = _force_left(shares.share_of(hypothesis, held_out=False))
+            held_out = _remaining_force(shares.gap_share(hypothesis, held_out=True))
+        fitted = _remaining_force(shares.gap_share(hypothesis, held_out=False))
         at_port = replace(at_port, fitted=fitted, held_out=held_out)
     return replace(force, at_port=at_port)
 
 
-def _force_left(share: GapShare) -> ForceLeft:
+def _hypothesis_of_fit(
+    search: ForceSearch, hypotheses: Sequence[ForceHypothesis], fit: CandidateFit
+) -> ForceHypothesis | None:
+    """Return the hypothesis on the missing force with the effects of a fit.
+
+    Parameters
+    ----------
+    search : ForceSearch
+        The search for the missing force.
+    hypotheses : sequence of ForceHypothesis
+        The hypotheses that were fitted already; if none has the effects, one is fitted now.
+    fit : CandidateFit
+        The fit.
+
+    Returns
+    -------
+    ForceHypothesis or None
+        The hypothesis; None if the fit has no effects, or if they cannot act along the motion.
+    """
+    for hypothesis in hypotheses:
+        if hypothesis.candidate.key == fit.candidate.key:
+            return hypothesis
+    if not fit.candidate.terms:
+        return None
+    return search.fit_along_motion(search.hypothesis_of_all_ports, fit.candidate, fit.point.effect)
+
+
+def _remaining_force(share: GapShare) -> ForceLeft:
     """Return the rms of the missing force without and with a law, for the verdict."""
     return ForceLeft(
-        share.remaining_rms, share.total_rms, trials=share.trial_count, tested=share.tested
+        share.remaining_rms, share.total_rms, trials=share.trial_count, tested=share.is_tested
     )

@@ -1,4 +1,7 @@
-"""The most probable sizes and correlation times of missing forces, by Newton's method."""
+"""The most probable sizes and correlation times of missing forces, by Newton's method.
+
+The size of a missing force is its standard deviation as a random process.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -13,14 +16,14 @@ from .filtered import Process
 Processes = Mapping[int, Process]
 """Missing forces as processes, by the numbers of their ports."""
 
-SIZE_DEVIATION, TIME_DEVIATION = 3.0, 1.2
+PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME = 3.0, 1.2
 """Prior standard deviations of the logarithms of size and correlation time of a process."""
-PRIOR_DEVIATIONS = np.array((SIZE_DEVIATION, TIME_DEVIATION))
+PRIOR_LOG_DEVIATIONS = np.array((PRIOR_LOG_DEVIATION_OF_SIZE, PRIOR_LOG_DEVIATION_OF_TIME))
 """Both of these deviations, as an array."""
 START_FACTORS = np.log(list(product((10.0, 1.0, 0.1, 0.01), (0.3, 1.0, 3.0, 10.0))))
 """Logarithms of the factors on size and time that make the grid around the given processes. Small
 sizes are in it because a law leaves only a part of the force that was missing without it."""
-FARTHEST = 5.0
+LARGEST_DISTANCE = 5.0
 """Bound of the search, in prior standard deviations from the median."""
 DIFFERENCE = 0.02
 """Difference of the logarithms in numerical derivatives."""
@@ -33,7 +36,7 @@ MOST_STEPS = 20
 def prior_log_density(median: Processes, processes: Processes) -> float:
     """Return the log prior density of missing forces [nat], up to a constant.
 
-    Size and time of a missing force are lognormal about their medians, and independent.
+    The size and the correlation time of a missing force are independent and log-normal.
 
     Parameters
     ----------
@@ -43,14 +46,17 @@ def prior_log_density(median: Processes, processes: Processes) -> float:
         The missing forces.
     """
     log_ratios = np.log(
-        [_values_over(process, median[port]) for port, process in processes.items()]
+        [_ratios_to_median(process, median[port]) for port, process in processes.items()]
     )
-    return -0.5 * float(np.sum(np.square(log_ratios / PRIOR_DEVIATIONS)))
+    return -0.5 * float(np.sum(np.square(log_ratios / PRIOR_LOG_DEVIATIONS)))
 
 
-def _values_over(process: Process, median: Process) -> tuple[float, float]:
+def _ratios_to_median(process: Process, median: Process) -> tuple[float, float]:
     """Return size and time of a process, each divided by that of the median."""
-    return process.size / median.size, process.time / median.time
+    return (
+        process.standard_deviation / median.standard_deviation,
+        process.correlation_time / median.correlation_time,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,26 +70,26 @@ class ProcessSearch:
     log_evidence : callable
         The function that takes processes by port, and returns the log of evidence times prior
         [nat].
-    begin : mapping of int to Process
+    initial : mapping of int to Process
         The processes to begin with; only their sizes and times are changed.
     low, high : (P, 2) ndarray
         The bounds of the logarithms of size and time.
     """
 
     log_evidence: Callable[[dict[int, Process]], float]
-    begin: Processes
+    initial: Processes
     low: FloatArray
     high: FloatArray
 
     @classmethod
-    def around(
+    def within_prior(
         cls,
         log_evidence: Callable[[dict[int, Process]], float],
         median: Processes,
-        begin: Processes,
+        initial: Processes,
         time_range: tuple[float, float],
     ) -> "ProcessSearch":
-        """Return the search within `FARTHEST` prior deviations of the medians.
+        """Return the search within `LARGEST_DISTANCE` prior deviations of the medians.
 
         Parameters
         ----------
@@ -92,28 +98,28 @@ class ProcessSearch:
             [nat].
         median : mapping of int to Process
             The prior medians, by the number of the port.
-        begin : mapping of int to Process
+        initial : mapping of int to Process
             The processes to begin with.
         time_range : (float, float)
             The shortest and the longest correlation time that the records can show [s].
         """
-        center = logarithms({port: median[port] for port in begin})
-        low = center - FARTHEST * PRIOR_DEVIATIONS
-        high = center + FARTHEST * PRIOR_DEVIATIONS
+        center = logarithms({port: median[port] for port in initial})
+        low = center - LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
+        high = center + LARGEST_DISTANCE * PRIOR_LOG_DEVIATIONS
         shortest, longest = np.log(time_range)
         low[:, 1] = np.clip(low[:, 1], shortest, longest)
         high[:, 1] = np.clip(high[:, 1], shortest, longest)
-        return cls(log_evidence, begin, low, high)
+        return cls(log_evidence, initial, low, high)
 
     def processes(self, logs: FloatArray) -> dict[int, Process]:
         """Return the processes whose sizes and times have logarithms (P, 2)."""
         values = np.exp(logs).tolist()
         return {
-            port: replace(process, size=size, time=time)
-            for (port, process), (size, time) in zip(self.begin.items(), values, strict=True)
+            port: replace(process, standard_deviation=size, correlation_time=time)
+            for (port, process), (size, time) in zip(self.initial.items(), values, strict=True)
         }
 
-    def value(self, logs: FloatArray) -> float:
+    def log_posterior(self, logs: FloatArray) -> float:
         """Return the log of evidence times prior [nat] at logarithms (P, 2) of sizes and times."""
         return self.log_evidence(self.processes(logs))
 
@@ -125,15 +131,15 @@ class ProcessSearch:
         Parameters
         ----------
         from_grid : bool
-            Whether to begin at the best point of a grid around `begin`, not at `begin` itself.
+            Whether to begin at the best point of a grid around `initial`, not at `initial` itself.
         most_steps : int
             The largest number of steps of Newton's method.
         """
-        logs = np.clip(logarithms(self.begin), self.low, self.high)
+        logs = np.clip(logarithms(self.initial), self.low, self.high)
         if from_grid:
             logs = self._best_of_grid(logs)
-        logs, top = self._climbed(logs, most_steps)
-        return self.processes(logs), top
+        logs, value = self._climb(logs, most_steps)
+        return self.processes(logs), value
 
     def _best_of_grid(self, logs: FloatArray) -> FloatArray:
         """Return the best logarithms (P, 2) of a grid, one port after the other."""
@@ -143,40 +149,40 @@ class ProcessSearch:
                 candidate = logs.copy()
                 candidate[port] += factors
                 candidates.append(np.clip(candidate, self.low, self.high))
-            logs = max(candidates, key=self.value)
+            logs = max(candidates, key=self.log_posterior)
         return logs
 
-    def _climbed(self, logs: FloatArray, most_steps: int) -> tuple[FloatArray, float]:
-        """Return the maximum that Newton's method reaches, as logarithms (P, 2), and its value.
+    def _climb(self, logs: FloatArray, most_steps: int) -> tuple[FloatArray, float]:
+        """Return the logarithms (P, 2) that Newton's method reaches, and the value there [nat].
 
-        If the number of steps ended the search before the maximum, its result would depend on
-        rounding; the maximum itself does not.
+        `most_steps` should be large enough to reach the maximum. The result of a search that ends
+        before it depends on rounding errors; the maximum does not.
         """
-        top = self.value(logs)
+        value = self.log_posterior(logs)
         offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
         curvature = np.empty((logs.size, logs.size))
         last_change = np.inf
         for _ in range(most_steps):
-            values_above = np.array([self.value(logs + offset) for offset in offsets])
-            values_below = np.array([self.value(logs - offset) for offset in offsets])
+            values_above = np.array([self.log_posterior(logs + offset) for offset in offsets])
+            values_below = np.array([self.log_posterior(logs - offset) for offset in offsets])
             # near the maximum the last curvature is accurate enough
             if last_change > DIFFERENCE:
-                curvature = self._curvature(logs, top, values_above, values_below)
+                curvature = self._curvature(logs, value, values_above, values_below)
             if not np.isfinite((*curvature.flat, *values_above, *values_below)).all():
                 break
             # slope and curvature are both multiplied by DIFFERENCE ** 2, which cancels in the step
             step = self._newton_step(
                 logs, 0.5 * DIFFERENCE * (values_above - values_below), curvature
             )
-            next_logs, next_value = self._uphill(logs, top, step)
-            if next_value < top:
+            next_logs, next_value = self._backtrack(logs, value, step)
+            if next_value < value:
                 break
             last_change = np.abs(next_logs - logs).max()
-            logs, top = next_logs, next_value
-        return logs, top
+            logs, value = next_logs, next_value
+        return logs, value
 
     def _curvature(
-        self, logs: FloatArray, top: float, ahead: FloatArray, back: FloatArray
+        self, logs: FloatArray, value: float, values_above: FloatArray, values_below: FloatArray
     ) -> FloatArray:
         """Return the second differences (2 P, 2 P) of the value, by all pairs of logarithms.
 
@@ -184,17 +190,17 @@ class ProcessSearch:
         ----------
         logs : (P, 2) array
             The logarithms.
-        top : float
+        value : float
             The value there [nat].
-        ahead, back : (2 P,) array
+        values_above, values_below : (2 P,) array
             The values with one logarithm `DIFFERENCE` larger, or smaller.
         """
         offsets = DIFFERENCE * np.eye(logs.size).reshape(-1, *logs.shape)
         # central differences on the diagonal, forward ones of both logarithms off it
-        curvature = np.diag(ahead + back - 2.0 * top)
+        curvature = np.diag(values_above + values_below - 2.0 * value)
         for i, k in zip(*np.triu_indices(logs.size, 1), strict=True):
-            value_with_both_larger = self.value(logs + offsets[i] + offsets[k])
-            curvature[i, k] = value_with_both_larger - ahead[i] - ahead[k] + top
+            value_with_both_larger = self.log_posterior(logs + offsets[i] + offsets[k])
+            curvature[i, k] = value_with_both_larger - values_above[i] - values_above[k] + value
             curvature[k, i] = curvature[i, k]
         return curvature
 
@@ -225,7 +231,9 @@ class ProcessSearch:
         shortening = max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
         return np.asarray(step.reshape(logs.shape) / shortening)
 
-    def _uphill(self, logs: FloatArray, top: float, step: FloatArray) -> tuple[FloatArray, float]:
+    def _backtrack(
+        self, logs: FloatArray, value: float, step: FloatArray
+    ) -> tuple[FloatArray, float]:
         """Return logarithms (P, 2) of a larger value along a step, and the value (backtracking).
 
         The step is halved until the value is not below the present one. If the step becomes too
@@ -235,19 +243,21 @@ class ProcessSearch:
         ----------
         logs : (P, 2) array
             The logarithms.
-        top : float
+        value : float
             The value there [nat].
         step : (P, 2) array
             The step.
         """
         next_logs, next_value = logs, -np.inf
-        while next_value < top and np.abs(step).max() > SHORTEST_STEP:
+        while next_value < value and np.abs(step).max() > SHORTEST_STEP:
             next_logs = np.clip(logs + step, self.low, self.high)
-            next_value = self.value(next_logs)
+            next_value = self.log_posterior(next_logs)
             step = 0.5 * step
         return next_logs, next_value
 
 
 def logarithms(processes: Processes) -> FloatArray:
     """Return the logarithms (P, 2) of the sizes and times of processes."""
-    return np.log([(process.size, process.time) for process in processes.values()])
+    return np.log(
+        [(process.standard_deviation, process.correlation_time) for process in processes.values()]
+    )

@@ -13,21 +13,21 @@ from discrepancy.fits.candidate import Point
 from .explained import ForceHypothesis
 from .gap_share import OF_FORCE, OF_PREDICTIONS, SEED, GapShare
 from .hypotheses import ColumnBuilder
+from .linear_trials import LinearTrials, TrialMotion
 from .naming import ForceSearch
-from .trial import SeenTrial
-from .view import TrialMotion, View
+from .trial import PortedTrial
 
-WINDOWS = 12
-"""Largest number of blocks into which a trial is divided."""
-SHORTEST = 8
+MOST_BLOCKS = 12
+"""Largest number of blocks into which a trial is divided for the bootstrap."""
+LEAST_BLOCK_SAMPLES = 8
 """Least number of samples of a block."""
-WITHIN = 2.0
+SHARED_BOUND = 2.0
 """Bound of the shared unknowns, in prior standard deviations, when the missing force is estimated
 without any effect."""
-TESTED = 0.1
-"""Ratio of the mean square force of a law to that of the missing force from which on the trials
-test the law."""
-ROUNDS = 3
+LEAST_FORCE_RATIO = 0.1
+"""Least mean square force of a law, over that of the missing force, with which trials can test the
+law."""
+SMOOTHING_ROUNDS = 3
 """Number of times that a held-out trial is smoothed again with the law along its motion."""
 
 
@@ -56,28 +56,28 @@ class ForceShares:
         self.search = search
         campaign = search.problem.campaign
         held_out = tuple(trial for trial in campaign.held_out if trial.is_dynamic)
-        self._held_out: tuple[ColumnBuilder, View] | None = None
-        self._without_effect: dict[bool, tuple[View, list[TrialMotion]]] = {}
+        self._held_out: tuple[ColumnBuilder, LinearTrials] | None = None
+        self._without_effect: dict[bool, tuple[LinearTrials, list[TrialMotion]]] = {}
         if held_out:
             problem = search.problem.with_trials(held_out)
             numbers = range(len(problem.trials))
-            local = problem.start(search.whole.candidate).local
+            local = problem.prior_mean_point(search.hypothesis_of_all_ports.candidate).local
             point = Point(search.point.shared, local, np.zeros(0))
-            columns = ColumnBuilder(problem, numbers, point, search.laws)
-            self._held_out = (columns, columns.bare())
+            columns = ColumnBuilder(problem, numbers, point, search.model_laws)
+            self._held_out = (columns, columns.trials_without_effects())
 
     @property
     def has_held_out(self) -> bool:
         """Whether some of the trials in motion are held out."""
         return self._held_out is not None
 
-    def share_of(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
+    def gap_share(self, hypothesis: ForceHypothesis, *, held_out: bool) -> GapShare:
         """Return the share of the missing force that a hypothesis explains.
 
         Two shares are computed: that of the forces, and that of the changes of the readings by
-        these forces. The one with the larger lower end of its interval is returned, as each may
-        miss a part: fast forces hardly move a free mass, and slow forces are small compared with
-        fast ones.
+        these forces. The one with the larger lower end of its interval is returned. Each of them
+        may miss a part: fast forces hardly move a free mass, and slow forces are small compared
+        with fast ones.
 
         Parameters
         ----------
@@ -86,29 +86,31 @@ class ForceShares:
         held_out : bool
             Whether the share is that of held-out trials, not of the fitted ones.
         """
-        view, motions = self.motions(hypothesis, held_out=held_out)
+        linear_trials, motions = self.smooth_trials(hypothesis, held_out=held_out)
         _, motions_without = self._motions_without_effect(held_out)
         law_ports = self._law_ports(hypothesis)
-        ports = law_ports or set(self.search.best().processes)
-        remaining_rms = _largest_rms([motion.left for motion in motions], ports)
+        ports = law_ports or set(self.search.hypothesis_of_best_port().processes)
+        remaining_rms = _largest_rms([motion.unexplained_forces for motion in motions], ports)
         total_rms = _largest_rms([motion.forces for motion in motions_without], ports)
-        law_rms = _largest_rms([motion.laws for motion in motions], ports)
+        law_rms = _largest_rms([motion.law_forces for motion in motions], ports)
         # in trials where the force of the law is small, its share says nothing about it
-        tested = not law_ports or law_rms**2 > TESTED * total_rms**2
-        of_forces, of_predictions = self._block_sums(hypothesis, view, motions, motions_without)
+        is_tested = not law_ports or law_rms**2 > LEAST_FORCE_RATIO * total_rms**2
+        of_forces, of_predictions = self._block_sums(
+            hypothesis, linear_trials, motions, motions_without
+        )
         shares = []
         for block_sums, kind in ((of_forces, OF_FORCE), (of_predictions, OF_PREDICTIONS)):
             before, after, noise = np.array(block_sums).T
             share = GapShare(
-                before=before,
-                after=after,
-                noise=noise,
+                squares_before=before,
+                squares_after=after,
+                noise_squares=noise,
                 held_out=held_out,
                 trial_count=len(motions),
                 remaining_rms=remaining_rms,
                 total_rms=total_rms,
                 kind=kind,
-                tested=tested,
+                is_tested=is_tested,
             )
             shares.append(share)
         return max(shares, key=lambda share: share.interval[0])
@@ -122,7 +124,7 @@ class ForceShares:
     def _block_sums(
         self,
         hypothesis: ForceHypothesis,
-        view: View,
+        linear_trials: LinearTrials,
         motions: Sequence[TrialMotion],
         motions_without: Sequence[TrialMotion],
     ) -> tuple[list[_BlockSums], list[_BlockSums]]:
@@ -134,7 +136,7 @@ class ForceShares:
         ----------
         hypothesis : ForceHypothesis
             The hypothesis.
-        view : View
+        linear_trials : LinearTrials
             The trials.
         motions, motions_without : sequence of TrialMotion
             The motion of each trial with the hypothesis, and without any effect.
@@ -145,64 +147,66 @@ class ForceShares:
             The sums of each block of all trials: of weighted forces, and of changes of readings
             divided by their noise.
         """
-        system = view.trials[0].system
+        system = linear_trials.trials[0].system
         weights = {}
-        for port in motions[0].left:
+        for port in motions[0].unexplained_forces:
             strength_on_state = np.linalg.norm(system.actions[port])
             strength_on_readings = np.linalg.norm(system.through[port])
             weights[port] = float(np.hypot(strength_on_state, strength_on_readings))
         of_forces = []
         of_predictions = []
-        filters = view.filtered({**hypothesis.processes, **self.search.whole.processes})
+        filters = linear_trials.force_filters(
+            {**hypothesis.processes, **self.search.hypothesis_of_all_ports.processes}
+        )
         for trial, motion, motion_without, force_filter in zip(
-            view.trials, motions, motions_without, filters, strict=True
+            linear_trials.trials, motions, motions_without, filters, strict=True
         ):
             # the missing forces that are estimated from noise alone
-            smoothed = force_filter.smoothed(_simulated_noise(trial))
+            smoothed = force_filter.smooth(_simulated_noise(trial))
             noise_forces = {}
             for (port, _), force in zip(force_filter.processes, smoothed.forces, strict=True):
                 noise_forces[port] = force
             # in the order of `_BlockSums`: without a law, with the law, and of noise alone
             forces_of_kinds: tuple[PortForces, ...] = (
                 motion_without.forces,
-                motion.left,
+                motion.unexplained_forces,
                 noise_forces,
             )
             for begin, end in _blocks(len(trial.time)):
-                samples = slice(begin * trial.parts, end * trial.parts, trial.parts)
+                samples = slice(begin * trial.substeps, end * trial.substeps, trial.substeps)
                 force_sums = [
                     _weighted_squares(forces, weights, samples) for forces in forces_of_kinds
                 ]
                 of_forces.append(_BlockSums(*force_sums))
                 prediction_sums = [
-                    float(np.sum(trial.ahead(forces, begin, end) ** 2))
+                    float(np.sum(trial.readings_of_forces_in_block(forces, begin, end) ** 2))
                     for forces in forces_of_kinds
                 ]
                 of_predictions.append(_BlockSums(*prediction_sums))
         return of_forces, of_predictions
 
-    def _motions_without_effect(self, held_out: bool) -> tuple[View, list[TrialMotion]]:
-        """Return the view of the trials, and motion and missing force of each without any effect.
+    def _motions_without_effect(self, held_out: bool) -> tuple[LinearTrials, list[TrialMotion]]:
+        """Return the trials, and the motion and missing force of each without any effect.
 
-        Shared unknowns are kept within `WITHIN` prior deviations, as they would otherwise explain a
-        part of the missing force.
+        Shared unknowns are kept within `SHARED_BOUND` prior deviations, as they would otherwise
+        explain a part of the missing force.
         """
         if held_out not in self._without_effect:
-            whole = self.search.whole
+            whole = self.search.hypothesis_of_all_ports
             # an unknown without a prior has no bound
-            bound = np.where(whole.view.shared_precision > 0.0, WITHIN, np.inf)
+            bound = np.where(whole.linear_trials.shared_precision > 0.0, SHARED_BOUND, np.inf)
             mean = np.clip(whole.solution.mean, -bound, bound)
             bounded = replace(whole, solution=replace(whole.solution, mean=mean))
-            self._without_effect[held_out] = self.motions(bounded, held_out=held_out)
+            self._without_effect[held_out] = self.smooth_trials(bounded, held_out=held_out)
         return self._without_effect[held_out]
 
-    def motions(
+    def smooth_trials(
         self, hypothesis: ForceHypothesis, *, held_out: bool
-    ) -> tuple[View, list[TrialMotion]]:
-        """Return the view of the trials, and motion and remaining force of each with a hypothesis.
+    ) -> tuple[LinearTrials, list[TrialMotion]]:
+        """Return the trials, and the motion and unexplained force of each with a hypothesis.
 
-        The remaining force has the size of the force that is missing without any effect, so that it
-        can take up all that the hypothesis does not explain.
+        The unexplained force has the standard deviation of the force that is missing without any
+        effect, so that it can take up all that the hypothesis does not explain.
 
         Parameters
         ----------
@@ -211,26 +215,28 @@ class ForceShares:
         held_out : bool
             Whether the trials are the held-out ones, not those fitted.
         """
-        processes = {**hypothesis.processes, **self.search.whole.processes}
+        processes = {**hypothesis.processes, **self.search.hypothesis_of_all_ports.processes}
         if not held_out:
-            _, _, motions = hypothesis.view.smoothed(processes, hypothesis.solution)
-            return hypothesis.view, motions
+            smoothed = hypothesis.linear_trials.smooth(processes, hypothesis.solution)
+            return hypothesis.linear_trials, smoothed.motions
         assert self._held_out is not None
-        builder, view = self._held_out
+        builder, linear_trials = self._held_out
         solution = replace(hypothesis.solution, mean=hypothesis.shared)
-        _, _, motions = view.smoothed(processes, solution)
-        for _ in range(ROUNDS):
+        motions = linear_trials.smooth(processes, solution).motions
+        for _ in range(SMOOTHING_ROUNDS):
             effects_column = None
             if len(hypothesis.effect):
-                effects_column = builder.of(view, motions, hypothesis.candidate, hypothesis.effect)
-            view = builder.along(view, motions, effects_column)
-            _, _, motions = view.smoothed(processes, solution)
-        return view, motions
+                effects_column = builder.column_of_candidate(
+                    linear_trials, motions, hypothesis.candidate, hypothesis.effect
+                )
+            linear_trials = builder.trials_along_motions(linear_trials, motions, effects_column)
+            motions = linear_trials.smooth(processes, solution).motions
+        return linear_trials, motions
 
 
 def _blocks(sample_count: int) -> Iterable[tuple[int, int]]:
     """Return start and end of each block of a trial, as indices of samples."""
-    count = min(WINDOWS, max(1, sample_count // SHORTEST))
+    count = min(MOST_BLOCKS, max(1, sample_count // LEAST_BLOCK_SAMPLES))
     edges = np.linspace(0, sample_count, count + 1).astype(int)
     return pairwise(edges.tolist())
 
@@ -265,21 +271,21 @@ def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def _simulated_noise(trial: SeenTrial) -> FloatArray:
+def _simulated_noise(trial: PortedTrial) -> FloatArray:
     """Return simulated noise (N, C) of a trial with its correlation, divided by its deviation.
 
     The seed is fixed, so that results can be repeated.
     """
     generator = np.random.default_rng(SEED)
     noise = generator.standard_normal(trial.residual.shape)
-    for channel, coloured_share, rate in trial.coloured:
-        # an autoregression of first order at the trial's stamps
-        decay = np.exp(-rate * np.diff(trial.time, prepend=-np.inf))
+    for coloured in trial.coloured_noises:
+        # an autoregression of first order at the trial's stamps; nothing comes before the first one
+        decay = np.exp(-coloured.decay_rate * np.diff(trial.time, prepend=-np.inf))
         correlated_noise = np.zeros(len(noise))
         for k, innovation in enumerate(generator.standard_normal(len(noise))):
             correlated_noise[k] = (
                 decay[k] * correlated_noise[k - 1] + np.sqrt(1.0 - decay[k] ** 2) * innovation
             )
-        white_noise = np.sqrt(1.0 - coloured_share) * noise[:, channel]
-        noise[:, channel] = white_noise + np.sqrt(coloured_share) * correlated_noise
+        white_noise = np.sqrt(1.0 - coloured.share) * noise[:, coloured.channel]
+        noise[:, coloured.channel] = white_noise + np.sqrt(coloured.share) * correlated_noise
     return np.asarray(noise * trial.used)

@@ -1,4 +1,4 @@
-"""A trial in which a force is on or off: the evidence of all stretches in which it may be on.
+"""A trial in which a force is on or off: the evidence of every stretch in which it may be on.
 
 A path (N,) says for each sample whether the force of events is on; a stretch is a range of samples
 in which it stays on, or off. The filter of the readings before a moment and the backward filter of
@@ -14,27 +14,28 @@ import numpy as np
 
 from discrepancy.campaign.records import BoolArray, FloatArray, IntArray
 
-from .filtered import ForceFilter, ForceStateSpace, Process, without
-from .kalman import FilterSteps, discretised, joined
-from .view import View
+from .filtered import ForceFilter, ForceStateSpace, Process, integrate_out_last
+from .kalman import FilterState, RecordFilter, StateInformation, discretise, join_filters
+from .linear_trials import LinearTrials
 
 CHANGE_PRICE = 4.0
-"""Log odds against a change of a path, besides the prior of its place [nat]."""
-STARTS = 40
-"""Largest number of places in a grid between which a stretch is looked for."""
-MOST_STEPS = 400_000
-"""Largest number of steps of the filter for one such grid; a long record has fewer places."""
-PLACES = 80
-"""Number of places of a change that are compared at once."""
-RANGE = 12.0
-"""Log evidence below the largest [nat] from which on a place is taken as impossible."""
+"""Log odds against a change of a path, besides the prior of the sample at which it lies [nat]. With
+4, one change in about 55 is believed without any evidence."""
+MOST_GRID_INTERVALS = 40
+"""Largest number of intervals of the grid on which stretches begin and end."""
+MOST_FILTER_STEPS = 400_000
+"""Largest number of steps of the filter for one such grid; a long record has fewer intervals."""
+COMPARED_SAMPLES = 80
+"""Number of samples that are compared at once as the place of a change."""
+EVIDENCE_RANGE = 12.0
+"""Difference to the largest log evidence above which a sample is taken as impossible [nat]."""
 
-Forces = tuple[Process, Process]
+ForcePair = tuple[Process, Process]
 """The force of events, and the force that may be missing throughout."""
 
 
-class Products(NamedTuple):
-    """The information of a trial on the K shared unknowns, as the products of its whitened columns.
+class TrialProducts(NamedTuple):
+    """What a trial says of the K shared unknowns: the inner products of its whitened columns.
 
     Attributes
     ----------
@@ -53,38 +54,40 @@ class EventTrials:
 
     Parameters
     ----------
-    view : View
-        The trials, and the columns of all unknowns and of the forces known to act.
+    linear_trials : LinearTrials
+        The trials with the columns of all unknowns.
     port : int
         The number of the port.
-    every : int
+    stride : int
         The step between samples that are used; 1 uses all.
 
     Attributes
     ----------
-    trials : list of SeenTrial
+    trials : list of PortedTrial
         The trials with the samples that are used.
     columns : list of (1 + K + L, N, C) ndarray
         The residual and the columns of all unknowns, by trial.
     """
 
-    def __init__(self, view: View, port: int, *, every: int = 1) -> None:
-        self.view = view
+    def __init__(self, linear_trials: LinearTrials, port: int, *, stride: int = 1) -> None:
+        self.linear_trials = linear_trials
         self.port = port
         self.trials = [
-            replace(trial, time=trial.time[::every], used=trial.used[::every])
-            for trial in view.trials
+            replace(trial, time=trial.time[::stride], used=trial.used[::stride])
+            for trial in linear_trials.trials
         ]
-        self.columns = [rows[:, ::every] for rows in view.rows]
+        self.columns = [rows[:, ::stride] for rows in linear_trials.regression_rows]
 
-    def evidence(self, by_trial: Sequence[Products]) -> FloatArray:
+    def log_evidence(self, by_trial: Sequence[TrialProducts]) -> FloatArray:
         """Return the log evidence (...) of all trials [nat], given the products of each."""
         products = sum(trial.products for trial in by_trial)
-        halves = sum(trial.half_log_determinants for trial in by_trial)
-        products, halves = without(
-            np.asarray(products), np.asarray(halves), self.view.shared_precision
+        half_log_determinants = sum(trial.half_log_determinants for trial in by_trial)
+        products, half_log_determinants = integrate_out_last(
+            np.asarray(products),
+            np.asarray(half_log_determinants),
+            self.linear_trials.shared_precision,
         )
-        return np.asarray(-0.5 * products[..., 0, 0] - halves)
+        return np.asarray(-0.5 * products[..., 0, 0] - half_log_determinants)
 
 
 class SwitchedRecord:
@@ -94,13 +97,13 @@ class SwitchedRecord:
     ----------
     trials : EventTrials
         The trials in which events are looked for.
-    number : int
+    trial_index : int
         The index of this trial in them.
     forces : (Process, Process)
         The force of events, and the force that may be missing throughout.
-    others : sequence of Products
+    products_of_others : sequence of TrialProducts
         The products of the other trials, which also depend on the shared unknowns.
-    parts : int
+    substeps : int
         The number of steps into which each interval between samples is divided, so that a change
         can lie between samples.
     """
@@ -108,50 +111,66 @@ class SwitchedRecord:
     def __init__(
         self,
         trials: EventTrials,
-        number: int,
-        forces: Forces,
-        others: Sequence[Products] = (),
-        parts: int = 1,
+        trial_index: int,
+        forces: ForcePair,
+        products_of_others: Sequence[TrialProducts] = (),
+        substeps: int = 1,
     ) -> None:
         self.trials = trials
-        self.others = others
-        trial = trials.trials[number]
+        self.products_of_others = products_of_others
+        trial = trials.trials[trial_index]
         self.local_precision = trial.local_precision
-        filtered = ForceFilter(trial, [(trials.port, force) for force in forces])
-        event = len(trial.system.generator)  # index of the event's force in the state
-        lengths, step_of_sample = trial.steps
-        used = np.zeros(((len(trial.time) - 1) * parts + 1, trial.used.shape[1]), dtype=bool)
-        used[::parts] = trial.used
-        columns = np.zeros((*used.shape, len(trials.columns[number])))
-        columns[::parts] = np.moveaxis(trials.columns[number] * filtered.white, 0, -1)
+        force_filter = ForceFilter(trial, [(trials.port, force) for force in forces])
+        state_space = force_filter.state_space
+        # the states of the missing forces follow those of the structure; that of events is first
+        event_state = len(trial.system.generator)
+        # between two samples there are `substeps` steps, at whose ends nothing is read
+        lengths, step_of_sample = trial.intervals
+        used = np.zeros(((len(trial.time) - 1) * substeps + 1, trial.used.shape[1]), dtype=bool)
+        used[::substeps] = trial.used
+        columns = np.zeros((*used.shape, len(trials.columns[trial_index])))
+        columns[::substeps] = np.moveaxis(
+            trials.columns[trial_index] * force_filter.white_noise_scale, 0, -1
+        )
         # a step is of one of 4 J kinds: its force is off, begins, ends or is on (see
-        # `switched_steps`), and it has one of J lengths
+        # `switched_step_matrices`), and it has one of J lengths
         self.length_of_sample = np.concatenate(
-            (step_of_sample[:1], np.repeat(step_of_sample[1:], parts))
+            (step_of_sample[:1], np.repeat(step_of_sample[1:], substeps))
         )
         self.length_count = len(lengths)
-        transitions, noises = switched_steps(filtered.system, event, lengths / parts)
-        self.steps = FilterSteps(transitions, noises, filtered.system.output_rows, used, columns)
-        off, on = begin_covariances(filtered.system, event)
-        self.begun = [self.steps.begin(off), self.steps.begin(on)]
+        transitions, noises = switched_step_matrices(state_space, event_state, lengths / substeps)
+        self.record_filter = RecordFilter(
+            transitions, noises, state_space.output_rows, used, columns
+        )
+        off, on = initial_covariances(state_space, event_state)
+        self._state_with_force_off = self.record_filter.initial_state(off)
+        self._state_with_force_on = self.record_filter.initial_state(on)
 
     def step_kinds(self, on: BoolArray) -> IntArray:
         """Return the kind (N,) of the step that leads to each sample of a path (N,).
 
-        It is the index in the matrices of `switched_steps`.
+        It is the index in the matrices of `switched_step_matrices`.
         """
         was_on = np.r_[False, on[:-1]]
         return np.asarray((2 * was_on + on) * self.length_count + self.length_of_sample)
 
-    def products(self, on: BoolArray) -> Products:
+    def products(self, on: BoolArray) -> TrialProducts:
         """Return the information of the trial on the shared unknowns, given a path (N,)."""
         end = np.array([len(on)])
-        begin = self.begun[int(on[0])]
-        *_, products, half_log_determinants = self.steps.before(self.step_kinds(on), 0, begin, end)
-        return Products(*without(products[0], half_log_determinants[0], self.local_precision))
+        at_end = self.record_filter.filter_before(
+            self.step_kinds(on), 0, self._initial_state(bool(on[0])), end
+        )
+        products, half_log_determinant = integrate_out_last(
+            at_end.products[0], at_end.half_log_determinants[0], self.local_precision
+        )
+        return TrialProducts(products, half_log_determinant)
 
-    def evidence_by_ends(self, on: BoolArray, starts: IntArray, ends: IntArray) -> FloatArray:
-        """Return the log evidence of all trials if the force is switched in one more stretch.
+    def _initial_state(self, is_on: bool) -> FilterState:
+        """Return the state of the filter before the first sample, with the force on or off."""
+        return self._state_with_force_on if is_on else self._state_with_force_off
+
+    def evidence_of_stretches(self, on: BoolArray, starts: IntArray, ends: IntArray) -> FloatArray:
+        """Return the log evidence of all trials if a path is inverted in one more stretch.
 
         Parameters
         ----------
@@ -160,7 +179,7 @@ class SwitchedRecord:
         starts : (A,) array of int
             The first samples of the stretches in which the path is inverted.
         ends : (B,) array of int
-            The samples that follow the last ones of the stretches.
+            The samples after the last ones of the stretches.
 
         Returns
         -------
@@ -168,48 +187,59 @@ class SwitchedRecord:
             The log evidence of each start with each end [nat]; -inf if the end is not after the
             start.
         """
-        product_count = 1 + len(self.trials.view.shared_precision)
-        products = np.zeros((len(starts), len(ends), product_count, product_count))
+        column_count = 1 + len(self.trials.linear_trials.shared_precision)
+        products = np.zeros((len(starts), len(ends), column_count, column_count))
         # an infinite determinant is an evidence of -inf, which stays if an end is not after the
         # start
         half_log_determinants = np.full((len(starts), len(ends)), np.inf)
         kinds = self.step_kinds(on)
-        states_at_starts = self.steps.before(kinds, 0, self.begun[int(on[0])], starts)
-        after_ends = self.steps.after(kinds, ends)
-        transitions, noises = self._steps_back(on, ends)
+        states_at_starts = self.record_filter.filter_before(
+            kinds, 0, self._initial_state(bool(on[0])), starts
+        )
+        information_at_ends = self.record_filter.information_after(kinds, ends)
+        transitions, noises = self._steps_at_ends(on, ends)
         for k, start in enumerate(starts.tolist()):
             # a stretch from the first sample on: the force begins off instead of on, or on instead
             # of off
             if start == 0:
-                state = self.begun[int(not on[0])]
+                state = self._initial_state(not on[0])
             else:
-                covariance, mean, known_products, known_half = states_at_starts
-                state = (covariance[k], mean[k], known_products[k], known_half[k])
+                state = FilterState(*(array[k] for array in states_at_starts))
+            # filter the readings of the stretch, in which the path is inverted
             is_later = ends > start
-            switched = on.copy()
-            switched[start:] ^= True
-            covariance, mean, *sums = self.steps.before(
-                self.step_kinds(switched), start, state, ends[is_later]
+            inverted = on.copy()
+            inverted[start:] ^= True
+            state_before_ends = self.record_filter.filter_before(
+                self.step_kinds(inverted), start, state, ends[is_later]
             )
-            # the step into the sample `end`, from which on the path is not inverted any more
+            # predict over the step that ends the stretch
             transition = transitions[is_later]
-            covariance = transition @ covariance @ transition.mT + noises[is_later]
-            state_at_ends = (covariance, transition @ mean, *sums)
-            products_of_trial = joined(state_at_ends, [array[is_later] for array in after_ends])
-            products[k, is_later], half_log_determinants[k, is_later] = without(
-                *products_of_trial, self.local_precision
+            covariance = transition @ state_before_ends.covariance @ transition.mT
+            state_at_ends = state_before_ends._replace(
+                covariance=covariance + noises[is_later], mean=transition @ state_before_ends.mean
             )
-        return self.trials.evidence([Products(products, half_log_determinants), *self.others])
+            # join with the readings after the stretch
+            products_of_record, half_of_record = join_filters(
+                state_at_ends, StateInformation(*(array[is_later] for array in information_at_ends))
+            )
+            products[k, is_later], half_log_determinants[k, is_later] = integrate_out_last(
+                products_of_record, half_of_record, self.local_precision
+            )
+        return self.trials.log_evidence(
+            [TrialProducts(products, half_log_determinants), *self.products_of_others]
+        )
 
-    def _steps_back(self, on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return transitions and noises (B, n, n) of the steps by which inverted stretches end.
+    def _steps_at_ends(self, on: BoolArray, ends: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Return transitions and noises (B, n, n) of the steps that end inverted stretches.
+
+        Such a step leads to the first sample at which the path is not inverted any more.
 
         Parameters
         ----------
         on : (N,) array of bool
             The path before a stretch is inverted.
         ends : (B,) array of int
-            The samples that follow the last ones of the stretches. No step follows the end of the
+            The samples after the last ones of the stretches. No step follows the end of the
             record: its transition is the identity, without noise.
         """
         # the kind of step as in `step_kinds`: the path is inverted before the end, not at it
@@ -217,16 +247,18 @@ class SwitchedRecord:
         end_sample = np.where(is_last, 0, ends)
         was_on = ~on[ends - 1]
         kind = (2 * was_on + on[end_sample]) * self.length_count + self.length_of_sample[end_sample]
-        identity = np.eye(len(self.steps.rows[0]))
-        transitions = np.where(is_last[:, None, None], identity, self.steps.moves[kind])
-        noises = np.where(is_last[:, None, None], 0.0, self.steps.noises[kind])
+        identity = np.eye(len(self.record_filter.output_rows[0]))
+        transitions = np.where(
+            is_last[:, None, None], identity, self.record_filter.transitions[kind]
+        )
+        noises = np.where(is_last[:, None, None], 0.0, self.record_filter.noises[kind])
         return transitions, noises
 
-    def with_best_stretch_switched(self, on: BoolArray) -> BoolArray | None:
-        """Return the path with that one stretch inverted which makes it most probable.
+    def invert_best_stretch(self, on: BoolArray) -> BoolArray | None:
+        """Return the path after the most probable inversion of one stretch.
 
-        Inverting turns the force on where it was off, and off where it was on. The begin and the
-        end of the stretch are taken from a grid over the record.
+        An inversion turns the force on where it was off, and off where it was on. The stretch
+        begins and ends at samples of a grid over the record, or at changes of the path.
 
         Parameters
         ----------
@@ -239,93 +271,106 @@ class SwitchedRecord:
             The new path; None if no stretch raises the evidence by more than its changes cost.
         """
         sample_count = len(on)
-        # each start needs one pass of the filter, of up to `sample_count` steps
-        interval_count = min(max(MOST_STEPS // sample_count, 12), STARTS, sample_count)
+        # each start needs one pass of the filter, of up to `sample_count` steps; 12 intervals are
+        # the least with which a stretch is found
+        interval_count = min(
+            max(MOST_FILTER_STEPS // sample_count, 12), MOST_GRID_INTERVALS, sample_count
+        )
         edges = np.unique(
-            np.r_[np.linspace(0, sample_count, interval_count + 1).round(), changes(on)]
+            np.r_[np.linspace(0, sample_count, interval_count + 1).round(), change_samples(on)]
         ).astype(np.int64)
         # The price of a path counts its changes. A stretch that begins or ends at an existing
         # change removes it (-1); elsewhere it adds one (+1); at the ends of the record there is no
         # change.
-        prices = change_price(sample_count) * np.where(np.isin(edges, changes(on)), -1.0, 1.0)
+        prices = change_price(sample_count) * np.where(
+            np.isin(edges, change_samples(on)), -1.0, 1.0
+        )
         prices[[0, -1]] = 0.0
         # score [k, m]: the stretch from edge k to edge m + 1; -inf if it is empty
         scores = (
-            self.evidence_by_ends(on, edges[:-1], edges[1:]) - prices[:-1, None] - prices[None, 1:]
+            self.evidence_of_stretches(on, edges[:-1], edges[1:])
+            - prices[:-1, None]
+            - prices[None, 1:]
         )
         first_edge, last_interval = np.unravel_index(np.argmax(scores), scores.shape)
-        if scores[first_edge, last_interval] <= self.trials.evidence(
-            [self.products(on), *self.others]
-        ):
+        present_evidence = self.trials.log_evidence([self.products(on), *self.products_of_others])
+        if scores[first_edge, last_interval] <= present_evidence:
             return None
-        switched = on.copy()
-        switched[edges[first_edge] : edges[last_interval + 1]] ^= True
-        return switched
+        inverted = on.copy()
+        inverted[edges[first_edge] : edges[last_interval + 1]] ^= True
+        return inverted
 
-    def with_changes_placed(self, on: BoolArray) -> BoolArray:
-        """Return a path (N,) whose changes are moved to their most probable places.
+    def place_changes(self, on: BoolArray) -> BoolArray:
+        """Return a path (N,) whose changes are moved to their most probable samples.
 
         They are moved one after the other. This is repeated, three times at most, since the best
-        place of one change depends on the others.
+        sample of one change depends on the others.
         """
         for _ in range(3):
             previous = on.copy()
-            for number, old in enumerate(changes(on)):
-                places, log_evidence = self.evidence_by_place(on, number)
-                new = places[np.argmax(log_evidence)]
+            for change_index, old_sample in enumerate(change_samples(on)):
+                samples, log_evidence = self.evidence_of_change_samples(on, change_index)
+                new_sample = samples[np.argmax(log_evidence)]
                 on = on.copy()
-                # between old and new place: an earlier change extends the state after it, a later
-                # one extends the state before it
-                on[min(old, new) : max(old, new)] = on[old] if new < old else on[old - 1]
+                # an earlier change extends the stretch after it, a later one that before it
+                if new_sample < old_sample:
+                    on[new_sample:old_sample] = on[old_sample]
+                else:
+                    on[old_sample:new_sample] = on[old_sample - 1]
             if np.array_equal(on, previous):
                 break
         return on
 
-    def evidence_by_place(self, on: BoolArray, number: int) -> tuple[IntArray, FloatArray]:
-        """Return places of a change of a path, and the log evidence of each.
+    def evidence_of_change_samples(
+        self, on: BoolArray, change_index: int
+    ) -> tuple[IntArray, FloatArray]:
+        """Return samples to which a change of a path may be moved, and the log evidence of each.
 
-        Places are refined from a coarse grid to all samples around the most probable ones.
+        The samples lie between the neighbouring changes. A coarse grid of them is refined around
+        the most probable ones, until it contains every sample there.
 
         Parameters
         ----------
         on : (N,) array of bool
             The path: whether the force is on at each sample.
-        number : int
+        change_index : int
             The index of the change among the changes of the path.
 
         Returns
         -------
-        places : (B,) array of int
-            Samples at which the change may lie, ascending.
+        samples : (B,) array of int
+            The samples, ascending.
         log_evidence : (B,) array
-            The log evidence of all trials with the change there [nat].
+            The log evidence of all trials with the change at each of them [nat].
         """
-        previous_change, change, next_change = np.r_[0, changes(on), len(on)][number : number + 3]
-        # the path whose change is as early as the previous one; inverting it from there to a place
-        # delays the change to that place
+        bounds = np.r_[0, change_samples(on), len(on)]
+        previous_change, change, next_change = bounds[change_index : change_index + 3]
+        # `earliest_path` has the change where the previous one is. If it is inverted from there up
+        # to a sample, the change lies at that sample.
         earliest_path = on.copy()
         earliest_path[previous_change:next_change] = on[change]
-        places = np.zeros(0, dtype=np.int64)
+        samples = np.zeros(0, dtype=np.int64)
         log_evidence = np.zeros(0)
-        first_place, last_place = previous_change + 1, next_change - 1
+        first, last = previous_change + 1, next_change - 1
         while True:
-            candidate_places = np.linspace(first_place, last_place, PLACES).round().astype(np.int64)
-            new_places = np.setdiff1d(candidate_places, places)
-            if not len(new_places):
-                return places, log_evidence
-            evidence_of_new = self.evidence_by_ends(
-                earliest_path, np.array([previous_change]), new_places
-            )[0]
-            places = np.r_[places, new_places]
+            grid = np.linspace(first, last, COMPARED_SAMPLES).round().astype(np.int64)
+            new_samples = np.setdiff1d(grid, samples)
+            if not len(new_samples):
+                return samples, log_evidence
+            (evidence_of_new,) = self.evidence_of_stretches(
+                earliest_path, np.array([previous_change]), new_samples
+            )
+            samples = np.r_[samples, new_samples]
             log_evidence = np.r_[log_evidence, evidence_of_new]
-            order = np.argsort(places)
-            places, log_evidence = places[order], log_evidence[order]
-            probable = np.flatnonzero(log_evidence >= log_evidence.max() - RANGE)
-            first_place = places[max(probable[0] - 1, 0)]
-            last_place = places[min(probable[-1] + 1, len(places) - 1)]
+            order = np.argsort(samples)
+            samples, log_evidence = samples[order], log_evidence[order]
+            # the next grid: one compared sample beyond the probable ones on either side
+            probable = np.flatnonzero(log_evidence >= log_evidence.max() - EVIDENCE_RANGE)
+            first = samples[max(probable[0] - 1, 0)]
+            last = samples[min(probable[-1] + 1, len(samples) - 1)]
 
 
-def switched_steps(
+def switched_step_matrices(
     system: ForceStateSpace, event: int, lengths: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return transitions and noises (4 J, n, n) of steps in which the force of events is switched.
@@ -342,9 +387,9 @@ def switched_steps(
     lengths : (J,) array
         The lengths of the steps [s].
     """
-    on_transition, on_noise = discretised(system.generator, system.intensity, lengths)
-    off_transition, off_noise = discretised(
-        without_state(system.generator, event), without_state(system.intensity, event), lengths
+    on_transition, on_noise = discretise(system.generator, system.intensity, lengths)
+    off_transition, off_noise = discretise(
+        zero_state(system.generator, event), zero_state(system.intensity, event), lengths
     )
     transitions = np.stack((off_transition, off_transition, on_transition, on_transition))
     noises = np.stack((off_noise, off_noise, on_noise, on_noise))
@@ -358,7 +403,7 @@ def switched_steps(
     return transitions.reshape(shape), noises.reshape(shape)
 
 
-def begin_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray, FloatArray]:
+def initial_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray, FloatArray]:
     """Return the covariances (n, n) of the state at the first sample with the force off, and on.
 
     Parameters
@@ -368,34 +413,35 @@ def begin_covariances(system: ForceStateSpace, event: int) -> tuple[FloatArray, 
     event : int
         The index of the force of events in the state.
     """
-    on = system.start_covariance
-    # a settled trial begins at rest under the force; without it that deflection is absent
+    on = system.initial_covariance
+    # A settled trial begins at rest, deflected by the force. Without the force that part of the
+    # covariance is absent.
     off = on.copy()
     off[:event, :event] -= np.outer(on[:event, event], on[:event, event])
-    return without_state(off, event), on
+    return zero_state(off, event), on
 
 
-def without_state(matrix: FloatArray, index: int) -> FloatArray:
-    """Return a matrix with the row and the column of a state set to zero."""
-    remaining = matrix.copy()
-    remaining[index] = 0.0
-    remaining[:, index] = 0.0
-    return remaining
+def zero_state(matrix: FloatArray, index: int) -> FloatArray:
+    """Return a matrix (n, n) with the row and the column of one state set to zero."""
+    changed = matrix.copy()
+    changed[index] = 0.0
+    changed[:, index] = 0.0
+    return changed
 
 
-def changes(on: BoolArray) -> IntArray:
-    """Return the samples at which a path (N,) changes: the first ones with the new value."""
+def change_samples(on: BoolArray) -> IntArray:
+    """Return the samples at which a path (N,) changes: each the first one with the new value."""
     return np.flatnonzero(np.diff(on)) + 1
 
 
-def change_price(count: int) -> float:
-    """Return the price of a change in a record of `count` samples [nat].
+def change_price(sample_count: int) -> float:
+    """Return the price of a change in a record of `sample_count` samples [nat].
 
-    It is minus the log prior of a change: of its place among the samples, and that there is one.
+    It is minus the log prior of a change: that there is one, and that it lies at this sample.
     """
-    return float(np.log(count)) + CHANGE_PRICE
+    return float(np.log(sample_count)) + CHANGE_PRICE
 
 
 def price_of_changes(paths: Sequence[BoolArray]) -> float:
     """Return the price of all changes of paths [nat]."""
-    return sum(len(changes(on)) * change_price(len(on)) for on in paths)
+    return sum(len(change_samples(on)) * change_price(len(on)) for on in paths)

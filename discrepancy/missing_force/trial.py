@@ -1,13 +1,12 @@
-"""A dynamic trial in which a missing force is looked for: its residuals, and their derivatives.
+"""A trial in motion as a linear system with ports, whose missing forces are estimated.
 
-The trial is linear in its unknowns. Residuals and derivatives are divided by the standard
-deviations of the noise. The unknowns are those of `fits.trial_data`, with prior mean zero. A
-calibrated parameter changes the motion of the model (a column of derivatives of the readings) and
-the motion that missing forces add to it (`slopes`); both together are exact along the actual
-motion.
+The trial is linear in its unknowns, which are those of `fits.trial_data`, with prior mean zero.
+Residuals and derivatives are divided by the standard deviations of the noise. A calibrated
+parameter changes the response of the model (`shared_derivatives`) and the motion that missing
+forces add to it (`system_derivatives`); both together are exact along the actual motion.
 
 Terms and shapes: a port is a place where a force can act. An interval between two of the N samples
-is divided into `parts` fine steps; their ends are the F = (N - 1) parts + 1 fine stamps. The added
+is divided into `parts` substeps; their ends are the F = (N - 1) parts + 1 fine stamps. The added
 state (F, n) is the state of the linear system that forces at ports add to the model's response. A
 column is the change of the readings (N, C) for a unit of one unknown.
 """
@@ -16,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -30,20 +30,89 @@ from discrepancy.system.sensing import in_own_clock
 from discrepancy.system.time_history import subdivide
 from fe.runtime.patch import ModelPatch
 
-from .kalman import driven
+from .kalman import simulate_inputs
 
-FINEST, COARSEST = 16, 4
-"""Largest and smallest number of fine steps in an interval between two samples."""
-FINE_PHASE = 0.15
-"""Largest phase of the fastest mode in a fine step [rad]."""
-LONGEST_MEMORY, LEAST_WHITE = 2000, 1e-3
-"""Largest number of samples over which the correlation of a noise is computed; least share of its
-variance that is taken as white."""
-SMALL = 1e-3
+MOST_SUBSTEPS, FEWEST_SUBSTEPS = 16, 4
+"""Largest and smallest number of substeps in an interval between two samples."""
+LARGEST_SUBSTEP_PHASE = 0.15
+"""Largest phase of the fastest mode in a substep [rad]."""
+LONGEST_CORRELATION, LEAST_WHITE_SHARE = 2000, 1e-3
+"""Largest number of samples over which the correlation of a noise is computed. Least share of its
+variance that is taken as white, so that the filter does not divide by zero."""
+HALF_DIFFERENCE = 1e-3
 """Half the difference of a parameter in the derivative of a system [prior standard deviations]."""
 
 NO_FORCES: Mapping[int, FloatArray] = MappingProxyType({})
 """Forces by port of a trial without any."""
+
+
+class ColouredNoise(NamedTuple):
+    """The part of a channel's noise that is correlated in time, as a process of first order.
+
+    Attributes
+    ----------
+    channel : int
+        The index of the channel in the trial.
+    share : float
+        The share of this part in the variance of the noise.
+    decay_rate : float
+        The rate at which its correlation decays [1/s].
+    """
+
+    channel: int
+    share: float
+    decay_rate: float
+
+
+class GainUnknown(NamedTuple):
+    """A shared unknown that is the gain of a channel of a trial.
+
+    Attributes
+    ----------
+    unknown : int
+        The number of the unknown.
+    channel : int
+        The index of the channel in the trial.
+    scale : float
+        The relative change of the channel's readings for a unit of the unknown.
+    """
+
+    unknown: int
+    channel: int
+    scale: float
+
+
+class SampleIntervals(NamedTuple):
+    """The intervals between the N samples of a trial.
+
+    Attributes
+    ----------
+    lengths : (J,) ndarray
+        The different lengths [s].
+    length_of_sample : (N,) ndarray of int
+        The index in `lengths` of the interval that ends at each sample; that of sample 0 is not
+        used.
+    """
+
+    lengths: FloatArray
+    length_of_sample: IntArray
+
+
+class SubstepMatrices(NamedTuple):
+    """The matrices by which the state advances over a substep, by the length of the interval.
+
+    Attributes
+    ----------
+    transitions : (J, n, n) ndarray
+        The transitions of the state.
+    by_input_at_begin, by_input_at_end : (J, n, n) ndarray
+        The derivatives of the next state by an input to the state's rate at the start and at the
+        end of the substep. The input is linear over the substep (first-order hold).
+    """
+
+    transitions: FloatArray
+    by_input_at_begin: FloatArray
+    by_input_at_end: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,14 +123,14 @@ class TrialColumn:
     ----------
     readings : (N, C) ndarray
         The change of the readings, divided by the noise deviations.
-    added : (F, n) ndarray or None
+    added_state : (F, n) ndarray or None
         The change of the added state; None if it does not change.
     forces : mapping of int to (F,) ndarray
         The change of the force at each port, by the number of the port [N, N m or the port's flow].
     """
 
     readings: FloatArray
-    added: FloatArray | None = None
+    added_state: FloatArray | None = None
     forces: Mapping[int, FloatArray] = field(default_factory=dict)
 
     def plus(self, other: "TrialColumn", factor: float) -> "TrialColumn":
@@ -69,17 +138,17 @@ class TrialColumn:
         forces = dict(self.forces)
         for port, force in other.forces.items():
             forces[port] = forces.get(port, 0.0) + factor * force
-        if other.added is None:
-            added = self.added
-        elif self.added is None:
-            added = factor * other.added
+        if other.added_state is None:
+            added = self.added_state
+        elif self.added_state is None:
+            added = factor * other.added_state
         else:
-            added = self.added + factor * other.added
+            added = self.added_state + factor * other.added_state
         return TrialColumn(self.readings + factor * other.readings, added, forces)
 
 
 @dataclass(frozen=True, eq=False)
-class SeenTrial:
+class PortedTrial:
     """A dynamic trial as a linear system with ports, with its residuals and their derivatives.
 
     Shapes: N samples, C channels, F fine stamps, n states, P ports, K shared unknowns, L unknowns
@@ -98,31 +167,31 @@ class SeenTrial:
         Whether each reading counts.
     deviation : (C,) ndarray
         The standard deviation of the noise of each channel [unit of the channel].
-    coloured : sequence of (int, float, float)
-        The channels whose noise has a part correlated in time: the number of the channel, the share
-        of that part in the variance, and its decay rate [1/s].
-    shared, local : (K, N, C), (L, N, C) ndarray
+    coloured_noises : sequence of ColouredNoise
+        The parts of noises that are correlated in time.
+    shared_derivatives, local_derivatives : (K, N, C), (L, N, C) ndarray
         The derivatives of the readings by the shared unknowns, and by those of this trial alone,
         divided by the noise deviations.
     local_precision : (L,) ndarray
         The prior precisions of the unknowns of this trial alone.
     system : PortedSystem
-        The linear system at the values `about`, with the gains of the channels.
-    slopes : sequence of PortedSystem or None
+        The linear system at the values `linearisation_point`; the gains of the channels are
+        contained in its outputs.
+    system_derivatives : sequence of PortedSystem or None
         The derivatives of the system by each shared unknown; None if the derivative is zero.
-    parts : int
-        The number of fine steps in an interval between two samples.
-    positions, speeds : (F, P) ndarray
+    substeps : int
+        The number of substeps in an interval between two samples.
+    port_positions, port_speeds : (F, P) ndarray
         The motion of the ports by the model without missing forces [m or rad, and per s].
-    settled : bool
+    begins_at_rest : bool
         Whether the trial begins at rest under the forces that act at its first sample.
-    about : (K + L,) ndarray
+    linearisation_point : (K + L,) ndarray
         The values of the unknowns about which the trial is linear.
-    gains : sequence of (int, int, float)
-        The shared unknowns that are gains: the number of the unknown, the number of the channel,
-        and the relative change of its reading for a unit of the unknown.
-    by_unknowns : mapping of int to (2, F, P) ndarray
-        The derivatives of `positions` and `speeds`, by the number of the unknown in `about`.
+    gain_unknowns : sequence of GainUnknown
+        The shared unknowns that are gains of its channels.
+    port_motion_derivatives : mapping of int to (2, F, P) ndarray
+        The derivatives of `port_positions` and `port_speeds`, by the number of the unknown in
+        `linearisation_point`.
     """
 
     name: str
@@ -130,46 +199,44 @@ class SeenTrial:
     residual: FloatArray
     used: BoolArray
     deviation: FloatArray
-    coloured: Sequence[tuple[int, float, float]]
-    shared: FloatArray
-    local: FloatArray
+    coloured_noises: Sequence[ColouredNoise]
+    shared_derivatives: FloatArray
+    local_derivatives: FloatArray
     local_precision: FloatArray
     system: PortedSystem
-    slopes: Sequence[PortedSystem | None]
-    parts: int
-    positions: FloatArray
-    speeds: FloatArray
-    settled: bool
-    about: FloatArray = field(default_factory=lambda: np.zeros(0))
-    gains: Sequence[tuple[int, int, float]] = ()
-    by_unknowns: Mapping[int, FloatArray] = field(default_factory=dict)
+    system_derivatives: Sequence[PortedSystem | None]
+    substeps: int
+    port_positions: FloatArray
+    port_speeds: FloatArray
+    begins_at_rest: bool
+    linearisation_point: FloatArray = field(default_factory=lambda: np.zeros(0))
+    gain_unknowns: Sequence[GainUnknown] = ()
+    port_motion_derivatives: Mapping[int, FloatArray] = field(default_factory=dict)
 
     @cached_property
-    def steps(self) -> tuple[FloatArray, IntArray]:
-        """The different lengths (J,) of intervals between samples [s], and an index (N,) into them.
+    def intervals(self) -> SampleIntervals:
+        """The intervals between samples.
 
-        Entry k of the index is for the interval that ends at sample k; entry 0 is not used.
         Intervals within 0.1 % of their mean are taken as equal, so that they share the matrices of
         a step.
         """
         lengths = np.diff(self.time)
         mean = float(lengths.mean())
         if np.all(np.abs(lengths - mean) < 1e-3 * mean):
-            return np.array([mean]), np.zeros(len(self.time), dtype=np.int64)
+            return SampleIntervals(np.array([mean]), np.zeros(len(self.time), dtype=np.int64))
         relative_lengths, index = np.unique(np.round(lengths / mean, 9), return_inverse=True)
-        return relative_lengths * mean, np.concatenate(([0], index)).astype(np.int64)
+        length_of_sample = np.concatenate(([0], index)).astype(np.int64)
+        return SampleIntervals(relative_lengths * mean, length_of_sample)
 
     @cached_property
-    def fine(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The matrices (J, n, n) by which the state advances over a fine step of each length.
+    def substep_matrices(self) -> SubstepMatrices:
+        """The matrices by which the state advances over a substep.
 
-        They are the transition, and the derivatives of the next state by an input to the state's
-        rate at the start and at the end of the step. The input is linear over the step (first-order
-        hold). One exponential of the system, with the input and its rate as further states, gives
-        all three (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
+        One exponential of the system, with the input and its rate as further states, gives all of
+        them (Van Loan 1978, IEEE Transactions on Automatic Control 23, 395-404).
         """
         n = len(self.system.generator)
-        lengths = self.steps[0][:, None, None] / self.parts
+        lengths = self.intervals.lengths[:, None, None] / self.substeps
         blocks = np.zeros((len(lengths), 3 * n, 3 * n))
         state, input_, input_rate = slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n)
         blocks[:, state, state] = self.system.generator * lengths
@@ -181,30 +248,34 @@ class SeenTrial:
         by_rising_input = np.ascontiguousarray(exponential[:, state, input_rate])
         # an input that rises from 0 to 1 stands for its value at the end of the step; a constant
         # input minus a rising one falls from 1 to 0, which stands for its value at the start
-        return transition, by_constant_input - by_rising_input, by_rising_input
+        return SubstepMatrices(transition, by_constant_input - by_rising_input, by_rising_input)
 
     @cached_property
     def fine_time(self) -> FloatArray:
         """The fine stamps (F,) [s]."""
-        return subdivide(self.time, self.parts)
+        return subdivide(self.time, self.substeps)
 
-    def port_motion(self, unknowns: FloatArray, added: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def port_motion(
+        self, unknowns: FloatArray, added_state: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Return positions and speeds (F, P) of the ports [m or rad, and per s].
 
         Parameters
         ----------
         unknowns : (K + L,) array
             The values of the shared unknowns, then of those of this trial alone.
-        added : (F, n) array
+        added_state : (F, n) array
             The state that forces at ports add.
         """
-        motion = np.stack((self.positions, self.speeds))
-        for k, derivative in self.by_unknowns.items():
-            motion += (unknowns[k] - self.about[k]) * derivative
-        return motion[0] + added @ self.system.positions.T, motion[1] + added @ self.system.speeds.T
+        motion = np.stack((self.port_positions, self.port_speeds))
+        for k, derivative in self.port_motion_derivatives.items():
+            motion += (unknowns[k] - self.linearisation_point[k]) * derivative
+        return motion[0] + added_state @ self.system.positions.T, motion[
+            1
+        ] + added_state @ self.system.speeds.T
 
-    def pushed(self, port: int, force: FloatArray) -> FloatArray:
-        """Return the state (F, n) that a force at a port adds.
+    def state_under_force(self, port: int, force: FloatArray) -> FloatArray:
+        """Return the state (F, n) that a force at a port adds to the response of the model.
 
         Parameters
         ----------
@@ -214,14 +285,18 @@ class SeenTrial:
             The force at the fine stamps [N, N m or the port's flow].
         """
         direction = -self.system.actions[port]
-        # s' = A s + direction force (see `PortedSystem`); at rest s' = 0 at the first sample
+        # s' = A s + direction * force (see `PortedSystem`); at rest s' = 0 at the first sample. A
+        # rigid motion makes A singular: least squares give the equilibrium without it.
         start = np.zeros(len(direction))
-        if self.settled and force[0] != 0.0:
+        if self.begins_at_rest and force[0] != 0.0:
             start = np.linalg.lstsq(self.system.generator, -direction * force[0], rcond=1e-12)[0]
-        return self._moved(start, direction[:, None], force[:, None])
+        return self._state_under_inputs(start, direction[:, None], force[:, None])
 
-    def turned(
-        self, slope: PortedSystem, added: FloatArray, forces: Mapping[int, FloatArray]
+    def change_by_system_parameter(
+        self,
+        system_derivative: PortedSystem,
+        added_state: FloatArray,
+        forces: Mapping[int, FloatArray],
     ) -> TrialColumn:
         """Return the change of the trial for a unit of a parameter that changes the system itself.
 
@@ -230,34 +305,35 @@ class SeenTrial:
 
         Parameters
         ----------
-        slope : PortedSystem
+        system_derivative : PortedSystem
             The derivative of the system by the parameter.
-        added : (F, n) array
+        added_state : (F, n) array
             The added state s.
         forces : mapping of int to (F,) array
             The forces g at ports that add it, by the number of the port.
         """
-        inputs = added @ slope.generator.T
+        inputs = added_state @ system_derivative.generator.T
         for port, force in forces.items():
-            inputs -= np.outer(force, slope.actions[port])
-        start = np.zeros(len(slope.generator))
-        if self.settled:
+            inputs -= np.outer(force, system_derivative.actions[port])
+        start = np.zeros(len(system_derivative.generator))
+        if self.begins_at_rest:
             start = -np.linalg.lstsq(self.system.generator, inputs[0], rcond=1e-12)[0]
         # only these states have an input: the others need no column in `_moved`
         driven_states = np.flatnonzero(np.any(inputs, axis=0))
-        state_derivative = self._moved(
+        state_derivative = self._state_under_inputs(
             start, np.eye(len(start))[:, driven_states], inputs[:, driven_states]
         )
         return TrialColumn(
-            self.readings(state_derivative) + self.over_noise(self.shown(slope, added, forces)),
+            self.readings_of_state(state_derivative)
+            + self.divide_by_noise(self.outputs_of_state(system_derivative, added_state, forces)),
             state_derivative,
         )
 
-    def _moved(
+    def _state_under_inputs(
         self,
         start: FloatArray,
         directions: FloatArray,
-        pushes: FloatArray,
+        inputs: FloatArray,
         step_of_sample: IntArray | None = None,
     ) -> FloatArray:
         """Return the state (F, n) of the linear system under inputs to the rate of its state.
@@ -271,53 +347,63 @@ class SeenTrial:
             The state at the first fine stamp.
         directions : (n, D) array
             The rate of the state for a unit of each of the D inputs.
-        pushes : (F, D) array
+        inputs : (F, D) array
             The inputs u at the fine stamps.
         step_of_sample : (N,) array of int, optional
-            The index in `steps` of the length of the interval that ends at each of the N samples
-            that are simulated; by default all samples of the trial.
+            The index in `intervals` of the length of the interval that ends at each of the N
+            samples that are simulated; by default all samples of the trial.
         """
-        transitions, by_input_at_begin, by_input_at_end = self.fine
+        matrices = self.substep_matrices
         if step_of_sample is None:
-            _, step_of_sample = self.steps
-        states = driven(
-            self.parts,
-            transitions,
-            np.ascontiguousarray(by_input_at_begin @ directions),
-            np.ascontiguousarray(by_input_at_end @ directions),
+            step_of_sample = self.intervals.length_of_sample
+        states = simulate_inputs(
+            self.substeps,
+            matrices.transitions,
+            np.ascontiguousarray(matrices.by_input_at_begin @ directions),
+            np.ascontiguousarray(matrices.by_input_at_end @ directions),
             step_of_sample,
             start,
-            np.ascontiguousarray(pushes),
+            np.ascontiguousarray(inputs),
         )
         return np.asarray(states)
 
-    def readings(
+    def readings_of_state(
         self, states: FloatArray, forces: Mapping[int, FloatArray] = NO_FORCES
     ) -> FloatArray:
-        """Return the readings (N, C), over the noise, of an added state (F, n) and forces (F,)."""
-        return self.over_noise(self.shown(self.system, states, forces))
-
-    def shown(
-        self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
-    ) -> FloatArray:
-        """Return the outputs (N, C) of an added state and of forces, in the units of the channels.
+        """Return the readings (N, C) by an added state and forces, divided by the noise.
 
         Parameters
         ----------
-        system : PortedSystem
-            The system whose outputs are meant, or its derivative by a parameter.
         states : (F, n) array
             The added state.
         forces : mapping of int to (F,) array
             The forces at ports, which an acceleration shows directly, by the number of the port.
         """
-        readings = states[:: self.parts] @ system.outputs.T
+        return self.divide_by_noise(self.outputs_of_state(self.system, states, forces))
+
+    def outputs_of_state(
+        self, system: PortedSystem, states: FloatArray, forces: Mapping[int, FloatArray]
+    ) -> FloatArray:
+        """Return the outputs (N, C) of a system by an added state and forces [unit of the channel].
+
+        Parameters
+        ----------
+        system : PortedSystem
+            The system of the trial, or its derivative by a parameter.
+        states : (F, n) array
+            The added state.
+        forces : mapping of int to (F,) array
+            The forces at ports, which an acceleration shows directly, by the number of the port.
+        """
+        readings = states[:: self.substeps] @ system.outputs.T
         for port, force in forces.items():
-            readings -= np.outer(force[:: self.parts], system.through[port])
+            readings -= np.outer(force[:: self.substeps], system.through[port])
         return np.asarray(readings)
 
-    def ahead(self, forces: Mapping[int, FloatArray], begin: int, end: int) -> FloatArray:
-        """Return the change of readings (B, C) by forces in a block of B samples, over the noise.
+    def readings_of_forces_in_block(
+        self, forces: Mapping[int, FloatArray], begin: int, end: int
+    ) -> FloatArray:
+        """Return the readings (B, C) by forces in a block of B samples, divided by the noise.
 
         The system is at rest at the start of the block, so that forces before it have no effect.
 
@@ -328,44 +414,43 @@ class SeenTrial:
         begin, end : int
             The first sample of the block, and the one after its last.
         """
-        fine_stamps_of_block = slice(begin * self.parts, (end - 1) * self.parts + 1)
+        fine_stamps_of_block = slice(begin * self.substeps, (end - 1) * self.substeps + 1)
         forces_in_block = {port: force[fine_stamps_of_block] for port, force in forces.items()}
         directions = -np.array([self.system.actions[port] for port in forces_in_block]).T
-        _, index_of_all = self.steps
-        step_of_sample = np.ascontiguousarray(index_of_all[begin:end])
+        step_of_sample = np.ascontiguousarray(self.intervals.length_of_sample[begin:end])
         inputs = np.array([*forces_in_block.values()]).T
-        states = self._moved(np.zeros(len(directions)), directions, inputs, step_of_sample)
-        readings = self.shown(self.system, states, forces_in_block)
+        states = self._state_under_inputs(
+            np.zeros(len(directions)), directions, inputs, step_of_sample
+        )
+        readings = self.outputs_of_state(self.system, states, forces_in_block)
         return np.asarray(readings / self.deviation * self.used[begin:end])
 
-    def over_noise(self, columns: FloatArray) -> FloatArray:
-        """Return columns (..., N, C) divided by the noise; 0 if a reading does not count."""
+    def divide_by_noise(self, columns: FloatArray) -> FloatArray:
+        """Return columns (..., N, C) over the noise deviation; 0 if a reading does not count."""
         return np.asarray(columns / self.deviation * self.used)
 
 
-def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, float] | None:
-    """Return the part of a noise that is correlated in time: share of the variance, and rate.
+def correlated_noise_part(
+    channel: int, noise: NoiseModel, interval: float | None
+) -> ColouredNoise | None:
+    """Return the part of a channel's noise that is correlated in time, or None if it is white.
 
     The noise is taken as white noise plus an autoregression of first order. The autocovariance of
     the sum at lags of one and two samples determines both parts.
 
     Parameters
     ----------
+    channel : int
+        The index of the channel.
     noise : NoiseModel
-        The noise of a channel, with the coefficients of an autoregression of any order.
+        Its noise, with the coefficients of an autoregression of any order.
     interval : float or None
         The interval between samples [s]; None if the samples are not equally spaced.
-
-    Returns
-    -------
-    (float, float) or None
-        The share of the correlated part in the variance, and its decay rate [1/s]; None if the
-        noise is white.
     """
     if interval is None or not noise.applies(interval):
         return None
     impulse_response = lfilter(
-        [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_MEMORY)]
+        [1.0], np.r_[1.0, -noise.autoregression], np.r_[1.0, np.zeros(LONGEST_CORRELATION)]
     )
     # up to a common factor, the autocovariances at lags of 0, 1 and 2 samples
     covariances = [
@@ -376,56 +461,64 @@ def decaying_part(noise: NoiseModel, interval: float | None) -> tuple[float, flo
         return None
     # for a first-order autoregression plus white noise, c_1 = share c_0 decay and c_2 = c_1 decay
     decay = covariances[2] / covariances[1]
-    return min(covariances[1] / decay / covariances[0], 1.0 - LEAST_WHITE), -float(
-        np.log(decay)
-    ) / interval
+    share = covariances[1] / decay / covariances[0]
+    return ColouredNoise(
+        channel=channel,
+        share=min(share, 1.0 - LEAST_WHITE_SHARE),
+        decay_rate=-float(np.log(decay)) / interval,
+    )
 
 
-def seen_trial(problem: Problem, number: int, point: Point) -> SeenTrial:
+def ported_trial(problem: Problem, trial_index: int, point: Point) -> PortedTrial:
     """Return a dynamic trial of a problem, linear about a point.
 
     Parameters
     ----------
     problem : Problem
         The campaign and model; the model must describe how its ports move.
-    number : int
+    trial_index : int
         The index of the trial in the problem.
     point : Point
         The values of the unknowns about which the trial is linear.
     """
-    data = problem.trials[number]
+    data = problem.trials[trial_index]
     trial = data.trial
     gains = 1.0 + problem.shared.gains(point.shared, trial.channels)
-    system, slopes = _ported(problem, trial, point.shared)
+    system, system_derivatives = _ported_system(problem, trial, point.shared)
     system = _with_gains(system, gains)
-    parts = _fine_steps(system, trial.time)
-    positions_and_speeds, by_unknowns = _port_motion(problem, number, point, parts)
-    residual, by_shared, by_local = _linear_readings(problem, number, point)
-    deviation = trial.noise_factor * np.array([noise.static_deviation for noise in data.noise])
-    return SeenTrial(
+    substeps = _substep_count(system, trial.time)
+    positions_and_speeds, by_unknowns = _port_motion(problem, trial_index, point, substeps)
+    residual, by_shared, by_local = _residual_and_derivatives(problem, trial_index, point)
+    deviation = trial.noise_factor * np.array(
+        [noise.static_deviation for noise in data.noise_models]
+    )
+    return PortedTrial(
         name=trial.name,
         time=trial.time,
         residual=residual / deviation * trial.used,
         used=trial.used,
         deviation=deviation,
-        coloured=_coloured_noises(data.noise, trial.whitened_at),
-        shared=by_shared / deviation * trial.used,
-        local=by_local / deviation * trial.used,
+        coloured_noises=_coloured_noises(data.noise_models, trial.whitened_at),
+        shared_derivatives=by_shared / deviation * trial.used,
+        local_derivatives=by_local / deviation * trial.used,
         local_precision=data.unknowns.precision,
         system=system,
-        slopes=[None if slope is None else _with_gains(slope, gains) for slope in slopes],
-        parts=parts,
-        positions=positions_and_speeds[0],
-        speeds=positions_and_speeds[1],
-        settled=trial.begins.value == "settled" and trial.kind.value != "ringdown",
-        about=np.concatenate((point.shared, point.local[number])),
-        gains=_gain_unknowns(problem, trial, gains),
-        by_unknowns=by_unknowns,
+        system_derivatives=[
+            None if derivative is None else _with_gains(derivative, gains)
+            for derivative in system_derivatives
+        ],
+        substeps=substeps,
+        port_positions=positions_and_speeds[0],
+        port_speeds=positions_and_speeds[1],
+        begins_at_rest=trial.begins.value == "settled" and trial.kind.value != "ringdown",
+        linearisation_point=np.concatenate((point.shared, point.local[trial_index])),
+        gain_unknowns=_gain_unknowns(problem, trial, gains),
+        port_motion_derivatives=by_unknowns,
     )
 
 
-def _linear_readings(
-    problem: Problem, number: int, point: Point
+def _residual_and_derivatives(
+    problem: Problem, trial_index: int, point: Point
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the residuals at zero unknowns, and the derivatives of the readings.
 
@@ -433,7 +526,7 @@ def _linear_readings(
     ----------
     problem : Problem
         The campaign and model.
-    number : int
+    trial_index : int
         The index of the trial in the problem.
     point : Point
         The values u_0 of the unknowns about which the model is linear.
@@ -446,26 +539,24 @@ def _linear_readings(
     by_shared, by_local : (K, N, C), (L, N, C) array
         The derivatives D of the prediction by the shared unknowns, and by those of the trial alone.
     """
-    data = problem.trials[number]
-    linear_response = problem.linearise(number, point, Candidate())
+    data = problem.trials[trial_index]
+    linear_response = problem.linearise(trial_index, point, Candidate())
     derivatives, shared_of_column = problem.prediction_derivatives(
-        number, point, linear_response, Candidate()
+        trial_index, point, linear_response, Candidate()
     )
-    by_local = derivatives[: data.unknowns.size]
-    by_shared = np.zeros((problem.shared.size, *linear_response.response.shape))
-    by_shared[shared_of_column] = derivatives[data.unknowns.size :]
-    residual = data.trial.values - problem.prediction(number, point, linear_response.response)
+    by_local = derivatives[: data.unknowns.unknown_count]
+    by_shared = np.zeros((problem.shared.unknown_count, *linear_response.response.shape))
+    by_shared[shared_of_column] = derivatives[data.unknowns.unknown_count :]
+    residual = data.trial.values - problem.prediction(trial_index, point, linear_response.response)
     # the linear prediction is p(u_0) + D (u - u_0); at u = 0 it is p(u_0) - D u_0
     residual += np.tensordot(point.shared, by_shared, 1) + np.tensordot(
-        point.local[number], by_local, 1
+        point.local[trial_index], by_local, 1
     )
     return residual, by_shared, by_local
 
 
-def _gain_unknowns(
-    problem: Problem, trial: Trial, gains: FloatArray
-) -> list[tuple[int, int, float]]:
-    """Return the shared unknowns that are gains of the trial's channels, as `SeenTrial.gains`.
+def _gain_unknowns(problem: Problem, trial: Trial, gains: FloatArray) -> list[GainUnknown]:
+    """Return the shared unknowns that are gains of the trial's channels.
 
     Parameters
     ----------
@@ -480,40 +571,37 @@ def _gain_unknowns(
     unknowns = []
     for index, channel_name in enumerate(shared.gain_channels):
         if channel_name in trial.channels:
-            number = shared.count + index
+            number = shared.parameter_count + index
             channel = trial.channels.index(channel_name)
-            unknowns.append((number, channel, float(shared.scale[number]) / float(gains[channel])))
+            scale = float(shared.scale[number]) / float(gains[channel])
+            unknowns.append(GainUnknown(number, channel, scale))
     return unknowns
 
 
-def _coloured_noises(
-    noises: Sequence[NoiseModel], interval: float | None
-) -> list[tuple[int, float, float]]:
-    """Return the channels whose noise has a correlated part, as `SeenTrial.coloured`."""
-    coloured = []
-    for channel, noise in enumerate(noises):
-        share_and_rate = decaying_part(noise, interval)
-        if share_and_rate is not None:
-            coloured.append((channel, *share_and_rate))
-    return coloured
+def _coloured_noises(noises: Sequence[NoiseModel], interval: float | None) -> list[ColouredNoise]:
+    """Return the parts of the channels' noises that are correlated in time."""
+    parts = [
+        correlated_noise_part(channel, noise, interval) for channel, noise in enumerate(noises)
+    ]
+    return [part for part in parts if part is not None]
 
 
-def _fine_steps(system: PortedSystem, time: FloatArray) -> int:
-    """Return the number of fine steps in an interval between two samples.
+def _substep_count(system: PortedSystem, time: FloatArray) -> int:
+    """Return the number of substeps in an interval between two samples.
 
-    The fastest mode moves by at most `FINE_PHASE` in a step, within `COARSEST` and `FINEST` steps.
+    The phase of the fastest mode changes by at most `LARGEST_SUBSTEP_PHASE` in a substep, if that
+    needs no more than `MOST_SUBSTEPS`; the number is at least `FEWEST_SUBSTEPS`.
     """
     interval = float(np.median(np.diff(time)))
     fastest_angular_frequency = float(
         np.max(np.abs(np.linalg.eigvals(system.generator)), initial=0.0)
     )
-    return int(
-        np.clip(np.ceil(fastest_angular_frequency * interval / FINE_PHASE), COARSEST, FINEST)
-    )
+    needed = np.ceil(fastest_angular_frequency * interval / LARGEST_SUBSTEP_PHASE)
+    return int(np.clip(needed, FEWEST_SUBSTEPS, MOST_SUBSTEPS))
 
 
 def _port_motion(
-    problem: Problem, number: int, point: Point, parts: int
+    problem: Problem, trial_index: int, point: Point, substeps: int
 ) -> tuple[FloatArray, dict[int, FloatArray]]:
     """Return the motion of the ports by the model alone, and its derivatives by the unknowns.
 
@@ -521,38 +609,39 @@ def _port_motion(
     ----------
     problem : Problem
         The campaign and model.
-    number : int
+    trial_index : int
         The index of the trial in the problem.
     point : Point
         The values of the unknowns.
-    parts : int
-        The number of fine steps in an interval between two samples.
+    substeps : int
+        The number of substeps in an interval between two samples.
 
     Returns
     -------
     motion : (2, F, P) array
         The positions and speeds of the P ports at the fine stamps [m or rad, and per s].
     by_unknowns : dict of int to (2, F, P) array
-        The derivatives of the motion, by the number of the unknown in `SeenTrial.about`.
+        The derivatives of the motion, by the number of the unknown in
+        `PortedTrial.linearisation_point`.
     """
-    data = problem.trials[number]
+    data = problem.trials[trial_index]
     shared = problem.shared
     trial_in_own_clock, _ = in_own_clock(data.trial, ModelPatch())
 
     def motion(shared_values: FloatArray, local_values: FloatArray) -> FloatArray:
         parameters = shared.parameters(shared_values)
         conditions = data.unknowns.conditions(data.trial, parameters, local_values)
-        return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, parts))
+        return np.stack(problem.model.port_motion(trial_in_own_clock, conditions, substeps))
 
-    local = point.local[number]
+    local = point.local[trial_index]
     at_point = motion(point.shared, local)
     by_unknowns = {}
-    for k in range(shared.count):
+    for k in range(shared.parameter_count):
         by_unknowns[k] = (motion(with_step(point.shared, k), local) - at_point) / PARAMETER_STEP
     # the first unknowns of a trial are the zeros of its channels, which do not move the ports
-    for k in range(data.unknowns.zeros, data.unknowns.size):
+    for k in range(data.unknowns.zero_count, data.unknowns.unknown_count):
         stepped_motion = motion(point.shared, with_step(local, k))
-        by_unknowns[shared.size + k] = (stepped_motion - at_point) / PARAMETER_STEP
+        by_unknowns[shared.unknown_count + k] = (stepped_motion - at_point) / PARAMETER_STEP
     return at_point, by_unknowns
 
 
@@ -561,7 +650,7 @@ def _with_gains(system: PortedSystem, gains: FloatArray) -> PortedSystem:
     return replace(system, outputs=system.outputs * gains[:, None], through=system.through * gains)
 
 
-def _ported(
+def _ported_system(
     problem: Problem, trial: Trial, shared: FloatArray
 ) -> tuple[PortedSystem, list[PortedSystem | None]]:
     """Return the linear system with ports of a trial, and its derivatives by the shared unknowns.
@@ -584,26 +673,26 @@ def _ported(
     def system(u: FloatArray) -> PortedSystem:
         return problem.model.ported(trial, outputs, unknowns.parameters(u))
 
-    slopes: list[PortedSystem | None] = []
-    for k in range(unknowns.count):
-        above = system(with_step(shared, k, SMALL))
-        below = system(with_step(shared, k, -SMALL))
-        slopes.append(_slope_of_system(above, below))
-    slopes += [None] * (unknowns.size - len(slopes))
-    return system(shared), slopes
+    derivatives: list[PortedSystem | None] = []
+    for k in range(unknowns.parameter_count):
+        above = system(with_step(shared, k, HALF_DIFFERENCE))
+        below = system(with_step(shared, k, -HALF_DIFFERENCE))
+        derivatives.append(_system_derivative(above, below))
+    derivatives += [None] * (unknowns.unknown_count - len(derivatives))
+    return system(shared), derivatives
 
 
-def _slope_of_system(above: PortedSystem, below: PortedSystem) -> PortedSystem | None:
+def _system_derivative(above: PortedSystem, below: PortedSystem) -> PortedSystem | None:
     """Return the derivative of a system by a parameter, a central difference; None if zero.
 
     Parameters
     ----------
     above, below : PortedSystem
-        The system with the parameter `SMALL` above and below its value.
+        The system with the parameter `HALF_DIFFERENCE` above and below its value.
     """
 
     def slope(upper: FloatArray, lower: FloatArray) -> FloatArray:
-        return np.asarray((upper - lower) / (2.0 * SMALL))
+        return np.asarray((upper - lower) / (2.0 * HALF_DIFFERENCE))
 
     derivative = replace(
         above,

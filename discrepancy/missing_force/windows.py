@@ -1,9 +1,10 @@
 """The windows in time in which there is a gap between the records and the model.
 
-They are found as events: of the missing force at the port with the most evidence or, if that is
-more probable, of an error of one channel, with all unknowns of the records integrated out. If the
-model does not describe how its ports move, events are looked for in the residuals of a fit:
-in the course of their strongest pattern over the channels (the first singular vector).
+The windows are found as events: stretches of time in which a force acts. The force is the missing
+one at the port with the most evidence or, if that is more probable, an error of one channel. All
+unknowns of the records are integrated out. If the model does not describe how its ports move,
+events are looked for in the residuals of a fit: in the amplitude of their strongest pattern over
+the channels (the first singular vector) over time.
 """
 
 from collections.abc import Sequence
@@ -20,23 +21,25 @@ from discrepancy.location.residuals import FittedTrial, ResidualSet
 from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
 
-from .events import GROUND, MOST_EVENTS, Events, events, throughout
-from .explained import ForceHypothesis, with_most_probable_forces
+from .events import LEAST_EVIDENCE, MOST_EVENTS, Events, events_throughout, find_events
+from .explained import ForceHypothesis, fit_missing_forces
 from .filtered import Process
+from .linear_trials import LinearTrials
 from .naming import ForceSearch
 from .port_force import evidence_without_force
-from .switched_record import changes
-from .trial import SeenTrial
-from .view import View
+from .process_search import Processes
+from .switched_record import change_samples
+from .trial import PortedTrial
 
-IN_TIME = frozenset(TrialKind) - {TrialKind.STATIC}
-"""Kinds of trials whose readings are a course in time."""
-SHOWS = 0.2
-"""Share of the largest channel's rms from which on a channel is listed as showing the gap."""
-READING_SIZES = (3.0, 30.0, 300.0)
+TIMED_KINDS = frozenset(TrialKind) - {TrialKind.STATIC}
+"""Kinds of trials whose readings follow each other in time; those of a static trial do not."""
+LEAST_RMS_SHARE = 0.2
+"""Least rms of a channel, over the largest rms of all channels, with which it is listed in a
+window."""
+CHANNEL_ERROR_DEVIATIONS = (3.0, 30.0, 300.0)
 """Standard deviations of an error of a channel, over that of its noise, that are compared with the
 missing force."""
-READING_TIMES = (0.02, 0.3)
+CHANNEL_ERROR_TIMES = (0.02, 0.3)
 """Correlation times of such an error, over the duration of the longest record."""
 
 
@@ -62,16 +65,17 @@ def gap_windows(
     dynamic_trials = tuple(fitted.trial for fitted in residuals.trials if fitted.trial.is_dynamic)
     _, own_laws = problem.model.apart()
     if not dynamic_trials or not problem.model.shows_ports or len(own_laws):
-        return residual_windows(residuals, seed=seed)
+        return windows_of_residuals(residuals, seed=seed)
     try:
-        windows = _force_windows(problem.with_trials(dynamic_trials), fit)
-    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):  # no verdict rests on it
-        return residual_windows(residuals, seed=seed)
+        windows = _windows_of_missing_force(problem.with_trials(dynamic_trials), fit)
+    # the windows are an addition to the verdict: if they cannot be computed, the residuals serve
+    except (DiscrepancyError, np.linalg.LinAlgError, ValueError):
+        return windows_of_residuals(residuals, seed=seed)
     flight = frozenset({TrialKind.FLIGHT})
-    return windows + residual_windows(residuals, seed=seed, kinds=flight)
+    return windows + windows_of_residuals(residuals, seed=seed, kinds=flight)
 
 
-def _force_windows(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
+def _windows_of_missing_force(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]:
     """Return the windows in which a force is missing at the port with the most evidence.
 
     If an error of a channel is more probable, they are the windows of that error.
@@ -84,21 +88,25 @@ def _force_windows(problem: Problem, fit: CandidateFit) -> tuple[GapWindow, ...]
         The fit of the verdict.
     """
     search = ForceSearch(problem)
-    port = max(search.at, key=lambda name: search.at[name].log_evidence)
+    port = max(
+        search.hypothesis_by_port, key=lambda name: search.hypothesis_by_port[name].log_evidence
+    )
     evidence_of_law = _evidence_of_law(search, port, fit)
     channels = [data.trial.channels for data in problem.trials]
-    port_number, hypothesis = _most_probable_place(
-        search.ports.index(port), search.rough(port), channels
+    port_number, hypothesis = _port_or_channel_error(
+        search.ports.index(port), search.hypothesis_with_jumps(port), channels
     )
-    if hypothesis.log_evidence < evidence_without_force(hypothesis) + GROUND:
+    if hypothesis.log_evidence < evidence_without_force(hypothesis) + LEAST_EVIDENCE:
         return ()
     process = hypothesis.processes[port_number]
-    best_events = events(hypothesis.view, port_number, process, evidence_of_law)
+    best_events = find_events(hypothesis.linear_trials, port_number, process, evidence_of_law)
     readings_by_force = []
-    for trial, motion in zip(hypothesis.view.trials, hypothesis.motions, strict=True):
+    for trial, motion in zip(hypothesis.linear_trials.trials, hypothesis.motions, strict=True):
         force = motion.forces[port_number]
         readings_by_force.append(
-            trial.readings(trial.pushed(port_number, force), {port_number: force})
+            trial.readings_of_state(
+                trial.state_under_force(port_number, force), {port_number: force}
+            )
         )
     return _windows_of_events(best_events, channels, readings_by_force, with_effect=False)
 
@@ -118,17 +126,17 @@ def _evidence_of_law(search: ForceSearch, port: str, fit: CandidateFit) -> float
     laws = [number for number, term in enumerate(fit.candidate.terms) if term.place == port]
     if not laws:
         return -np.inf
-    candidate, effect = fit.candidate.subset(laws, fit.effect)
-    law = search.followed(search.at[port], candidate, effect)
+    candidate, effect = fit.candidate.subset_of_terms(laws, fit.effect)
+    law = search.fit_along_motion(search.hypothesis_by_port[port], candidate, effect)
     return -np.inf if law is None else law.log_evidence
 
 
-def residual_windows(
+def windows_of_residuals(
     residuals: ResidualSet,
     *,
     seed: int = 0,
     with_effect: bool = False,
-    kinds: frozenset[TrialKind] = IN_TIME,
+    kinds: frozenset[TrialKind] = TIMED_KINDS,
 ) -> tuple[GapWindow, ...]:
     """Return the windows in which the residuals of a fit are more than noise.
 
@@ -153,17 +161,17 @@ def residual_windows(
         extends_in_time = fitted.used.any() and np.ptp(trial.time) > 0.0
         if trial.kind not in kinds or not extends_in_time:
             continue
-        hypothesis, pattern = pattern_of_residuals(
+        hypothesis, pattern = strongest_pattern(
             trial.name, trial.time, white_residuals, fitted.used
         )
-        if hypothesis.log_evidence < evidence_without_force(hypothesis) + GROUND:
+        if hypothesis.log_evidence < evidence_without_force(hypothesis) + LEAST_EVIDENCE:
             continue
         process = hypothesis.processes[0]
         try:
-            best_events = events(hypothesis.view, 0, process)
+            best_events = find_events(hypothesis.linear_trials, 0, process)
         # with residuals of millions of noise deviations matrices become singular: a gap throughout
         except np.linalg.LinAlgError:
-            best_events = throughout(hypothesis.view, 0, process)
+            best_events = events_throughout(hypothesis.linear_trials, 0, process)
         residuals_by_pattern = hypothesis.motions[0].forces[0][:, None] * pattern
         windows += _windows_of_events(
             best_events, [trial.channels], [residuals_by_pattern], with_effect=with_effect
@@ -171,7 +179,7 @@ def residual_windows(
     return windows
 
 
-def sized_windows(
+def add_window_sizes(
     windows: Sequence[GapWindow], before: ResidualSet, after: ResidualSet
 ) -> tuple[GapWindow, ...]:
     """Return windows with the sizes and channels that the residuals show in them.
@@ -194,10 +202,10 @@ def sized_windows(
         inside = _used_in_window(window, fitted)
         if not inside.any():
             continue
-        rms_of_channels = _rms_inside(inside, fitted, noise[window.trial])
+        rms_of_channels = _rms_by_channel(inside, fitted, noise[window.trial])
         largest = float(rms_of_channels.max())
-        is_shown = (rms_of_channels > 0.0) & (rms_of_channels >= SHOWS * largest)
-        channels = _selected(fitted.trial.channels, is_shown)
+        is_shown = (rms_of_channels > 0.0) & (rms_of_channels >= LEAST_RMS_SHARE * largest)
+        channels = _select_channels(fitted.trial.channels, is_shown)
         windows_with_sizes.append(replace(window, size=largest, channels=channels))
     return tuple(windows_with_sizes)
 
@@ -210,7 +218,7 @@ def _used_in_window(window: GapWindow, fitted: FittedTrial) -> BoolArray:
     return np.asarray(fitted.used & ((time >= begin) & (time <= end))[:, None])
 
 
-def _rms_inside(inside: BoolArray, fitted: FittedTrial, noise: FloatArray) -> FloatArray:
+def _rms_by_channel(inside: BoolArray, fitted: FittedTrial, noise: FloatArray) -> FloatArray:
     """Return the rms residual (C,) of each channel divided by its noise, over selected readings.
 
     Parameters
@@ -226,7 +234,7 @@ def _rms_inside(inside: BoolArray, fitted: FittedTrial, noise: FloatArray) -> Fl
     return np.asarray(np.sqrt(squares / np.maximum(inside.sum(axis=0), 1)))
 
 
-def _selected(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...]:
+def _select_channels(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...]:
     """Return the channels whose entry in a mask (C,) is true."""
     pairs = zip(channels, is_selected, strict=True)
     return tuple(channel for channel, selected in pairs if selected)
@@ -235,7 +243,7 @@ def _selected(channels: Sequence[str], is_selected: BoolArray) -> tuple[str, ...
 # ---------------------------------------------------------------- errors of readings
 
 
-def _most_probable_place(
+def _port_or_channel_error(
     port: int, at_port: ForceHypothesis, channels: Sequence[tuple[str, ...]]
 ) -> tuple[int, ForceHypothesis]:
     """Return the missing force at a port, or an error of a channel if that is more probable.
@@ -252,52 +260,73 @@ def _most_probable_place(
     Returns
     -------
     port : int
-        The number of the port; 0 for a channel, which is the only port of its view.
+        The number of the port; 0 for a channel, which is the only port of the returned trials.
     hypothesis : ForceHypothesis
         The more probable of both.
     """
-    view = at_port.view
-    trials = view.trials
+    linear_trials = at_port.linear_trials
+    trials = linear_trials.trials
     longest_duration = max(float(np.ptp(trial.time)) for trial in trials)
     best_port = port
     best_hypothesis = at_port
-    for channel in dict.fromkeys(chain(*channels)):
-        motions = [replace(motion, forces={}, left={}) for motion in view.motions]
-        trials_with_error = [
-            _with_reading_as_port(trial, names, channel)
-            for trial, names in zip(trials, channels, strict=True)
-        ]
-        channel_view = replace(view, trials=trials_with_error, motions=motions)
-        processes_to_try = []
-        for size, relative_time in product(READING_SIZES, READING_TIMES):
-            processes_to_try.append(
-                {0: Process(size, relative_time * longest_duration, rough=True)}
-            )
-        evidences = [channel_view.solve(processes).evidence for processes in processes_to_try]
-        best_option = max(range(len(processes_to_try)), key=lambda k: evidences[k])
-        if evidences[best_option] > best_hypothesis.log_evidence:
+    channel_names = dict.fromkeys(chain(*channels))  # each once, in order
+    for channel in channel_names:
+        with_channel_error = replace(
+            linear_trials,
+            trials=[
+                _with_channel_as_port(trial, names, channel)
+                for trial, names in zip(trials, channels, strict=True)
+            ],
+            motions=[
+                replace(motion, forces={}, unexplained_forces={})
+                for motion in linear_trials.motions
+            ],
+        )
+        evidence, processes = _best_channel_error(with_channel_error, longest_duration)
+        if evidence > best_hypothesis.log_evidence:
             best_port = 0
-            best_hypothesis = with_most_probable_forces(
-                channel_view, processes_to_try[best_option], processes_to_try[best_option]
-            )
+            best_hypothesis = fit_missing_forces(with_channel_error, processes, processes)
     return best_port, best_hypothesis
 
 
-def _with_reading_as_port(trial: SeenTrial, channels: Sequence[str], channel: str) -> SeenTrial:
+def _best_channel_error(
+    linear_trials: LinearTrials, longest_duration: float
+) -> tuple[float, Processes]:
+    """Return the log evidence and the process of an error of a channel, the best of a grid.
+
+    Parameters
+    ----------
+    linear_trials : LinearTrials
+        The trials, whose only port is the channel.
+    longest_duration : float
+        The duration of the longest of them [s].
+    """
+    best_evidence = -np.inf
+    best_processes: Processes = {}
+    for deviation, relative_time in product(CHANNEL_ERROR_DEVIATIONS, CHANNEL_ERROR_TIMES):
+        processes = {0: Process(deviation, relative_time * longest_duration, may_jump=True)}
+        evidence = linear_trials.solve(processes).log_evidence
+        if not best_processes or evidence > best_evidence:
+            best_evidence = evidence
+            best_processes = processes
+    return best_evidence, best_processes
+
+
+def _with_channel_as_port(trial: PortedTrial, channels: Sequence[str], channel: str) -> PortedTrial:
     """Return a trial whose only port is a channel: a force there is an error of its readings.
 
     Parameters
     ----------
-    trial : SeenTrial
+    trial : PortedTrial
         The trial.
     channels : sequence of str
         The channels of the trial.
     channel : str
-        The channel with the error. A force of 1 changes its reading by one noise deviation.
+        The channel with the error. A force of one changes its reading by one noise deviation.
     """
     # readings are C s - e f (see `PortedSystem`): the minus sign makes a positive force raise them
     through = -trial.deviation[None] * (np.array(channels) == channel)
-    no_motion = np.zeros((len(trial.positions), 1))
+    no_motion = np.zeros((len(trial.port_positions), 1))
     no_action = np.zeros((1, len(trial.system.generator)))
     system = replace(
         trial.system,
@@ -307,13 +336,19 @@ def _with_reading_as_port(trial: SeenTrial, channels: Sequence[str], channel: st
         speeds=no_action,
         through=through,
     )
-    return replace(trial, system=system, positions=no_motion, speeds=no_motion, by_unknowns={})
+    return replace(
+        trial,
+        system=system,
+        port_positions=no_motion,
+        port_speeds=no_motion,
+        port_motion_derivatives={},
+    )
 
 
-def pattern_of_residuals(
+def strongest_pattern(
     name: str, time: FloatArray, series: FloatArray, used: BoolArray
 ) -> tuple[ForceHypothesis, FloatArray]:
-    """Return the strongest pattern of residuals over channels, and its course as a force.
+    """Return the strongest pattern of residuals over channels, and its amplitude as a force.
 
     Parameters
     ----------
@@ -329,7 +364,7 @@ def pattern_of_residuals(
     Returns
     -------
     hypothesis : ForceHypothesis
-        The course of the pattern, as a missing force at the one channel of a record.
+        The amplitude of the pattern over time, as a missing force in a record of one channel.
     pattern : (C,) array
         The pattern over the channels, of norm one.
     """
@@ -351,26 +386,26 @@ def pattern_of_residuals(
     )
     no_unknowns = np.zeros((0, len(time), 1))
     no_motion = np.zeros((len(time), 1))
-    trial = SeenTrial(
+    trial = PortedTrial(
         name=name,
         time=time,
         residual=series @ pattern.T / deviation,
         used=np.any(used, axis=1).reshape(-1, 1),
         deviation=np.array([deviation]),
-        coloured=(),
-        shared=no_unknowns,
-        local=no_unknowns,
+        coloured_noises=(),
+        shared_derivatives=no_unknowns,
+        local_derivatives=no_unknowns,
         local_precision=np.zeros(0),
         system=system,
-        slopes=(),
-        parts=1,
-        positions=no_motion,
-        speeds=no_motion,
-        settled=False,
+        system_derivatives=(),
+        substeps=1,
+        port_positions=no_motion,
+        port_speeds=no_motion,
+        begins_at_rest=False,
     )
     size = max(float(np.sqrt(np.mean(trial.residual**2))), 1.0)
-    processes = {0: Process(size, 0.1 * float(np.ptp(time)), rough=True)}
-    hypothesis = with_most_probable_forces(View([trial], np.zeros(0)), processes, processes)
+    processes = {0: Process(size, 0.1 * float(np.ptp(time)), may_jump=True)}
+    hypothesis = fit_missing_forces(LinearTrials([trial], np.zeros(0)), processes, processes)
     return hypothesis, pattern[0]
 
 
@@ -378,9 +413,9 @@ def pattern_of_residuals(
 
 
 def _windows_of_events(
-    best: Events,
+    events: Events,
     channels: Sequence[tuple[str, ...]],
-    shown: Sequence[FloatArray],
+    readings_by_force: Sequence[FloatArray],
     *,
     with_effect: bool,
 ) -> tuple[GapWindow, ...]:
@@ -388,43 +423,77 @@ def _windows_of_events(
 
     Parameters
     ----------
-    best : Events
+    events : Events
         The events.
     channels : sequence of tuple of str
         The channels of each trial.
-    shown : sequence of (N, C) array
+    readings_by_force : sequence of (N, C) array
         The part of the readings of each trial that the force makes, divided by the noise.
     with_effect : bool
         Whether the gap is that of the best hypothesis, not of the unchanged model.
     """
-    windows = []
-    for number, (trial, path) in enumerate(zip(best.search.trials, best.paths, strict=True)):
-        is_on = path
-        switches = changes(path)
-        if len(switches) > 2 * MOST_EVENTS:  # a force that comes and goes acts throughout
-            is_on = np.ones_like(path)
-            switches = switches[:0]
-        moments: list[Moment | None] = []
-        if len(switches):
-            moments = [Moment(*map(float, moment)) for moment in best.moments(number)]
-        stretch_edges = [0, *switches.tolist(), len(is_on)]
-        # None: the stretch begins with the record, or ends with it
-        bounds = [None, *moments, None]
-        for k in np.flatnonzero(is_on[stretch_edges[:-1]]).tolist():
-            samples_of_stretch = slice(stretch_edges[k], stretch_edges[k + 1])
-            rms_of_channels = np.sqrt(np.mean(shown[number][samples_of_stretch] ** 2, axis=0))
-            windows.append(
-                GapWindow(
-                    trial=trial.name,
-                    channels=_selected(
-                        channels[number], rms_of_channels > SHOWS * rms_of_channels.max()
-                    ),
-                    begin=bounds[k],
-                    end=bounds[k + 1],
-                    first=float(trial.time[0]),
-                    last=float(trial.time[-1]),
-                    size=float(rms_of_channels.max()),
-                    with_effect=with_effect,
-                )
-            )
+    windows: list[GapWindow] = []
+    for trial_index, channel_names in enumerate(channels):
+        windows += _windows_in_trial(
+            events,
+            trial_index,
+            channel_names,
+            readings_by_force[trial_index],
+            with_effect=with_effect,
+        )
     return tuple(windows)
+
+
+def _windows_in_trial(
+    events: Events,
+    trial_index: int,
+    channels: Sequence[str],
+    readings_by_force: FloatArray,
+    *,
+    with_effect: bool,
+) -> list[GapWindow]:
+    """Return the windows of events in one trial: the stretches in which the force is on.
+
+    Parameters
+    ----------
+    events : Events
+        The events.
+    trial_index : int
+        The index of the trial.
+    channels : sequence of str
+        The channels of the trial.
+    readings_by_force : (N, C) array
+        The part of its readings that the force makes, divided by the noise.
+    with_effect : bool
+        Whether the gap is that of the best hypothesis, not of the unchanged model.
+    """
+    trial = events.search.trials[trial_index]
+    is_on = events.paths[trial_index]
+    changes = change_samples(is_on)
+    change_times: list[Moment | None] = []
+    if len(changes) > 2 * MOST_EVENTS:
+        # a force that varies, not events: one stretch from the first sample to the last
+        is_on = np.ones_like(is_on)
+        changes = changes[:0]
+    elif len(changes):
+        change_times = [Moment(*times) for times in events.change_times(trial_index).tolist()]
+    stretch_edges = [0, *changes.tolist(), len(is_on)]
+    # None: the stretch begins with the record, or ends with it
+    edge_times = [None, *change_times, None]
+    windows = []
+    for stretch in np.flatnonzero(is_on[stretch_edges[:-1]]).tolist():
+        samples = slice(stretch_edges[stretch], stretch_edges[stretch + 1])
+        rms_of_channels = np.sqrt(np.mean(readings_by_force[samples] ** 2, axis=0))
+        largest_rms = float(rms_of_channels.max())
+        window = GapWindow(
+            trial=trial.name,
+            channels=_select_channels(channels, rms_of_channels > LEAST_RMS_SHARE * largest_rms),
+            begin=edge_times[stretch],
+            end=edge_times[stretch + 1],
+            first=float(trial.time[0]),
+            last=float(trial.time[-1]),
+            size=largest_rms,
+            with_effect=with_effect,
+        )
+        windows.append(window)
+    return windows

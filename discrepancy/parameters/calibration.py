@@ -24,7 +24,7 @@ from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.model_choice import ModelChoice
 from discrepancy.parameters.posterior import ParameterPosterior, parameter_posterior
-from discrepancy.search.wide_noise import residual_process_of
+from discrepancy.search.wide_noise import estimate_residual_process
 from discrepancy.verdict import Gate
 from discrepancy.workflow import checked, without_wrong_ends
 from reporting.progress import Progress, reporter
@@ -55,11 +55,11 @@ def calibrate_parameters(
     choice : ModelChoice
         The model, with its file or source.
     asset : str, optional
-        Name of what was measured; that of the campaign by default.
+        The name of what was measured; that of the campaign by default.
     samples : int
-        Number of samples of the posterior, and of the prior.
+        The number of samples of the posterior, and of the prior.
     seed : int
-        Seed of the samples.
+        The seed of the samples.
     progress : Progress, optional
         Where progress is reported.
 
@@ -87,7 +87,7 @@ def calibrate_parameters(
         posterior = parameter_posterior(problem, samples, seed)
     # residuals that are correlated as the noise record itself are not a discrepancy
     best = posterior.optima[0]
-    best = replace(best, residual_process=residual_process_of(problem, best))
+    best = replace(best, residual_process=estimate_residual_process(problem, best))
     gate = check_absolute_fit(problem, best)
     hashes = {"campaign": campaign.data_hash, "model": choice.source_hash}
     return Calibration(
@@ -96,7 +96,7 @@ def calibrate_parameters(
         model_hash=choice.source_hash,
         procedure=posterior.procedure,
         priors=priors,
-        samples=posterior.marginal.values(posterior.draws),
+        samples=posterior.marginal.physical_values(posterior.draws),
         prior_samples=prior_samples(priors, samples, seed),
         explained=gate.passed,
         findings=findings(priors, posterior, gate, faults, campaign.remarks),
@@ -147,23 +147,23 @@ def stated_priors(campaign: Campaign, choice: ModelChoice) -> tuple[ParameterPri
 def _channel_fits(problem: Problem, posterior: ParameterPosterior) -> tuple[ChannelFit, ...]:
     """Return the rms residuals of each channel at the prior means and at the optimum."""
     marginal = posterior.marginal
-    optimum = posterior.optima[0].point.shared[marginal.free]
+    optimum = posterior.optima[0].point.shared[marginal.parameter_indices]
     prior_mean = np.zeros_like(optimum)
     problems: dict[Literal["fitted", "held out"], Problem] = {"fitted": problem}
     if problem.campaign.held_out:
         problems["held out"] = problem.with_trials(problem.campaign.held_out)
     channel_fits: list[ChannelFit] = []
     for role, problem_of_role in problems.items():
-        at_prior_mean = marginal.fitted(prior_mean, problem_of_role)
-        at_optimum = marginal.fitted(optimum, problem_of_role)
+        at_prior_mean = marginal.fit_nuisances(prior_mean, problem_of_role)
+        at_optimum = marginal.fit_nuisances(optimum, problem_of_role)
         for index, name in enumerate(problem_of_role.channel_names):
-            count = int(problem_of_role.counts[index])
+            count = int(problem_of_role.sample_counts[index])
             if not count:
                 continue
             before = after = np.nan
-            if problem_of_role.freedom[index] > 0.0:
-                before = float(np.sqrt(at_prior_mean.sums[index] / count))
-                after = float(np.sqrt(at_optimum.sums[index] / count))
+            if problem_of_role.record_freedom[index] > 0.0:
+                before = float(np.sqrt(at_prior_mean.squares_by_channel[index] / count))
+                after = float(np.sqrt(at_optimum.squares_by_channel[index] / count))
             channel_fits.append(ChannelFit(name, role, count, before, after))
     return tuple(channel_fits)
 
@@ -171,17 +171,17 @@ def _channel_fits(problem: Problem, posterior: ParameterPosterior) -> tuple[Chan
 # ---------------------------------------------------------------- findings
 
 
-FAR = 3.0
+FAR_FROM_PRIOR = 3.0
 """Distance of a posterior mean from the prior mean, in prior deviations, above which it is
 reported."""
-TIED = 0.95
+TIED_CORRELATION = 0.95
 """Absolute correlation above which two parameters are reported as not determined separately."""
-EDGE = 0.02
+LEAST_CUT_OFF = 0.02
 """Probability of a posterior outside of the model's range above which it is reported.
 
 It is reported only for a parameter that the data determine, since any other is truncated just as
 its prior is."""
-REFUSED = 4.0
+REFUSAL_DISTANCE = 4.0
 """Distance from the optimum, in standard deviations, within which a failure of the model is
 reported."""
 
@@ -198,15 +198,15 @@ def findings(
     Parameters
     ----------
     priors : tuple of ParameterPrior
-        Priors of the parameters.
+        The priors of the parameters.
     posterior : ParameterPosterior
         Their posterior.
     gate : Gate
         The test of absolute fit at the optimum.
     faults : tuple of DataFault
-        Faults of the data.
+        The faults of the data.
     remarks : tuple of str
-        Remarks of the campaign.
+        The remarks of the campaign.
     """
     sentences: list[str] = []
     if gate.passed is False:
@@ -241,7 +241,7 @@ def _prior_findings(
 ) -> Iterator[str]:
     """Yield a finding on each parameter whose posterior mean is far from its prior mean."""
     for prior, mean in zip(priors, posterior.draws.mean(axis=0).tolist(), strict=True):
-        if abs(mean) > FAR:
+        if abs(mean) > FAR_FROM_PRIOR:
             side = "above" if mean > 0.0 else "below"
             yield (
                 f"{prior.name} comes out {abs(mean):.1f} prior deviations {side} what "
@@ -256,12 +256,12 @@ def _range_findings(
     """Yield findings on posteriors at an end of the range, and on failures within it."""
     marginal = posterior.marginal
     optimum = posterior.optima[0]
-    fitted_parameters = optimum.point.shared[marginal.free]
-    deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.free]), 1e-12)
+    fitted_parameters = optimum.point.shared[marginal.parameter_indices]
+    deviation = np.maximum(np.sqrt(np.diag(optimum.covariance)[marginal.parameter_indices]), 1e-12)
     probability_below = ndtr((marginal.low - fitted_parameters) / deviation)
     probability_above = ndtr((fitted_parameters - marginal.high) / deviation)
     is_determined = remaining_deviations(posterior) <= MOST_OF_PRIOR
-    is_cut_off = is_determined & (probability_below + probability_above > EDGE)
+    is_cut_off = is_determined & (probability_below + probability_above > LEAST_CUT_OFF)
     for prior, cut_off in zip(priors, is_cut_off.tolist(), strict=True):
         if cut_off:
             yield (
@@ -271,12 +271,12 @@ def _range_findings(
             )
     refusals = [
         refusal
-        for refusal in marginal.refused
-        if _distance_from_optimum(posterior, refusal.parameters) < REFUSED
+        for refusal in marginal.refusals
+        if _distance_from_optimum(posterior, refusal.parameters) < REFUSAL_DISTANCE
     ]
     if refusals:
         first = refusals[0]
-        values = _parameter_values(priors, marginal.values(first.parameters))
+        values = _parameter_values(priors, marginal.physical_values(first.parameters))
         yield (
             f"At {counted(len(refusals), 'place')} near the optimum, and within its range, the "
             f"model cannot be had, first at {values} ({first.reason.rstrip('.')}): the posterior "
@@ -296,7 +296,7 @@ def _optimum_findings(
         probabilities = (weight / weight.sum()).tolist()
         phrases = []
         for optimum, probability in zip(optima, probabilities, strict=True):
-            values = marginal.values(optimum.point.shared[marginal.free])
+            values = marginal.physical_values(optimum.point.shared[marginal.parameter_indices])
             phrases.append(f"{_parameter_values(priors, values)} ({probability:.0%})")
         yield (
             f"The posterior has {len(optima)} maxima: {' and '.join(phrases)}; the campaign does "
@@ -322,7 +322,7 @@ def _undetermined_findings(
             )
     correlations = correlation(posterior.draws)
     for i, j in combinations(range(len(priors)), 2):
-        if abs(correlations[i, j]) > TIED:
+        if abs(correlations[i, j]) > TIED_CORRELATION:
             yield (
                 f"{priors[i].name} and {priors[j].name} are told together and hardly apart "
                 f"(correlation {correlations[i, j]:+.3f}): fly with samples of both, or measure "
@@ -342,7 +342,7 @@ def _distance_from_optimum(posterior: ParameterPosterior, u: FloatArray) -> floa
     """
     optimum = posterior.optima[0]
     is_known = np.isfinite(u)
-    indices = posterior.marginal.free[is_known]
+    indices = posterior.marginal.parameter_indices[is_known]
     shift = u[is_known] - optimum.point.shared[indices]
     covariance = optimum.covariance[np.ix_(indices, indices)]
     return float(np.sqrt(shift @ np.linalg.solve(covariance, shift)))

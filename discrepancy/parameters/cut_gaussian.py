@@ -14,19 +14,19 @@ from discrepancy.campaign.records import FloatArray
 
 
 @dataclass(frozen=True)
-class CutGaussian:
+class TruncatedGaussian:
     """A Gaussian density of P scaled parameters, truncated at their range.
 
     Attributes
     ----------
     mean : (P,) ndarray
-        Mean of the Gaussian before truncation; it may lie outside the range.
+        The mean of the Gaussian before truncation; it may lie outside the range.
     covariance : (P, P) ndarray
-        Covariance of the Gaussian before truncation.
+        The covariance of the Gaussian before truncation.
     low, high : (P,) ndarray
-        Lower and upper ends of the range of each parameter.
+        The lower and upper ends of the range of each parameter.
     log_integral : float
-        Logarithm of the integral of the density before truncation, up to a constant [nat].
+        The logarithm of the integral of the density before truncation, up to a constant [nat].
     """
 
     mean: FloatArray
@@ -70,16 +70,16 @@ class CutGaussian:
         Parameters
         ----------
         means : (..., P) ndarray
-            Means of the Gaussian for each draw, used instead of `mean`.
+            The means of the Gaussian for each draw, used instead of `mean`.
         uniform : (..., P) ndarray
-            Uniform random numbers between 0 and 1, one for each parameter of each draw.
+            The uniform random numbers between 0 and 1, one for each parameter of each draw.
 
         Returns
         -------
         draws : (..., P) ndarray
             Draws of the scaled parameters.
         log_weights : (...) ndarray
-            Logarithm of the weight of each draw.
+            The logarithm of the weight of each draw.
         """
         normal = np.zeros_like(uniform)
         log_weight = np.zeros(uniform.shape[:-1])
@@ -107,55 +107,56 @@ class CutGaussian:
         return 0.5 * float(shift @ np.linalg.solve(self.covariance, shift))
 
     @cached_property
-    def _even_draws(self) -> tuple[FloatArray, FloatArray]:
+    def _quasi_random_draws(self) -> tuple[FloatArray, FloatArray]:
         """Quasi-random draws (N, P) by a Sobol sequence, and their log weights (N,)."""
         parameter_count = len(self.mean)
-        uniform = Sobol(max(parameter_count, 1), rng=0).random(EVEN)[:, :parameter_count]
+        uniform = Sobol(max(parameter_count, 1), rng=0).random(MOMENT_DRAWS)[:, :parameter_count]
         return self.weighted_draws(self.mean, uniform)
 
     @cached_property
     def moments(self) -> tuple[FloatArray, FloatArray]:
         """Mean (P,) and covariance (P, P) of the truncated Gaussian."""
-        points, log_weight = self._even_draws
+        points, log_weight = self._quasi_random_draws
         weight = softmax(log_weight)
         return weight @ points, np.atleast_2d(np.cov(points.T, aweights=weight))
 
     @property
     def log_evidence(self) -> float:
         """Logarithm of the integral of the density within the range, up to a constant [nat]."""
-        _, log_weight = self._even_draws
-        return float(self.log_integral + logsumexp(log_weight) - np.log(EVEN))
+        _, log_weight = self._quasi_random_draws
+        return float(self.log_integral + logsumexp(log_weight) - np.log(MOMENT_DRAWS))
 
     def draws(self, count: int, generator: np.random.Generator) -> FloatArray:
-        """Return equally weighted draws (count, P), resampled from `TRIED` times as many.
+        """Return equally weighted draws (count, P), resampled from weighted candidates.
 
         Parameters
         ----------
         count : int
-            Number of draws.
+            The number of draws.
         generator : Generator
-            Source of random numbers.
+            The source of random numbers.
         """
-        uniform = generator.random((TRIED * count, len(self.mean)))
+        uniform = generator.random((CANDIDATES_PER_DRAW * count, len(self.mean)))
         candidates, log_weight = self.weighted_draws(self.mean, uniform)
         cumulative = np.cumsum(softmax(log_weight))
         chosen = np.searchsorted(cumulative, stratified(generator, count))
         return np.asarray(candidates[np.minimum(chosen, len(candidates) - 1)])
 
-    def draws_about(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
+    def draws_with_means(self, means: FloatArray, generator: np.random.Generator) -> FloatArray:
         """Return one draw (N, P) for each of several means, with the covariance of this Gaussian.
 
-        For each mean, one of `TRIED` weighted draws is chosen with a probability proportional to
-        its weight: the one of largest log weight plus Gumbel noise (the Gumbel-max trick).
+        For each mean, one of `CANDIDATES_PER_DRAW` weighted draws is chosen with a probability
+        proportional to its weight: the one of largest log weight plus Gumbel noise (the Gumbel-max
+        trick).
 
         Parameters
         ----------
         means : (N, P) ndarray
-            Means that are used instead of `mean`.
+            The means that are used instead of `mean`.
         generator : Generator
-            Source of random numbers.
+            The source of random numbers.
         """
-        shape = (TRIED, *means.shape)
+        shape = (CANDIDATES_PER_DRAW, *means.shape)
         candidates, log_weight = self.weighted_draws(
             np.broadcast_to(means, shape), generator.random(shape)
         )
@@ -163,7 +164,7 @@ class CutGaussian:
         return np.asarray(candidates[chosen, np.arange(len(means))])
 
 
-EVEN = 1024
+MOMENT_DRAWS = 1024
 """Number of draws from which the probability of the range and the moments are computed."""
-TRIED = 32
+CANDIDATES_PER_DRAW = 32
 """Number of weighted draws for each draw that is returned."""

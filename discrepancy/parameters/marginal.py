@@ -18,34 +18,34 @@ from discrepancy.fits.candidate import Candidate, Point
 from discrepancy.fits.fitting import CandidateFit, fit
 from discrepancy.fits.normal_equations import cholesky_factor, normal_equations, solve_factored
 from discrepancy.fits.problem import Problem
-from discrepancy.parameters.cut_gaussian import CutGaussian
+from discrepancy.parameters.cut_gaussian import TruncatedGaussian
 
-NOTHING = Candidate()
+NO_EFFECTS = Candidate()
 """The hypothesis that the model lacks nothing."""
-STARTS = 4
+FURTHER_STARTS = 4
 """Number of draws of the prior at which further fits begin, to find several optima."""
-APART = 3.0
+OPTIMUM_DISTANCE = 3.0
 """Distance of two fits, in standard deviations, from which on they are different optima."""
-COMPARABLE = 10.0
+LARGEST_EVIDENCE_GAP = 10.0
 """Largest difference of log evidence from the best optimum for another one to be kept [nat]."""
 
 
 class Refusal(NamedTuple):
-    """Parameters within the stated range for which the model could not be evaluated.
+    """A point within the stated range of the parameters at which the model could not be evaluated.
 
     Attributes
     ----------
     parameters : (P,) ndarray
-        Scaled parameters; nan for those that were being fitted.
+        The scaled parameters; nan for those that were being fitted.
     reason : str
-        Message of the model.
+        The message of the model.
     """
 
     parameters: FloatArray
     reason: str
 
 
-class Marginal:
+class MarginalPosterior:
     """The posterior density of the parameters, with all nuisances integrated out.
 
     An instance is a function of the scaled parameters u = (value - prior mean) / prior deviation.
@@ -54,45 +54,45 @@ class Marginal:
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
 
     Attributes
     ----------
-    free : (P,) ndarray of int
-        Indices of the calibrated parameters whose prior deviation is not zero; u has one entry for
-        each of them.
+    parameter_indices : (P,) ndarray of int
+        The indices of the calibrated parameters whose prior deviation is not zero; u has one entry
+        for each of them.
     low, high : (P,) ndarray
-        Ends of the model's range as scaled parameters; the prior is truncated there.
-    refused : list of Refusal
+        The ends of the model's range as scaled parameters; the prior is truncated there.
+    refusals : list of Refusal
         Parameters within the range for which the model could not be evaluated.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
         shared = problem.shared
-        self.free = np.flatnonzero(shared.scale[: shared.count] > 0.0)
-        self.low, self.high = shared.ends[:, self.free]
-        self._near = problem.start(NOTHING)
-        self.refused: list[Refusal] = []
+        self.parameter_indices = np.flatnonzero(shared.scale[: shared.parameter_count] > 0.0)
+        self.low, self.high = shared.bounds[:, self.parameter_indices]
+        self._start_point = problem.prior_mean_point(NO_EFFECTS)
+        self.refusals: list[Refusal] = []
 
-    def values(self, u: FloatArray) -> FloatArray:
+    def physical_values(self, u: FloatArray) -> FloatArray:
         """Return the parameters (..., P) in their units, given scaled parameters u (..., P)."""
         shared = self._problem.shared
-        return shared.centre[self.free] + shared.scale[self.free] * u
+        return shared.centre[self.parameter_indices] + shared.scale[self.parameter_indices] * u
 
-    def inside(self, u: FloatArray) -> NDArray[np.bool_]:
+    def is_in_range(self, u: FloatArray) -> NDArray[np.bool_]:
         """Return whether points u (..., P) lie within the model's range, (...)."""
         return np.asarray(np.all((u >= self.low) & (u <= self.high), axis=-1))
 
-    def fitted(
+    def fit_nuisances(
         self,
         u: FloatArray,
         trials: Problem | None = None,
         *,
-        fixed: NDArray[np.bool_] | None = None,
-        near: Point | None = None,
+        is_fixed: NDArray[np.bool_] | None = None,
+        start_point: Point | None = None,
     ) -> CandidateFit:
-        """Return the fit of the nuisances while parameters are fixed at given values.
+        """Return the fit of the nuisances with parameters fixed at given values.
 
         Parameters
         ----------
@@ -100,11 +100,11 @@ class Marginal:
             Scaled parameters.
         trials : Problem, optional
             A problem with other trials of the campaign; that of this density by default.
-        fixed : (P,) ndarray of bool, optional
+        is_fixed : (P,) ndarray of bool, optional
             True for parameters that are fixed at `u`, all by default; the others are fitted
             together with the nuisances.
-        near : Point, optional
-            Point at which the fit begins; the best optimum by default, if it is known.
+        start_point : Point, optional
+            The point at which the fit begins; the best optimum by default, if it is known.
 
         Raises
         ------
@@ -113,40 +113,40 @@ class Marginal:
         """
         problem = copy(trials or self._problem)
         shared = problem.shared
-        if fixed is None:
-            fixed = np.ones(len(self.free), dtype=bool)
-        fixed_indices = self.free[fixed]
-        # a fixed parameter has a prior without deviation, and a range of one value
+        if is_fixed is None:
+            is_fixed = np.ones(len(self.parameter_indices), dtype=bool)
+        fixed_indices = self.parameter_indices[is_fixed]
+        # a parameter is fixed by a prior without deviation, and a range of one value
         prior_arrays = {
             name: getattr(shared, name).copy() for name in ("centre", "low", "high", "scale")
         }
         for array in prior_arrays.values():
-            array[fixed_indices] = self.values(u)[fixed]
+            array[fixed_indices] = self.physical_values(u)[is_fixed]
         prior_arrays["scale"][fixed_indices] = 0.0
         problem.shared = replace(shared, **prior_arrays)
-        start = near
+        start = start_point
         if start is None:
-            start = self._near if trials is None else problem.start(NOTHING)
+            start = self._start_point if trials is None else problem.prior_mean_point(NO_EFFECTS)
         start_shared = start.shared.copy()
         start_shared[fixed_indices] = 0.0
         try:
-            return fit(problem, NOTHING, replace(start, shared=start_shared))
+            return fit(problem, NO_EFFECTS, replace(start, shared=start_shared))
         except ModelError as cause:
-            self.refused.append(Refusal(np.where(fixed, u, np.nan), str(cause)))
+            self.refusals.append(Refusal(np.where(is_fixed, u, np.nan), str(cause)))
             raise
 
     def __call__(self, u: FloatArray) -> float:
         """Return the energy at scaled parameters (P,); infinite outside the model's range."""
-        if not self.inside(u):
+        if not self.is_in_range(u):
             return np.inf
         try:
-            fitted = self.fitted(u)
+            fitted = self.fit_nuisances(u)
         except (FitError, ModelError):
             return np.inf
         # the evidence of the fit does not contain the prior of the fixed parameters
         return 0.5 * float(u @ u) - fitted.log_evidence
 
-    def optima(self, seed: int) -> list[CandidateFit]:
+    def find_optima(self, seed: int) -> list[CandidateFit]:
         """Return the maxima of the posterior with notable probability, the most probable first.
 
         Fits begin at the prior mean and at draws of the prior. The evidence of a maximum is that of
@@ -155,7 +155,7 @@ class Marginal:
         Parameters
         ----------
         seed : int
-            Seed of the draws from which fits begin.
+            The seed of the draws from which fits begin.
 
         Raises
         ------
@@ -163,38 +163,43 @@ class Marginal:
             If the model fails at its prior mean.
         """
         problem = self._problem
-        fits = [fit(problem, NOTHING, problem.start(NOTHING), iterations=40)]
+        fits = [fit(problem, NO_EFFECTS, problem.prior_mean_point(NO_EFFECTS), iterations=40)]
         generator = np.random.default_rng(seed)
-        for _ in range(STARTS):
-            start = problem.start(NOTHING)
-            start.shared[self.free] = generator.standard_normal(len(self.free))
+        for _ in range(FURTHER_STARTS):
+            start = problem.prior_mean_point(NO_EFFECTS)
+            start.shared[self.parameter_indices] = generator.standard_normal(
+                len(self.parameter_indices)
+            )
             with suppress(FitError, ModelError):
-                fits.append(fit(problem, NOTHING, start, iterations=40))
-        # of fits that agree within rounding the first one is kept, as the sort is stable
+                fits.append(fit(problem, NO_EFFECTS, start, iterations=40))
+        # the sort is stable: of fits that agree within rounding, the first one stays first
         fits.sort(key=lambda fitted: round(fitted.objective, 3))
-        all_fitted = np.ones(len(self.free), dtype=bool)
+        all_fitted = np.ones(len(self.parameter_indices), dtype=bool)
         optima: list[CandidateFit] = []
         for fitted in fits:
             if not any(self._is_same_optimum(optimum, fitted) for optimum in optima):
-                evidence = self.gaussian_about(fitted, all_fitted).log_evidence
+                evidence = self.laplace_gaussian(fitted, all_fitted).log_evidence
                 optima.append(replace(fitted, log_evidence=evidence))
         optima.sort(key=lambda optimum: -optimum.log_evidence)
         best = optima[0]
-        self._near = best.point
-        least_evidence = best.log_evidence - COMPARABLE
+        self._start_point = best.point
+        least_evidence = best.log_evidence - LARGEST_EVIDENCE_GAP
         return [optimum for optimum in optima if optimum.log_evidence > least_evidence]
 
     def _is_same_optimum(self, first: CandidateFit, second: CandidateFit) -> bool:
         """Return whether two fits are at the same optimum.
 
-        They are if their distance in posterior standard deviations (Mahalanobis) is below `APART`.
+        They are if their distance in posterior standard deviations (Mahalanobis) is below
+        `OPTIMUM_DISTANCE`.
         """
-        free = self.free
+        free = self.parameter_indices
         shift = first.point.shared[free] - second.point.shared[free]
         covariance = first.covariance[np.ix_(free, free)]
-        return bool(shift @ np.linalg.solve(covariance, shift) < APART**2)
+        return bool(shift @ np.linalg.solve(covariance, shift) < OPTIMUM_DISTANCE**2)
 
-    def gaussian_about(self, fitted: CandidateFit, which: NDArray[np.bool_]) -> CutGaussian:
+    def laplace_gaussian(
+        self, fitted: CandidateFit, is_fitted: NDArray[np.bool_]
+    ) -> TruncatedGaussian:
         """Return the Gaussian approximation of the posterior about a fit, truncated at the range.
 
         It is that of Laplace's method. If the fit is at an end of the range, the mean of the
@@ -204,18 +209,20 @@ class Marginal:
         ----------
         fitted : CandidateFit
             The fit.
-        which : (P,) ndarray of bool
+        is_fitted : (P,) ndarray of bool
             True for the parameters that were fitted, whose density the Gaussian is.
         """
         problem = self._problem
-        indices = self.free[which]
-        equations = normal_equations(problem, fitted, NOTHING, problem.precisions(fitted.sums))
+        indices = self.parameter_indices[is_fitted]
+        equations = normal_equations(
+            problem, fitted, NO_EFFECTS, problem.noise_precisions(fitted.squares_by_channel)
+        )
         # the Newton step to the maximum without limits adds gradient @ step / 2 to the log density
         step = solve_factored(cholesky_factor(equations.matrix), equations.gradient)
-        return CutGaussian(
+        return TruncatedGaussian(
             mean=fitted.point.shared[indices] + step[indices],
             covariance=fitted.covariance[np.ix_(indices, indices)],
-            low=self.low[which],
-            high=self.high[which],
+            low=self.low[is_fitted],
+            high=self.high[is_fitted],
             log_integral=fitted.log_evidence + 0.5 * float(equations.gradient @ step),
         )

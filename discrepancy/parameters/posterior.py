@@ -18,28 +18,28 @@ from discrepancy.campaign.records import FloatArray
 from discrepancy.errors import FitError, ModelError
 from discrepancy.fits.fitting import CandidateFit
 from discrepancy.fits.problem import Problem
-from discrepancy.parameters.cut_gaussian import CutGaussian
-from discrepancy.parameters.marginal import Marginal
+from discrepancy.parameters.cut_gaussian import TruncatedGaussian
+from discrepancy.parameters.marginal import MarginalPosterior
 
-REACH = 6.0
+QUADRATURE_RANGE = 6.0
 """Half of the range of a quadrature about the prior mean, in prior deviations."""
-NEAR = 9
-"""Number of first nodes within three standard deviations of an optimum."""
-WIDE = 17
-"""Number of first nodes over the whole prior."""
-BETWEEN = 40
+NODES_PER_OPTIMUM = 9
+"""Number of first nodes of a quadrature within three standard deviations of each optimum."""
+NODES_OF_PRIOR = 17
+"""Number of first nodes of a quadrature over the whole prior."""
+INTERPOLATION_INTERVALS = 40
 """Number of intervals between two nodes at which the density is interpolated."""
 LARGEST_MASS = 0.04
 """Probability between two neighbouring nodes above which a node is added between them."""
 MOST_NODES = 90
 """Largest number of nodes of a quadrature."""
-CHECKED = ((1.0, 0.12), (2.0, 0.5))
+GAUSSIAN_CHECKS = ((1.0, 0.12), (2.0, 0.5))
 """Pairs of a distance from the mean [standard deviations] at which a Gaussian is compared with the
 posterior, and the allowed error of its energy there [nat]."""
-EMPTY = 700.0
+LARGEST_ENERGY = 700.0
 """Largest energy above the least one; higher energies are reduced to it, as exp(-700) is nearly the
 least number of double precision [nat]."""
-LEAST_SPREAD = 1e-9
+LEAST_NODE_DISTANCE = 1e-9
 """Distance of two nodes, as a fraction of the length of the grid, below which one is dropped."""
 
 
@@ -50,19 +50,19 @@ class ParameterPosterior:
     Attributes
     ----------
     procedure : Procedure
-        How the draws were made.
+        The procedure by which the draws were made.
     draws : (N, P) ndarray
         Scaled parameters of equal weight.
     optima : tuple of CandidateFit
-        Maxima of the posterior, the most probable first.
-    marginal : Marginal
+        The maxima of the posterior, the most probable first.
+    marginal : MarginalPosterior
         The posterior density.
     """
 
     procedure: Procedure
     draws: FloatArray
     optima: tuple[CandidateFit, ...]
-    marginal: Marginal
+    marginal: MarginalPosterior
 
 
 def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPosterior:
@@ -78,23 +78,23 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
     Parameters
     ----------
     problem : Problem
-        Campaign and model.
+        The campaign and model.
     count : int
-        Number of draws.
+        The number of draws.
     seed : int
-        Seed of the draws.
+        The seed of the draws.
 
     Raises
     ------
     FitError, ModelError
         If the model fails at its prior mean.
     """
-    marginal = Marginal(problem)
-    optima = tuple(marginal.optima(seed))
+    marginal = MarginalPosterior(problem)
+    optima = tuple(marginal.find_optima(seed))
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
-    parameter_count = len(marginal.free)
+    parameter_count = len(marginal.parameter_indices)
     all_fitted = np.ones(parameter_count, dtype=bool)
-    gaussians = [marginal.gaussian_about(optimum, all_fitted) for optimum in optima]
+    gaussians = [marginal.laplace_gaussian(optimum, all_fitted) for optimum in optima]
     procedure: Procedure
     if parameter_count == 1 or (len(gaussians) == 1 and not is_gaussian(marginal, gaussians[0])):
         procedure = "quadrature"
@@ -108,7 +108,7 @@ def parameter_posterior(problem: Problem, count: int, seed: int) -> ParameterPos
 
 
 def _draws_of_gaussians(
-    gaussians: Sequence[CutGaussian], count: int, generator: np.random.Generator
+    gaussians: Sequence[TruncatedGaussian], count: int, generator: np.random.Generator
 ) -> FloatArray:
     """Return draws (count, P) from a mixture of Gaussians that are weighted by their evidence."""
     probabilities = softmax([gaussian.log_evidence for gaussian in gaussians])
@@ -120,24 +120,24 @@ def _draws_of_gaussians(
     return draws
 
 
-def is_gaussian(marginal: Marginal, gaussian: CutGaussian) -> bool:
+def is_gaussian(marginal: MarginalPosterior, gaussian: TruncatedGaussian) -> bool:
     """Return whether a posterior agrees with a Gaussian that is truncated at the range.
 
-    Their energies are compared at points on the principal axes, at the distances `CHECKED` from the
-    mean, or at the end of the range if that is nearer.
+    Their energies are compared at points on the principal axes, at the distances from the mean that
+    `GAUSSIAN_CHECKS` lists, or at the end of the range if that is nearer.
 
     Parameters
     ----------
-    marginal : Marginal
+    marginal : MarginalPosterior
         The posterior density.
-    gaussian : CutGaussian
+    gaussian : TruncatedGaussian
         The Gaussian about its optimum.
     """
     mean, covariance = gaussian.moments
     variances, directions = np.linalg.eigh(covariance)
     axes = (directions * np.sqrt(np.maximum(variances, 0.0))).T
     energy_at_mean = marginal(mean) - gaussian.energy(mean)
-    for axis, (distance, allowed_error), side in product(axes, CHECKED, (-1.0, 1.0)):
+    for axis, (distance, allowed_error), side in product(axes, GAUSSIAN_CHECKS, (-1.0, 1.0)):
         step = side * distance * axis
         distance_to_end = np.where(step > 0.0, gaussian.high - mean, mean - gaussian.low)
         largest_step_fraction = distance_to_end / np.maximum(np.abs(step), 1e-300)
@@ -151,7 +151,7 @@ def is_gaussian(marginal: Marginal, gaussian: CutGaussian) -> bool:
 
 def _draws_by_quadrature(
     index: int,
-    marginal: Marginal,
+    marginal: MarginalPosterior,
     optima: tuple[CandidateFit, ...],
     count: int,
     generator: np.random.Generator,
@@ -164,15 +164,15 @@ def _draws_by_quadrature(
     Parameters
     ----------
     index : int
-        Index of the parameter of the quadrature.
-    marginal : Marginal
+        The index of the parameter of the quadrature.
+    marginal : MarginalPosterior
         The posterior density.
     optima : tuple of CandidateFit
         Its maxima, the most probable first.
     count : int
-        Number of draws.
+        The number of draws.
     generator : Generator
-        Source of the draws.
+        The source of the draws.
 
     Returns
     -------
@@ -180,18 +180,20 @@ def _draws_by_quadrature(
         Draws of the scaled parameters, of equal weight.
     """
     nodes = _QuadratureNodes(index, marginal, optima[0])
-    first_nodes = _first_nodes(marginal, optima, index)
-    for node in sorted(first_nodes, key=lambda node: abs(node - nodes.centre)):
-        nodes.visit(node)
-    points, distribution = _distribution(nodes.energy)
+    initial_nodes = _initial_nodes(marginal, optima, index)
+    for node in sorted(initial_nodes, key=lambda node: abs(node - nodes.centre)):
+        nodes.add_node(node)
+    points, distribution = _cumulative_distribution(nodes.energy)
     while len(nodes.energy) < MOST_NODES:
-        probabilities = np.diff(distribution[::BETWEEN])  # between neighbouring nodes
+        probabilities = np.diff(
+            distribution[::INTERPOLATION_INTERVALS]
+        )  # between neighbouring nodes
         largest = int(np.argmax(probabilities))
         if not probabilities[largest] > LARGEST_MASS:
             break
         left, right = sorted(nodes.energy)[largest : largest + 2]
-        nodes.visit(0.5 * (left + right))
-        points, distribution = _distribution(nodes.energy)
+        nodes.add_node(0.5 * (left + right))
+        points, distribution = _cumulative_distribution(nodes.energy)
     quadrature_values = np.interp(stratified(generator, count), distribution, points)
 
     # the other parameters: their mean interpolates those at the nodes, and their covariance is
@@ -206,7 +208,7 @@ def _draws_by_quadrature(
     for node_number, gaussian in enumerate(gaussians):
         draws_at_node = np.flatnonzero(nearest == node_number)
         entries_of_others = np.ix_(draws_at_node, ~nodes.is_of_quadrature)
-        draws[entries_of_others] = gaussian.draws_about(draws[entries_of_others], generator)
+        draws[entries_of_others] = gaussian.draws_with_means(draws[entries_of_others], generator)
     return draws
 
 
@@ -216,8 +218,8 @@ class _QuadratureNodes:
     Parameters
     ----------
     index : int
-        Index of the parameter of the quadrature.
-    marginal : Marginal
+        The index of the parameter of the quadrature.
+    marginal : MarginalPosterior
         The posterior density.
     best : CandidateFit
         The most probable optimum.
@@ -225,67 +227,71 @@ class _QuadratureNodes:
     Attributes
     ----------
     centre : float
-        Value of the parameter at the optimum.
+        The value of the parameter at the optimum.
     is_of_quadrature : (P,) ndarray of bool
         True for the parameter of the quadrature.
     energy : dict of float to float
-        Energy by node; infinite if the model cannot be evaluated there.
-    gaussians : dict of float to CutGaussian
+        The energy by node; infinite if the model cannot be evaluated there.
+    gaussians : dict of float to TruncatedGaussian
         The other parameters by node.
     """
 
-    def __init__(self, index: int, marginal: Marginal, best: CandidateFit) -> None:
+    def __init__(self, index: int, marginal: MarginalPosterior, best: CandidateFit) -> None:
         self._marginal = marginal
-        self.is_of_quadrature = np.arange(len(marginal.free)) == index
-        self.centre = float(best.point.shared[marginal.free[index]])
+        self.is_of_quadrature = np.arange(len(marginal.parameter_indices)) == index
+        self.centre = float(best.point.shared[marginal.parameter_indices[index]])
         self.energy: dict[float, float] = {}
-        self.gaussians: dict[float, CutGaussian] = {}
+        self.gaussians: dict[float, TruncatedGaussian] = {}
         self._points = {self.centre: best.point}
 
-    def visit(self, node: float) -> None:
+    def add_node(self, node: float) -> None:
         """Add a node with its energy; the fit there begins at the point of the nearest node."""
         nearest = min(self._points, key=lambda visited: abs(visited - node))
         self.energy[node] = np.inf
         with suppress(FitError, ModelError):
-            fitted = self._marginal.fitted(
+            fitted = self._marginal.fit_nuisances(
                 np.where(self.is_of_quadrature, node, 0.0),
-                fixed=self.is_of_quadrature,
-                near=self._points[nearest],
+                is_fixed=self.is_of_quadrature,
+                start_point=self._points[nearest],
             )
-            gaussian = self._marginal.gaussian_about(fitted, ~self.is_of_quadrature)
+            gaussian = self._marginal.laplace_gaussian(fitted, ~self.is_of_quadrature)
             self._points[node] = fitted.point
             self.gaussians[node] = gaussian
             # the evidence does not contain the prior of the parameter that is fixed at the node
             self.energy[node] = 0.5 * node**2 - gaussian.log_evidence
 
 
-def _first_nodes(marginal: Marginal, optima: tuple[CandidateFit, ...], index: int) -> list[float]:
+def _initial_nodes(
+    marginal: MarginalPosterior, optima: tuple[CandidateFit, ...], index: int
+) -> list[float]:
     """Return the first nodes: values over the whole prior, and closer ones about each optimum.
 
     Parameters
     ----------
-    marginal : Marginal
+    marginal : MarginalPosterior
         The posterior density.
     optima : tuple of CandidateFit
         Its maxima.
     index : int
-        Index of the parameter of the quadrature.
+        The index of the parameter of the quadrature.
     """
     low, high = marginal.low[index], marginal.high[index]
-    shared_index = marginal.free[index]
-    node_grids = [np.linspace(max(low, -REACH), min(high, REACH), WIDE)]
+    shared_index = marginal.parameter_indices[index]
+    node_grids = [
+        np.linspace(max(low, -QUADRATURE_RANGE), min(high, QUADRATURE_RANGE), NODES_OF_PRIOR)
+    ]
     for optimum in optima:
         deviation = np.sqrt(optimum.covariance[shared_index, shared_index])
         about_optimum = optimum.point.shared[shared_index] + deviation * np.linspace(
-            -3.0, 3.0, NEAR
+            -3.0, 3.0, NODES_PER_OPTIMUM
         )
         node_grids.append(np.clip(about_optimum, low, high))
     nodes = np.unique(np.concatenate(node_grids))
-    is_apart = np.diff(nodes, prepend=-np.inf) > LEAST_SPREAD * (nodes[-1] - nodes[0])
+    is_apart = np.diff(nodes, prepend=-np.inf) > LEAST_NODE_DISTANCE * (nodes[-1] - nodes[0])
     return [float(node) for node in nodes[is_apart]]
 
 
-def _distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
+def _cumulative_distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray]:
     """Return the cumulative distribution of a density whose energy is known at nodes.
 
     The energy is interpolated between the nodes by Akima's method.
@@ -293,19 +299,19 @@ def _distribution(energy: Mapping[float, float]) -> tuple[FloatArray, FloatArray
     Parameters
     ----------
     energy : mapping of float to float
-        Energy [nat] by node.
+        The energy [nat] by node.
 
     Returns
     -------
     points : (K,) ndarray
-        The nodes, with `BETWEEN` - 1 points between any two of them.
+        The nodes, with `INTERPOLATION_INTERVALS` - 1 points between any two of them.
     probability : (K,) ndarray
         The probability below each point.
     """
     nodes = np.array(sorted(energy))
     energies = np.array([energy[node] for node in nodes.tolist()])
-    energies = np.minimum(energies - energies.min(), EMPTY)
-    fractions = np.linspace(0.0, 1.0, BETWEEN, endpoint=False)
+    energies = np.minimum(energies - energies.min(), LARGEST_ENERGY)
+    fractions = np.linspace(0.0, 1.0, INTERPOLATION_INTERVALS, endpoint=False)
     between_nodes = (nodes[:-1, None] + np.diff(nodes)[:, None] * fractions).ravel()
     points = np.append(between_nodes, nodes[-1])
     density = np.exp(-Akima1DInterpolator(nodes, energies)(points))

@@ -84,8 +84,8 @@ def parameter_rows(investigation: Investigation) -> list[tuple[str, ...]]:
         fits.append(fit)
     estimates_of_fits = [calibrated_parameters(problem, fitted) for fitted in fits]
     layout = problem.shared
-    means = layout.centre.tolist()[: layout.count]
-    deviations = layout.scale.tolist()[: layout.count]
+    means = layout.centre.tolist()[: layout.parameter_count]
+    deviations = layout.scale.tolist()[: layout.parameter_count]
     rows = []
     for index, (mean, deviation) in enumerate(zip(means, deviations, strict=True)):
         cells = [_with_half_width(mean, deviation)]

@@ -7,7 +7,7 @@ from scipy.special import logsumexp
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.fits.candidate import Candidate, CandidateKey
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.gates import check_absolute_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.missing_force.explained import ForceHypothesis
@@ -61,14 +61,15 @@ class FittedCandidates:
         uncertain. Hypotheses with a missing force take the recorded variance as exact; with this
         score a simulation can be compared with them.
         """
-        averaged_misfit = self.problem.misfit(fit.sums)
-        recorded_misfit = self.problem.recorded_misfit(fit.sums)
+        averaged_misfit = self.problem.misfit(fit.squares_by_channel)
+        recorded_misfit = self.problem.recorded_misfit(fit.squares_by_channel)
         return self.score(fit) + averaged_misfit - recorded_misfit
 
     def compared_fits(self) -> dict[CandidateKey, CandidateFit]:
-        """Return the fit of every candidate by which it is compared.
+        """Return the fits by which candidates are compared, one for each candidate.
 
-        It is the fit under the wider noise if there is any, else the exact fit, else the rough one.
+        They are the fits under the wider noise if there are any; otherwise the exact fit of each
+        candidate, or its rough fit if it has no exact one.
         """
         return self.wide_fits or {**self.rough_fits, **self.exact_fits}
 
@@ -76,8 +77,8 @@ class FittedCandidates:
         """Return the most probable candidate."""
         return max((self.wide_fits or self.exact_fits).values(), key=self.score)
 
-    def best_of(self, identifiers: tuple[str, ...]) -> CandidateFit:
-        """Return the fit of the highest score of a set of effects, at any places."""
+    def best_fit_of_set(self, identifiers: tuple[str, ...]) -> CandidateFit:
+        """Return the fit with the highest score of a set of effects, whatever their places."""
         fits = self.compared_fits().values()
         return max(
             (fit for fit in fits if fit.candidate.identifiers == identifiers), key=self.score
@@ -97,7 +98,7 @@ class FittedCandidates:
         return self.wide_fits.get((), self.no_effect)
 
     def set_probabilities(self) -> dict[tuple[str, ...], float]:
-        """Return the probability of each set of effects at any places, the most probable first."""
+        """Return the probability of each set of effects over all places, in descending order."""
         scores: dict[tuple[str, ...], list[float]] = {}
         for fit in self.compared_fits().values():
             scores.setdefault(fit.candidate.identifiers, []).append(self.score(fit))
@@ -108,7 +109,7 @@ class FittedCandidates:
         ordered = sorted(log_weights.items(), key=lambda entry: -entry[1])
         return {identifiers: min(exp(value - log_total), 1.0) for identifiers, value in ordered}
 
-    def record(self, fit: CandidateFit, *, exact: bool) -> None:
+    def record_fit(self, fit: CandidateFit, *, exact: bool) -> None:
         """Record a fit if its evidence is above that of an earlier fit of the same candidate."""
         fits = self.exact_fits if exact else self.rough_fits
         key = fit.candidate.key
@@ -136,9 +137,9 @@ class FittedCandidates:
         key = rough.candidate.key
         if key in self.wide_fits:
             return self.wide_fits[key]
-        known = self.exact_fits.get(key)
-        if known is None or known.log_evidence < rough.log_evidence - SEARCH.gained_again:
-            exact = attempt(self.problem, rough.candidate, rough.point)
+        previous = self.exact_fits.get(key)
+        if previous is None or previous.log_evidence < rough.log_evidence - SEARCH.gained_again:
+            exact = try_fit(self.problem, rough.candidate, rough.point)
             # the rough fit may be at a point from which the model cannot be fitted further
-            self.record(rough if exact is None else exact, exact=True)
+            self.record_fit(rough if exact is None else exact, exact=True)
         return self.exact_fits[key]

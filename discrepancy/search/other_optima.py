@@ -19,9 +19,9 @@ from discrepancy.search_settings import SEARCH
 def canonical_relatives(
     leading: EffectTerm, hypotheses: Iterable[ForceHypothesis]
 ) -> list[ForceHypothesis]:
-    """Return the hypotheses of one effect that has the family and place of a given one.
+    """Return the hypotheses of one effect with the family and place of a leading effect.
 
-    The effects have their canonical shape, and a magnitude.
+    Only effects with a magnitude and with their canonical shape are returned.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def canonical_relatives(
     return relatives
 
 
-def points_at_other_sizes(problem: Problem, candidate: Candidate, start: Point) -> list[Point]:
+def points_at_other_magnitudes(problem: Problem, candidate: Candidate, start: Point) -> list[Point]:
     """Return points at which a single effect has another magnitude, to begin fits at.
 
     They are sorted by their objective, the least first; `SEARCH.restarts` of them are returned.
@@ -59,7 +59,7 @@ def points_at_other_sizes(problem: Problem, candidate: Candidate, start: Point) 
     (term,) = candidate.terms
     valued_points: list[tuple[float, Point]] = []
     for factor in SEARCH.restart_sizes:
-        effect = term.rescaled(start.effect, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
+        effect = term.multiply_magnitudes(start.effect, factor, -LARGEST_EFFECT, LARGEST_EFFECT)
         point = replace(start, effect=effect)
         with suppress(DiscrepancyError):  # the effect is larger than the model allows
             valued_points.append((objective(problem, candidate, point), point))

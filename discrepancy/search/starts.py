@@ -37,11 +37,11 @@ class FitStart(NamedTuple):
     point: Point
 
 
-def no_progress(message: str) -> None:
+def ignore_progress(message: str) -> None:
     """Ignore a line of progress."""
 
 
-def with_progress(
+def report_each(
     on_progress: OnProgress, items: Sequence[T], describe: Callable[[T], str]
 ) -> Iterator[T]:
     """Yield items, and before each one report what is done with it and how many follow.
@@ -64,14 +64,14 @@ def with_progress(
 # ---------------------------------------------------------------- effects
 
 
-def acts_within(effect: Effect, setting: Setting) -> bool:
+def changes_structure(effect: Effect, setting: Setting) -> bool:
     """Return whether an effect changes the structure or its loads, and not only the readings.
 
     An error of a sensor, such as a gain, changes only the readings.
     """
     term = EffectTerm(effect, effect.places(setting)[0])
     try:
-        patch = term.patch(setting, term.start() + 1.0)
+        patch = term.patch(setting, term.start_values() + 1.0)
     except DiscrepancyError:  # only a change of the structure can be too large for the model
         return True
     return not all(isinstance(primitive, SENSORS) for primitive in patch)
@@ -88,12 +88,12 @@ def are_related(first: Effect, second: Effect) -> bool:
 # ---------------------------------------------------------------- starts from a screen
 
 
-def starting_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
+def best_changes_by_effect(screen: Screen, effect: Effect) -> list[ScreenedChange]:
     """Return the changes of the prediction by an effect from which its fits should begin.
 
-    They are those of least `_cost`, over all places and a grid of parameters. An effect with
-    several parameters besides its magnitude, such as the place and width of a box, gets more starts
-    than others.
+    They are those with the least expected objective over all places and a grid of parameters. An
+    effect with several parameters besides its magnitude, such as the place and width of a box, gets
+    more starts than others.
 
     Parameters
     ----------
@@ -110,26 +110,32 @@ def starting_changes(screen: Screen, effect: Effect) -> list[ScreenedChange]:
     best_changes: list[ScreenedChange] = []
     for place in places:
         best_of_place: list[ScreenedChange] = []
-        for change in screen.changes(EffectTerm(effect, place), fine=has_few_places):
+        for change in screen.changes_on_grid(
+            EffectTerm(effect, place), with_small_magnitude=has_few_places
+        ):
             changes = [change]
-            is_nonlinear = change.squared_size > SEARCH.first_order and acts_within(effect, setting)
+            is_nonlinear = change.squared_size > SEARCH.first_order and changes_structure(
+                effect, setting
+            )
             # a large change that is not linear in its magnitude is tried at a small one too
             if has_few_places and is_nonlinear:
                 with suppress(DiscrepancyError):
-                    small_change, _ = screen.shrunk(change)
+                    small_change, _ = screen.shrink_change(change)
                     changes.append(small_change)
             nonzero_changes = [change for change in changes if change.squared_size > 0.0]
-            best_of_place = sorted([*best_of_place, *nonzero_changes], key=_cost)[:count]
+            best_of_place = sorted(
+                [*best_of_place, *nonzero_changes], key=_expected_objective_change
+            )[:count]
         best_changes.extend(best_of_place)
-    return sorted(best_changes, key=_cost)[:count]
+    return sorted(best_changes, key=_expected_objective_change)[:count]
 
 
-def _cost(change: ScreenedChange) -> float:
+def _expected_objective_change(change: ScreenedChange) -> float:
     """Return the expected change of the objective by a change at its best scale [nat].
 
     It is the negative log prior of the parameters minus the decrease of the misfit.
     """
-    scaled_parameters = change.best
+    scaled_parameters = change.best_values
     return -change.gain + 0.5 * float(scaled_parameters @ scaled_parameters)
 
 
@@ -157,8 +163,9 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
     changes : sequence of ScreenedChange
         The changes by all effects.
     sign : (D,) array
-        The signs of the inner product of changes, `Screen.sign`: entries of a vector that are
-        projections on nuisances count negative, as they are subtracted from those of readings.
+        The signs of the inner product of changes, `Screen.inner_product_signs`: entries of a vector
+        that are projections on nuisances count negative, as they are subtracted from those of
+        readings.
     """
     best: dict[tuple[str, str], ScreenedPair] = {}
     for first, second in combinations(changes, 2):
@@ -188,12 +195,12 @@ def best_pairs(changes: Sequence[ScreenedChange], sign: FloatArray) -> list[Scre
 def _with_scale(change: ScreenedChange, scale: float) -> ScreenedChange:
     """Return a change whose best scale is the given one, so that a fit begins there.
 
-    The best scale of a change is its overlap over its squared size (`ScreenedChange.scale`).
+    The best scale of a change is its overlap over its squared size (`ScreenedChange.best_scale`).
     """
     return replace(change, overlap=scale * change.squared_size)
 
 
-def start_beside(base: CandidateFit, term: EffectTerm, values: FloatArray) -> FitStart:
+def start_with_added_effect(base: CandidateFit, term: EffectTerm, values: FloatArray) -> FitStart:
     """Return the start of a fit with one more effect than a base has.
 
     Parameters
@@ -236,7 +243,7 @@ def grid_starts(problem: Problem, base: CandidateFit, effect: Effect) -> list[Fi
         # quantiles of the prior
         levels = ndtri((np.arange(level_count) + 0.5) / max(level_count, 1))
         for values in product(levels, repeat=parameter_count):
-            start = start_beside(base, term, np.array(values))
+            start = start_with_added_effect(base, term, np.array(values))
             with suppress(DiscrepancyError):  # the effect is larger than the model allows
                 value = objective(problem, start.candidate, start.point)
                 valued_starts.append((value, start))

@@ -15,29 +15,29 @@ import numpy as np
 
 from discrepancy.catalogue.entry import Effect
 from discrepancy.errors import ModelError
-from discrepancy.estimation.refinement import refined
+from discrepancy.estimation.refinement import refine_hypotheses
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import CandidateFit, attempt, fit_free_shape
-from discrepancy.fits.gates import SHAPE_GAIN, check_absolute_fit, time_step_error
+from discrepancy.fits.fitting import CandidateFit, fit_free_shape, try_fit
+from discrepancy.fits.gates import LEAST_SHAPE_GAIN, check_absolute_fit, time_step_error
 from discrepancy.fits.problem import Problem
 from discrepancy.fits.screening import Screen, ScreenedChange
 from discrepancy.missing_force.explained import ForceHypothesis
-from discrepancy.missing_force.hypotheses import sees_forces
+from discrepancy.missing_force.hypotheses import can_estimate_forces
 from discrepancy.missing_force.naming import ForceSearch
 from discrepancy.search_settings import SEARCH
 
 from .fitted_candidates import FittedCandidates
-from .other_optima import canonical_relatives, points_at_other_sizes, sets_at_other_places
+from .other_optima import canonical_relatives, points_at_other_magnitudes, sets_at_other_places
 from .starts import (
     FitStart,
     OnProgress,
-    acts_within,
+    best_changes_by_effect,
     best_pairs,
+    changes_structure,
     grid_starts,
-    no_progress,
-    start_beside,
-    starting_changes,
-    with_progress,
+    ignore_progress,
+    report_each,
+    start_with_added_effect,
 )
 
 
@@ -60,14 +60,14 @@ class Search(FittedCandidates):
     """
 
     screened_gains: dict[str, float] = field(default_factory=dict)
-    on_progress: OnProgress = no_progress
+    on_progress: OnProgress = ignore_progress
     wide_problem: Problem | None = None
     force_hypotheses: list[ForceHypothesis] = field(init=False, default_factory=list)
 
     @cached_property
     def force_search(self) -> ForceSearch | None:
         """The search for missing forces in the trials in motion; None if they show no force."""
-        if not sees_forces(self.problem):
+        if not can_estimate_forces(self.problem):
             return None
         self.on_progress("looking for the missing force")
         try:
@@ -78,10 +78,10 @@ class Search(FittedCandidates):
 
     # ---------------------------------------------------------------- rough fits of one more effect
 
-    def fit_roughly_beside(
+    def fit_one_more_effect(
         self, base: CandidateFit, effects: Iterable[Effect]
     ) -> list[CandidateFit]:
-        """Add each effect to a fit and fit the set by few steps.
+        """Add each effect to a base, one at a time, and fit the sets by few steps.
 
         The fits begin where the screen expects the least objective. Far from the truth the phases
         of predictions drift away from those of the readings, and the screen, which is linear, does
@@ -103,29 +103,29 @@ class Search(FittedCandidates):
         setting = self.problem.setting
         screened = effects
         # with large residuals a screen is used only for errors of readings, which shift no phases
-        if self._misfits(base):
-            screened = tuple(effect for effect in effects if not acts_within(effect, setting))
+        if self._has_large_residuals(base):
+            screened = tuple(effect for effect in effects if not changes_structure(effect, setting))
         fits = self._fit_from_screen(base, screened)
         is_explained = any(check_absolute_fit(self.problem, fit).passed for fit in fits)
-        if self._misfits(base) or (self._is_far(base) and not is_explained):
+        if self._has_large_residuals(base) or (self._is_far_from_truth(base) and not is_explained):
             unbiased_base = self._with_unbiased_nuisances(base)
             starts_by_effect = []
             for effect in effects:
-                if acts_within(effect, setting):
+                if changes_structure(effect, setting):
                     starts_by_effect.append(grid_starts(self.problem, unbiased_base, effect))
             starts_by_effect = [starts for starts in starts_by_effect if starts]
             fits += self._fit_from_starts(starts_by_effect, unbiased_base, 0.0)
         best_by_effects: dict[tuple[str, ...], CandidateFit] = {}
         for fit in sorted(fits, key=self.score):
-            self.record(fit, exact=False)
+            self.record_fit(fit, exact=False)
             best_by_effects[fit.candidate.identifiers] = fit
         return sorted(best_by_effects.values(), key=lambda fit: -self.score(fit))
 
-    def _misfits(self, base: CandidateFit) -> bool:
-        """Return whether the residuals of a fit are much larger than the noise."""
-        return base.chi_square > SEARCH.far * float(self.problem.counts.sum())
+    def _has_large_residuals(self, base: CandidateFit) -> bool:
+        """Return whether χ² per sample of a fit is above `SEARCH.far`: much more than noise."""
+        return base.chi_square > SEARCH.far * float(self.problem.sample_counts.sum())
 
-    def _is_far(self, base: CandidateFit) -> bool:
+    def _is_far_from_truth(self, base: CandidateFit) -> bool:
         """Return whether a fit is far from the truth.
 
         Its residuals are then much larger than the noise, or a shared unknown is many deviations
@@ -133,7 +133,9 @@ class Search(FittedCandidates):
         """
         has_prior = self.problem.shared.precision > 0.0
         deviations = np.abs(base.point.shared[has_prior])
-        return self._misfits(base) or bool(deviations.max(initial=0.0) > SEARCH.strained)
+        return self._has_large_residuals(base) or bool(
+            deviations.max(initial=0.0) > SEARCH.strained
+        )
 
     def _fit_from_screen(self, base: CandidateFit, effects: Sequence[Effect]) -> list[CandidateFit]:
         """Fit effects by few steps from the best points of a screen, the most promising first.
@@ -154,10 +156,10 @@ class Search(FittedCandidates):
         least_gain = SEARCH.worth_adding if has_effects else SEARCH.worth_fitting
         screen = Screen(self.problem, base)
         changes_by_effect = []
-        for effect in with_progress(
+        for effect in report_each(
             self.on_progress, effects, lambda effect: f"screening {effect.identifier}"
         ):
-            changes = starting_changes(screen, effect)
+            changes = best_changes_by_effect(screen, effect)
             if not has_effects:
                 gains = [change.gain for change in changes]
                 self.screened_gains[effect.identifier] = max(gains, default=0.0)
@@ -168,26 +170,32 @@ class Search(FittedCandidates):
         starts_by_effect = []
         for changes in changes_by_effect:
             if changes:
-                starts = [start_beside(base, change.term, change.best) for change in changes]
+                starts = [
+                    start_with_added_effect(base, change.term, change.best_values)
+                    for change in changes
+                ]
                 starts_by_effect.append(starts)
         return self._fit_from_starts(starts_by_effect, base, least_gain if has_effects else 0.0)
 
     def _with_unbiased_nuisances(self, base: CandidateFit) -> CandidateFit:
-        """Return a base with nuisances that are not distorted by the errors of the model.
+        """Return a base whose nuisances are not distorted by the errors of the model.
 
         The nuisances of a wrong model take up part of its error, which makes them a bad start. They
         are taken from a fit that includes a free missing force. If a trial is at rest, or no force
-        can be seen, they are set to their prior means.
+        can be estimated, they are set to their prior means.
         """
-        point = self.problem.start(base.candidate)
+        point = self.problem.prior_mean_point(base.candidate)
         force_search = self.force_search if self.is_all_in_motion else None
         if force_search is not None:
-            hypothesis = force_search.whole
+            hypothesis = force_search.hypothesis_of_all_ports
             if base.candidate.terms:
-                followed = force_search.followed(hypothesis, base.candidate, base.effect)
-                hypothesis = followed or hypothesis
-            point = force_search.whole_point(hypothesis)
-        return replace(base, point=replace(point, effect=base.effect), linearisations=())
+                with_effects = force_search.fit_along_motion(
+                    hypothesis, base.candidate, base.effect
+                )
+                # without the effects if they cannot act along the motion
+                hypothesis = with_effects or hypothesis
+            point = force_search.point_with_effects(hypothesis)
+        return replace(base, point=replace(point, effect=base.effect), trial_derivatives=())
 
     def _fit_from_starts(
         self, starts_by_effect: Sequence[Sequence[FitStart]], base: CandidateFit, least_gain: float
@@ -205,20 +213,20 @@ class Search(FittedCandidates):
         """
         best_fits = []
         give_up = base.objective - least_gain
-        for starts in with_progress(
+        for starts in report_each(
             self.on_progress,
             starts_by_effect,
             lambda starts: f"fitting {starts[0].candidate.description}",
         ):
             fits: list[CandidateFit] = []
             for start in starts:
-                rough = attempt(
+                rough = try_fit(
                     self.problem,
                     start.candidate,
                     start.point,
-                    known=base.linearisations or None,
+                    nearby_derivatives=base.trial_derivatives or None,
                     iterations=SEARCH.rough_steps,
-                    give_up=give_up,
+                    objective_limit=give_up,
                 )
                 if rough is not None:  # None if the effect is larger than the model allows
                     fits.append(rough)
@@ -242,12 +250,12 @@ class Search(FittedCandidates):
         if not rough:
             return []
         best_score = self.score(rough[0])
-        # after few steps far from the truth the scores are only roughly in order
+        # far from the truth, the scores after few steps are only roughly in order
         margin = max(SEARCH.close, SEARCH.close_share * (best_score - floor))
         least_score = max(best_score - margin, floor)
         chosen = [fit for fit in rough[: SEARCH.exact_fits] if self.score(fit) > least_score]
         exact = []
-        for fit in with_progress(
+        for fit in report_each(
             self.on_progress, chosen, lambda fit: f"fitting {fit.candidate.description} to the end"
         ):
             exact.append(self.fit_exactly(fit))
@@ -269,7 +277,7 @@ class Search(FittedCandidates):
             for fit in ranked[: SEARCH.refitted]:
                 if not fit.candidate.terms:
                     continue
-                finer = attempt(problem, fit.candidate, fit.point)
+                finer = try_fit(problem, fit.candidate, fit.point)
                 if finer is not None:  # else the coarser fit stands
                     self.exact_fits[fit.candidate.key] = finer
 
@@ -277,24 +285,24 @@ class Search(FittedCandidates):
 
     def search_single_effects(self) -> None:
         """Fit all single effects, and refine the time steps for the best of them."""
-        rough = self.fit_roughly_beside(self.no_effect, self.effects)
+        rough = self.fit_one_more_effect(self.no_effect, self.effects)
         self.fit_best_exactly(rough, self.score(self.no_effect) - SEARCH.hopeless)
         self.refine_time_steps()
 
     def search_sets(self) -> None:
         """Fit laws of free shape, sets of several effects, and pairs, if these explain more."""
-        self.fit_families()
+        self.fit_free_shapes()
         self.refine_time_steps()
         # a law of free shape together with a further effect could fit nearly anything
-        if not self.best().candidate.is_family:
+        if not self.best().candidate.has_free_shape:
             self.add_effects()
-        if not self.best().candidate.is_family and self.is_unexplained():
+        if not self.best().candidate.has_free_shape and self.is_unexplained():
             self.fit_pairs()
         self.move_effects()
         self.drop_effects()
         self.refine_time_steps()
 
-    def search_along_force(self, force_search: ForceSearch) -> None:
+    def search_by_missing_force(self, force_search: ForceSearch) -> None:
         """Fit the sets of effects whose force agrees best with the missing force.
 
         The missing force is estimated from the readings without a law. The new fits replace all
@@ -307,34 +315,36 @@ class Search(FittedCandidates):
         """
         self.exact_fits = {(): self.no_effect}
         self.rough_fits = {}
-        named = force_search.name(self.effects, self.on_progress)
-        self.force_hypotheses = refined(force_search, named, len(self.effects), self.on_progress)
+        named = force_search.rank_hypotheses(self.effects, self.on_progress)
+        self.force_hypotheses = refine_hypotheses(
+            force_search, named, len(self.effects), self.on_progress
+        )
         eligible = []
         for hypothesis in self.force_hypotheses:
             candidate = hypothesis.candidate
             # a law of free shape together with another law could fit nearly anything
-            is_family_in_set = candidate.is_family and len(candidate.terms) > 1
+            is_family_in_set = candidate.has_free_shape and len(candidate.terms) > 1
             if candidate.terms and not is_family_in_set:
                 eligible.append(hypothesis)
         leading = []
         for hypothesis in eligible:
             if self.score(hypothesis) > self.score(eligible[0]) - SEARCH.followed:
                 leading.append(hypothesis)
-        for hypothesis in with_progress(
+        for hypothesis in report_each(
             self.on_progress,
             leading[: SEARCH.far_fits],
             lambda hypothesis: f"fitting {hypothesis.candidate.description} to the end",
         ):
-            start = force_search.whole_point(hypothesis)
-            fit = attempt(self.problem, hypothesis.candidate, start)
+            start = force_search.point_with_effects(hypothesis)
+            fit = try_fit(self.problem, hypothesis.candidate, start)
             if fit is not None:
-                self.record(fit, exact=True)
-        self.restart_leading_single(force_search)
+                self.record_fit(fit, exact=True)
+        self.refit_from_other_magnitudes(force_search)
         self.move_effects()
         self.drop_effects()
         self.refine_time_steps()
 
-    def restart_leading_single(self, force_search: ForceSearch) -> None:
+    def refit_from_other_magnitudes(self, force_search: ForceSearch) -> None:
         """Fit the best single effect again from other magnitudes, unless it explains the data.
 
         If dry friction ends a motion, there is an optimum of its magnitude for every number of half
@@ -347,7 +357,7 @@ class Search(FittedCandidates):
         force_search : ForceSearch
             The search for the missing force.
         """
-        if not self.is_unexplained() and not self.best().candidate.is_family:
+        if not self.is_unexplained() and not self.best().candidate.has_free_shape:
             return
         singles = [fit for fit in self.exact_fits.values() if len(fit.candidate.terms) == 1]
         if not singles:
@@ -356,12 +366,12 @@ class Search(FittedCandidates):
         for hypothesis in canonical_relatives(leading, self.force_hypotheses):
             candidate = hypothesis.candidate
             self.on_progress(f"fitting {candidate.description} from other sizes")
-            start = force_search.whole_point(hypothesis)
-            for point in points_at_other_sizes(self.problem, candidate, start):
-                fit = attempt(self.problem, candidate, point)
+            start = force_search.point_with_effects(hypothesis)
+            for point in points_at_other_magnitudes(self.problem, candidate, start):
+                fit = try_fit(self.problem, candidate, point)
                 if fit is None:
                     continue
-                self.record(fit, exact=True)
+                self.record_fit(fit, exact=True)
                 if check_absolute_fit(self.problem, fit).passed:
                     return
 
@@ -369,12 +379,12 @@ class Search(FittedCandidates):
         """Add one effect at a time to the best set, as long as the score rises."""
         current = self.best()
         while 0 < len(current.candidate.terms) < SEARCH.largest_set:
-            if len(current.candidate.terms) > 1 and self._is_far(current):
+            if len(current.candidate.terms) > 1 and self._is_far_from_truth(current):
                 break  # a third effect is looked for only where two nearly explain the data
             current_score = self.score(current)
             present = {term.effect.identifier for term in current.candidate.terms}
             others = [effect for effect in self.effects if effect.identifier not in present]
-            rough = self.fit_roughly_beside(current, others)
+            rough = self.fit_one_more_effect(current, others)
             exact = self.fit_best_exactly(rough, current_score - SEARCH.hopeless_longer)
             if not exact or self.score(exact[0]) <= current_score:
                 break
@@ -392,9 +402,9 @@ class Search(FittedCandidates):
             for candidate in sets_at_other_places(best.candidate, self.problem.setting):
                 if candidate.key in self.exact_fits:
                     continue
-                fit = attempt(self.problem, candidate, best.point, give_up=give_up)
+                fit = try_fit(self.problem, candidate, best.point, objective_limit=give_up)
                 if fit is not None:
-                    self.record(fit, exact=True)
+                    self.record_fit(fit, exact=True)
             if self.best() is best:
                 break
             best = self.best()
@@ -411,80 +421,85 @@ class Search(FittedCandidates):
             numbers = range(len(best.candidate.terms))
             for dropped in numbers:
                 remaining = [number for number in numbers if number != dropped]
-                candidate, effect = best.candidate.subset(remaining, best.effect)
+                candidate, effect = best.candidate.subset_of_terms(remaining, best.effect)
                 start = replace(best.point, effect=effect)
-                fit = attempt(self.problem, candidate, start, give_up=give_up)
+                fit = try_fit(self.problem, candidate, start, objective_limit=give_up)
                 if fit is not None:
-                    self.record(fit, exact=True)
+                    self.record_fit(fit, exact=True)
             if self.best() is best:
                 break
             best = self.best()
 
-    def fit_families(self) -> None:
+    def fit_free_shapes(self) -> None:
         """Fit the best single effects with free shapes, and record those that explain the data.
 
-        One law with a free shape is a simpler cause than two laws, so it is tried before pairs. Of
-        each family at a place the fit of the best score is recorded.
+        One law with a free shape is a simpler cause than two laws, so it is tried before pairs.
+        Effects of one family at one place lead to the same free law; of their fits, the one with
+        the highest score is recorded.
         """
-        singles = self._singles_with_open_shape()
-        best_families: dict[tuple[str, str], CandidateFit] = {}
-        for single in singles:
-            family = fit_free_shape(self.problem, single, 0)
-            if family is None or family.log_evidence - single.log_evidence <= SHAPE_GAIN:
+        single_fits = self._single_fits_to_free()
+        best_by_family: dict[tuple[str, str], CandidateFit] = {}
+        for single_fit in single_fits:
+            free_fit = fit_free_shape(self.problem, single_fit, term_index=0)
+            if free_fit is None:
                 continue
-            (term,) = family.candidate.terms
-            # all effects of a family lead to the same verdict: keep the fit of the best score
+            evidence_gain = free_fit.log_evidence - single_fit.log_evidence
+            if evidence_gain <= LEAST_SHAPE_GAIN:
+                continue
+            (term,) = free_fit.candidate.terms
             key = (term.effect.family, term.place)
-            is_best = key not in best_families or self.score(best_families[key]) < self.score(
-                family
-            )
-            if is_best and check_absolute_fit(self.problem, family).passed is not False:
-                best_families[key] = family
-        for family in best_families.values():
-            self.record(family, exact=True)
+            previous_best = best_by_family.get(key)
+            is_best = previous_best is None or self.score(previous_best) < self.score(free_fit)
+            if is_best and self._is_not_refuted(free_fit):
+                best_by_family[key] = free_fit
+        for free_fit in best_by_family.values():
+            self.record_fit(free_fit, exact=True)
 
-    def _singles_with_open_shape(self) -> list[CandidateFit]:
+    def _is_not_refuted(self, fit: CandidateFit) -> bool:
+        """Return whether a fit passes the test of absolute fit, or cannot be tested.
+
+        It cannot be tested if there is no noise record (`passed` is then None).
+        """
+        return check_absolute_fit(self.problem, fit).passed is not False
+
+    def _single_fits_to_free(self) -> list[CandidateFit]:
         """Return the single effects that are to be fitted with a free shape, the best first.
 
-        If the best effect does not explain the data, these are all of the best ones. If it does,
-        they are those that explain the data with a score near that of the best; none if it is the
-        only one, or if the model without effect explains the data too. The free shape of the best
-        effect itself is then examined by the test of shape.
+        If the best effect does not explain the data, these are the `SEARCH.exact_fits` best ones.
+        If it does, they are the effects that explain the data with a score near that of the best.
+        If it is the only such effect, or if the model without effect explains the data too, there
+        are none: the test of shape (`gates.check_shape`) examines the best effect later.
         """
-        singles = []
+        single_fits = []
         for fit in self.exact_fits.values():
-            if len(fit.candidate.terms) == 1 and not fit.candidate.is_family:
-                singles.append(fit)
-        singles = sorted(singles, key=self.score, reverse=True)[: SEARCH.exact_fits]
-        fitting = []
-        for fit in singles:
-            if check_absolute_fit(self.problem, fit).passed is not False:
-                fitting.append(fit)
-        if not fitting or fitting[0] is not singles[0]:
-            return singles
-        least = self.score(singles[0]) - SEARCH.rivals
-        competing = [fit for fit in fitting if self.score(fit) > least]
-        model_fits = check_absolute_fit(self.problem, self.no_effect).passed is not False
-        if len(competing) == 1 or model_fits:
+            if len(fit.candidate.terms) == 1 and not fit.candidate.has_free_shape:
+                single_fits.append(fit)
+        single_fits = sorted(single_fits, key=self.score, reverse=True)[: SEARCH.exact_fits]
+        explaining_fits = [fit for fit in single_fits if self._is_not_refuted(fit)]
+        if not explaining_fits or explaining_fits[0] is not single_fits[0]:
+            return single_fits
+        least_score = self.score(single_fits[0]) - SEARCH.rivals
+        competing_fits = [fit for fit in explaining_fits if self.score(fit) > least_score]
+        if len(competing_fits) == 1 or self._is_not_refuted(self.no_effect):
             return []
-        return competing
+        return competing_fits
 
     def fit_pairs(self) -> None:
         """Fit the pairs of effects that reduce the misfit most by a screen without effect."""
         screen = Screen(self.problem, self.no_effect)
         changes: list[ScreenedChange] = []
         for effect in self.effects:
-            changes.extend(starting_changes(screen, effect))
+            changes.extend(best_changes_by_effect(screen, effect))
         starts_by_pair = []
-        for pair in best_pairs(changes, screen.sign)[: SEARCH.pairs_fitted]:
+        for pair in best_pairs(changes, screen.inner_product_signs)[: SEARCH.pairs_fitted]:
             candidate = Candidate((pair.first.term, pair.second.term))
             if candidate.key in self.exact_fits:
                 continue
-            values = np.concatenate((pair.first.best, pair.second.best))
+            values = np.concatenate((pair.first.best_values, pair.second.best_values))
             start = FitStart(candidate, replace(self.no_effect.point, effect=values))
             starts_by_pair.append([start])
         rough = self._fit_from_starts(starts_by_pair, self.no_effect, 0.0)
         for fit in rough:
-            self.record(fit, exact=False)
+            self.record_fit(fit, exact=False)
         rough.sort(key=lambda fit: -self.score(fit))
         self.fit_best_exactly(rough, self.score(self.best()) - SEARCH.close)

@@ -6,11 +6,11 @@ from discrepancy.catalogue.entry import Effect
 from discrepancy.catalogue.library import in_events
 from discrepancy.fits.beginnings import refit_from_first_readings
 from discrepancy.fits.candidate import Candidate
-from discrepancy.fits.fitting import attempt, fit
+from discrepancy.fits.fitting import fit, try_fit
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 
-from .starts import OnProgress, no_progress
+from .starts import OnProgress, ignore_progress
 from .strategy import Search
 
 OnSearch = Callable[[Search], None]
@@ -24,7 +24,7 @@ def ignore_search(search: Search) -> None:
 def search(
     problem: Problem,
     effects: Sequence[Effect],
-    on_progress: OnProgress = no_progress,
+    on_progress: OnProgress = ignore_progress,
     on_search: OnSearch = ignore_search,
 ) -> Search:
     """Search the catalogue for the set of effects that explains a campaign.
@@ -50,7 +50,7 @@ def search(
         All candidates that were fitted, with their evidence.
     """
     on_progress("fitting the model as it is")
-    start = problem.start(Candidate())
+    start = problem.prior_mean_point(Candidate())
     no_effect = fit(problem, Candidate(), start, iterations=SEARCH.none_steps)
     no_effect = refit_from_first_readings(problem, no_effect, iterations=SEARCH.none_steps)
     usable = [effect for effect in effects if effect.unavailable(problem.setting) is None]
@@ -60,8 +60,8 @@ def search(
     if len(own_laws) and result.force_search is not None and result.is_unexplained():
         # a nonlinear law of the model itself, such as dry friction that ends a motion, has many
         # optima: fit again from the unknowns of a fit that includes a missing force
-        start = result.force_search.whole_point(result.force_search.whole)
-        second_fit = attempt(problem, Candidate(), start)
+        start = result.force_search.point_with_effects(result.force_search.hypothesis_of_all_ports)
+        second_fit = try_fit(problem, Candidate(), start)
         least_gain = SEARCH.worth_fitting
         if second_fit is not None and second_fit.objective < no_effect.objective - least_gain:
             result = Search(problem, usable_effects, second_fit, on_progress=on_progress)
@@ -69,11 +69,11 @@ def search(
     force_search = result.force_search if result.is_all_in_motion else None
     # free forces at several ports could stand for nearly any law at one of them
     if force_search is not None and len(force_search.ports) <= 1:
-        result.search_along_force(force_search)
+        result.search_by_missing_force(force_search)
         return result
     result.search_single_effects()
     if force_search is not None and result.is_unexplained():
-        result.search_along_force(force_search)
+        result.search_by_missing_force(force_search)
     else:
         result.search_sets()
     return result

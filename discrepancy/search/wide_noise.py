@@ -1,4 +1,4 @@
-"""Evidence of hypotheses under a noise that is as large as the residuals of the best of them.
+"""Evidence of hypotheses under a noise that is as large as the residuals of the best hypothesis.
 
 The search itself uses the recorded noise, which shows best how far a fit is from the truth. But the
 residuals of a model of a real structure are never white noise of the recorded level (Kennedy and
@@ -21,24 +21,25 @@ import numpy as np
 from discrepancy.campaign import noise_tests
 from discrepancy.campaign.records import FloatArray
 from discrepancy.fits.candidate import CandidateKey, ResidualProcess
-from discrepancy.fits.fitting import CandidateFit, attempt
+from discrepancy.fits.fitting import CandidateFit, try_fit
 from discrepancy.fits.gates import ResidualRecord, residual_records, whiteness_p_value
 from discrepancy.fits.problem import Problem
 from discrepancy.search_settings import SEARCH
 
-from .starts import with_progress
+from .starts import report_each
 from .strategy import Search
 
-LEVEL = 1e-3
-"""p-value below which residuals are more than noise, or not white."""
-NEAR = 0.25
-"""Relative difference of sampling intervals up to which a noise record is compared with
+LEAST_P_VALUE = 1e-3
+"""Least p-value with which residuals are taken as noise of the recorded level, or as white."""
+LARGEST_INTERVAL_DIFFERENCE = 0.25
+"""Largest relative difference of sampling intervals with which a noise record is compared with
 residuals."""
-SWINGS = -0.25
+OSCILLATION_MINIMUM = -0.25
 """Autocorrelation at its first minimum below which a process oscillates."""
-LIKE_RECORD = 3.0
-"""Standard deviations within which the correlation of residuals agrees with the noise record."""
-LEAST_WHITE = 1e-12
+LARGEST_CORRELATION_DIFFERENCE = 3.0
+"""Largest difference between the correlations of residuals and of the noise record with which they
+agree [standard deviations]."""
+LEAST_WHITE_SHARE = 1e-12
 """Least variance of an unrecorded noise, as a fraction of the residuals' mean square."""
 SECOND_DIFFERENCES = 6.0
 """Variance of the second differences of white noise over its own: 1 + 4 + 1 by their weights."""
@@ -47,7 +48,7 @@ SECOND_DIFFERENCES = 6.0
 # ---------------------------------------------------------------- what a fit leaves
 
 
-@dataclass
+@dataclass(frozen=True)
 class _ChannelProcess:
     """The residual process of one channel; `ResidualProcess` defines the attributes.
 
@@ -61,7 +62,7 @@ class _ChannelProcess:
     is_recorded_colour: bool = False
 
 
-def residual_process_of(problem: Problem, fit: CandidateFit) -> ResidualProcess:
+def estimate_residual_process(problem: Problem, fit: CandidateFit) -> ResidualProcess:
     """Return the random process in the residuals of a fit besides the recorded noise.
 
     Parameters
@@ -87,7 +88,7 @@ def residual_process_of(problem: Problem, fit: CandidateFit) -> ResidualProcess:
 def _channel_process(
     problem: Problem, fit: CandidateFit, channel: int, noise_level: float
 ) -> _ChannelProcess:
-    """Return the residual process of a channel.
+    """Return the random process in the residuals of one channel besides white noise.
 
     Parameters
     ----------
@@ -100,60 +101,94 @@ def _channel_process(
     noise_level : float
         The variance of the noise over s0^2, with s0 its recorded deviation or a stand-in.
     """
-    process = _ChannelProcess()
     records = residual_records(problem, fit, channel)
     if not records:
-        return process
+        return _ChannelProcess()
     residual_series = [record.values for record in records]
     sample_count = sum(float(record.is_used.sum()) for record in records)
-    # compare the variance of the residuals with the noise record
-    residual_freedom = max(sample_count - fit.spent[channel], 1.0)
-    noise_freedom = problem.freedom[channel]
-    has_record = noise_freedom > 0.0
+    residual_freedom = max(sample_count - fit.absorbed_freedom[channel], 1.0)
+    has_record = problem.record_freedom[channel] > 0.0
     mean_square = _sum_of_squares(residual_series) / residual_freedom
     interval = max(float(np.median(record.steps)) for record in records)
     colour = _recorded_colour(problem, problem.channel_names[channel], records, interval)
+    # compare the variance of the residuals with the noise record
     is_larger = False
     if has_record:
         p_value = noise_tests.variance_p_value(
-            mean_square, residual_freedom / colour.times_fewer, noise_freedom / colour.times_fewer
+            mean_square,
+            residual_freedom / colour.samples_per_independent,
+            problem.record_freedom[channel] / colour.samples_per_independent,
         )
-        is_larger = p_value < LEVEL
-    if not is_larger and whiteness_p_value(records) > LEVEL:
-        return process
-    # noise factor: variance of the residuals times samples per independent sample
+        is_larger = p_value < LEAST_P_VALUE
+    if not is_larger and whiteness_p_value(records) > LEAST_P_VALUE:
+        return _ChannelProcess()
+    # compare their correlation with that of the noise record
     autocorrelation, white_variance = noise_tests.autocorrelation(residual_series)
     correlation_deviation = np.sqrt(1.0 / sample_count + colour.variance)
+    correlation_difference = abs(autocorrelation[0] - colour.correlation)
     has_record_colour = (
-        abs(autocorrelation[0] - colour.correlation) < LIKE_RECORD * correlation_deviation
+        correlation_difference < LARGEST_CORRELATION_DIFFERENCE * correlation_deviation
     )
-    process.is_recorded_colour = bool(not is_larger and has_record_colour)
-    if process.is_recorded_colour:
+    is_recorded_colour = bool(not is_larger and has_record_colour)
+    # noise factor: variance of the residuals times samples per independent sample
+    if is_recorded_colour:
         wide_variance = 1.0
     elif has_record:
         wide_variance = max(mean_square, 1.0)
     else:
         wide_variance = mean_square
-    process.noise_factor = np.sqrt(
-        wide_variance * noise_tests.times_fewer(autocorrelation, white_variance)
-    )
-    # the process without the noise: white noise adds to the variance of the residuals, but not to
-    # their correlation, so the correlation of the process is larger by the ratio of the variances
+    noise_factor = np.sqrt(wide_variance * noise_tests.times_fewer(autocorrelation, white_variance))
+    process = _ChannelProcess(noise_factor=noise_factor, is_recorded_colour=is_recorded_colour)
+    # the process is what the residuals have besides the noise
     process_variance = mean_square / noise_level - 1.0
-    if process.is_recorded_colour or process_variance <= 0.0:
+    if is_recorded_colour or process_variance <= 0.0:
         return process
-    process_over_residuals = (1.0 + process_variance) / process_variance
-    process.amplitude = np.sqrt(process_variance)
-    process.correlation_time = interval * noise_tests.times_fewer(
-        autocorrelation, white_variance, process_over_residuals
+    return _add_correlation_in_time(
+        process, process_variance, autocorrelation, white_variance, interval
     )
-    process_autocorrelation = autocorrelation * process_over_residuals
+
+
+def _add_correlation_in_time(
+    process: _ChannelProcess,
+    process_variance: float,
+    autocorrelation: FloatArray,
+    white_variance: FloatArray,
+    interval: float,
+) -> _ChannelProcess:
+    """Return a residual process with its amplitude, correlation time and frequency.
+
+    Parameters
+    ----------
+    process : _ChannelProcess
+        The process without these.
+    process_variance : float
+        The variance of the process over that of the noise.
+    autocorrelation : (K,) array
+        The autocorrelation of the residuals at lags of 1, 2, ... samples.
+    white_variance : (K,) array
+        The variance of each of these that white noise alone would cause.
+    interval : float
+        The sampling interval [s].
+    """
+    # White noise adds to the variance of the residuals, but not to their correlation. So the
+    # correlation of the process is larger by the ratio of the variances.
+    residuals_over_process = (1.0 + process_variance) / process_variance
+    correlation_time = interval * noise_tests.times_fewer(
+        autocorrelation, white_variance, residuals_over_process
+    )
+    frequency = 0.0
+    process_autocorrelation = autocorrelation * residuals_over_process
     first_minimum = int(np.argmax(np.diff(process_autocorrelation) > 0.0))
-    if process_autocorrelation[first_minimum] < SWINGS:
+    if process_autocorrelation[first_minimum] < OSCILLATION_MINIMUM:
         # the first minimum is at half a period; the lags begin at one interval
-        process.frequency = 0.5 / ((first_minimum + 1) * interval)
-        process.correlation_time *= 2.0  # the mean of a squared cosine is a half
-    return process
+        frequency = 0.5 / ((first_minimum + 1) * interval)
+        correlation_time *= 2.0  # the mean of a squared cosine is a half
+    return replace(
+        process,
+        amplitude=np.sqrt(process_variance),
+        correlation_time=correlation_time,
+        frequency=frequency,
+    )
 
 
 def _sum_of_squares(series: Sequence[FloatArray]) -> float:
@@ -168,7 +203,7 @@ def unrecorded_noise_levels(problem: Problem, fit: CandidateFit) -> FloatArray:
     of white noise have six times its variance, while a slow process contributes hardly anything.
     """
     levels = np.ones(len(problem.channel_names))
-    for channel in np.flatnonzero(problem.freedom == 0.0):
+    for channel in np.flatnonzero(problem.record_freedom == 0.0):
         records = residual_records(problem, fit, int(channel))
         residual_series = [record.values for record in records]
         differences = [np.diff(values, 2) for values in residual_series]
@@ -178,14 +213,14 @@ def unrecorded_noise_levels(problem: Problem, fit: CandidateFit) -> FloatArray:
         difference_count = max(sum(len(values) for values in differences), 1)
         white_variance = _sum_of_squares(differences) / SECOND_DIFFERENCES / difference_count
         if mean_square > 0.0:
-            levels[channel] = min(max(white_variance, LEAST_WHITE * mean_square), mean_square)
+            levels[channel] = min(max(white_variance, LEAST_WHITE_SHARE * mean_square), mean_square)
         else:  # the channel is in trials at rest only
-            levels[channel] = 1.0 / problem.precisions(fit.sums)[channel]
+            levels[channel] = 1.0 / problem.noise_precisions(fit.squares_by_channel)[channel]
     return levels
 
 
 class _RecordedColour(NamedTuple):
-    """The correlation in time that a channel's noise has in residuals, by its noise record.
+    """The correlation in time that the residuals of a channel have if they are recorded noise.
 
     Attributes
     ----------
@@ -193,19 +228,19 @@ class _RecordedColour(NamedTuple):
         The correlation of neighbouring samples; nan if it is not known.
     variance : float
         The variance of this estimate.
-    times_fewer : float
+    samples_per_independent : float
         The number of samples per independent sample.
     """
 
     correlation: float
     variance: float
-    times_fewer: float
+    samples_per_independent: float
 
 
 def _recorded_colour(
     problem: Problem, name: str, records: Sequence[ResidualRecord], interval: float
 ) -> _RecordedColour:
-    """Return the correlation in time that residuals have if they are noise as in the record.
+    """Return the correlation in time of residuals that are noise as in the noise record.
 
     If residuals are whitened, the record is passed through the same whitening filter first.
 
@@ -222,13 +257,13 @@ def _recorded_colour(
     """
     unknown = _RecordedColour(np.nan, 0.0, 1.0)
     record = problem.campaign.channels[name].noise
-    noise = problem.noise[name]
+    noise = problem.noise_models[name]
     if record is None or record.samples is None or record.interval is None:
         return unknown
     if not np.any(record.samples):
         return unknown
     centred_record = record.samples - record.samples.mean()
-    if abs(record.interval - interval) > NEAR * interval:
+    if abs(record.interval - interval) > LARGEST_INTERVAL_DIFFERENCE * interval:
         return unknown
     colours = []
     for residuals in records:
@@ -260,7 +295,7 @@ def with_wide_noise(problem: Problem, process: ResidualProcess) -> Problem:
 
     It is the given problem if the process is white noise of the recorded level.
     """
-    return problem.widened(process.noise_factor) if process.is_present else problem
+    return problem.with_wider_noise(process.noise_factor) if process.is_present else problem
 
 
 def refit_under_wide_noise(
@@ -290,13 +325,13 @@ def refit_under_wide_noise(
     """
     if wide_problem is problem:
         return fit
-    wide_fit = attempt(wide_problem, fit.candidate, fit.point, iterations=iterations)
+    wide_fit = try_fit(wide_problem, fit.candidate, fit.point, iterations=iterations)
     if wide_fit is None:
         return None
-    recorded_fit = attempt(problem, fit.candidate, wide_fit.point, iterations=0)
+    recorded_fit = try_fit(problem, fit.candidate, wide_fit.point, iterations=0)
     if recorded_fit is None:
         return None
-    process = residual_process_of(problem, recorded_fit)
+    process = estimate_residual_process(problem, recorded_fit)
     return replace(
         recorded_fit,
         log_evidence=wide_fit.log_evidence,
@@ -308,7 +343,7 @@ def refit_under_wide_noise(
 
 # ---------------------------------------------------------------- hypotheses compared under it
 
-ROUNDS = 3
+MOST_ROUNDS = 3
 """Largest number of times that the wider noise is taken from another best hypothesis."""
 
 
@@ -322,11 +357,11 @@ def compare_under_wide_noise(search: Search) -> None:
     """
     best = search.best()
     chosen = _most_probable_sets(search)
-    for _ in range(ROUNDS):
-        process = residual_process_of(search.problem, best)
+    for _ in range(MOST_ROUNDS):
+        process = estimate_residual_process(search.problem, best)
         search.wide_problem = with_wide_noise(search.problem, process)
         search.wide_fits = {}
-        wide_fits = _fits_under(search, search.wide_problem, chosen)
+        wide_fits = _fit_under_wide_noise(search, search.wide_problem, chosen)
         leading = max(wide_fits.values(), key=search.score)
         if leading.candidate.key == best.candidate.key:
             break
@@ -354,7 +389,7 @@ def _most_probable_sets(search: Search) -> list[CandidateFit]:
     return chosen
 
 
-def _fits_under(
+def _fit_under_wide_noise(
     search: Search, wide_problem: Problem, chosen: Sequence[CandidateFit]
 ) -> dict[CandidateKey, CandidateFit]:
     """Return the most promising hypotheses fitted under a wider noise.
@@ -374,7 +409,7 @@ def _fits_under(
     promising = [fit for fit, score in fits_with_scores[: SEARCH.weighed_fits] if score > least]
     wide_fits: dict[CandidateKey, CandidateFit] = {}
     _add_wide_fit(wide_fits, search, wide_problem, search.no_effect)
-    for fit in with_progress(
+    for fit in report_each(
         search.on_progress,
         promising,
         lambda fit: f"weighing {fit.candidate.description} with its remainder",
@@ -407,9 +442,9 @@ def _add_wide_fit(
 
 
 def _expected_score(search: Search, wide_problem: Problem, fit: CandidateFit) -> float:
-    """Return the score of a fit under a wider noise if its point and prior stay the same [nat].
+    """Return the score that a fit would have under a wider noise at its present point [nat].
 
-    The score is ln (evidence times prior). Only the misfit changes with the noise.
+    The score is ln (evidence times prior). Of its parts, only the misfit is computed again.
     """
     problem = search.problem
     scaled_residuals = []
@@ -417,5 +452,7 @@ def _expected_score(search: Search, wide_problem: Problem, fit: CandidateFit) ->
         problem.trials, wide_problem.trials, fit.residuals, strict=True
     ):
         scaled_residuals.append(data.deviation / wide_data.deviation * residual)
-    wide_sums = problem.sums_by_channel(scaled_residuals)
-    return search.score(fit) + problem.misfit(fit.sums) - wide_problem.misfit(wide_sums)
+    wide_sums = problem.squares_by_channel(scaled_residuals)
+    return (
+        search.score(fit) + problem.misfit(fit.squares_by_channel) - wide_problem.misfit(wide_sums)
+    )

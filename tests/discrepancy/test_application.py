@@ -318,8 +318,8 @@ def test_friction_in_the_model_is_fitted_from_the_beginnings():
     campaign = simulated(model, "ringdown", 1, friction)
     patched = model.patched(hiding(campaign, model, *friction))
     problem = problem_of(campaign, patched)
-    count = problem.counts.sum()
-    assert fit(problem, Candidate(), problem.start(Candidate())).chi_square > 10.0 * count
+    count = problem.sample_counts.sum()
+    assert fit(problem, Candidate(), problem.prior_mean_point(Candidate())).chi_square > 10.0 * count
     assert search(problem, chosen("load_cell")).no_effect.chi_square < 1.2 * count
 
 

@@ -1,10 +1,11 @@
-"""What flies: an asset under control; and a source, which prepares it, or what the twin expects of it.
+"""Assets under control, and sources, which prepare assets or predict their observations.
 
-An asset is told the control and its true health, and returns the noise-free observation; or it carries damage
-and sensors of its own, and tells of them beside. It is driven by the `Plant`; the twin never meets it.
+An asset receives the control and its true health in each step, and returns its observation without
+noise. An asset with damage and sensors of its own also returns its true state and the readings of
+its sensors. The `Plant` steps the asset; the twin never has access to it.
 
-A mission knows a source only by `AssetSource`. What a user may name stands in the files of this folder whose
-names end in `_source`: each holds the tables of its kinds and what is made of them.
+A mission uses a source only through `AssetSource`. The files of this folder whose names end in
+`_source` each contain the tables that a user writes for some kinds, and their sources.
 """
 
 from collections.abc import Callable, Mapping
@@ -23,13 +24,37 @@ from reporting.files import hash_file, write_members
 from reporting.progress import Progress
 from reporting.text_file import read_bytes
 from twin_master.assets.parameter import ParameterDraws, draw_parameter
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
-from twin_master.scenario.section import AssetSection, BeliefSection, FileSection
+from twin_master.scenario.kinds import AssetSection, BeliefSection, FileSection
+from twin_master.scenario.mission import CALIBRATION_COPY
+from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
+
+BINDING_COPY = "asset/binding.toml"
+PATCH_COPY = "asset/patch.json"
+MODEL_PATCH_COPY = "asset/model_patch.json"
+LIBRARY_COPY = "asset/UAVconfig.json"
+OBSERVATIONS_COPY = "asset/observation_library.nc"
+SSP_COPY = "asset/system.ssp"
+HASHED_COPIES = {
+    "binding": BINDING_COPY,
+    "calibration": CALIBRATION_COPY,
+    "patch": PATCH_COPY,
+    "model_patch": MODEL_PATCH_COPY,
+    "observation_library": OBSERVATIONS_COPY,
+    "ssp": SSP_COPY,
+    "strain_library": LIBRARY_COPY,
+}
+"""The copies inside a run folder whose hashes the run states, by the names of the hashes."""
+FLOWN_DESIGN_HASH = "flown_design"
+"""Name of the hash of the wing design that flies; that of the believed design is `design`."""
+NO_ASSET = (
+    "this scenario has no `[asset]`: it is for a real one, whose observations `uav-twin watch` "
+    "takes in, and its `belief` must be a model of its own."
+)
 
 
 @dataclass(frozen=True)
@@ -38,15 +63,15 @@ class AssetReading:
 
     Attributes
     ----------
-    values : (G,)
-        Noise-free observation in its SI unit.
+    values : (G,) array
+        The observation without noise in its SI unit.
     monitors : dict of str to float
-        Further figures that the asset reports of itself, such as a certified error bound.
+        Further figures that the asset reports, such as a certified error bound.
     state : dict of str to float or None
-        True value of each state factor, SI, where the asset carries damage of its own: for scoring, never for
-        the twin.
-    sensed : (G,) or None
-        What its sensors say, SI, where it carries sensors of its own; NaN where one is lost.
+        The true value of each state factor, SI, if the asset has damage of its own. It serves for
+        scoring; the twin does not receive it.
+    sensed : (G,) array or None
+        The readings of the sensors, SI, if the asset has sensors of its own; NaN for a lost sensor.
     """
 
     values: Float
@@ -56,13 +81,21 @@ class AssetReading:
 
 
 class Asset:
-    """An asset under control; one that inherits from this has no state unless it says so."""
+    """An asset under control; unless a subclass changes that, it has no state."""
 
     units: Mapping[str, str] = MappingProxyType({})
-    """Units of control inputs and monitors by name; those that are missing are dimensionless."""
+    """Units of control inputs and monitors by name; those without an entry are dimensionless."""
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Fly one step with the given control inputs and true health (SI)."""
+        """Advance the asset by one step.
+
+        Parameters
+        ----------
+        control : mapping of str to float
+            The value of each control input, SI.
+        health : mapping of str to float
+            The true value of each state factor, SI.
+        """
         raise NotImplementedError
 
     def save_state(self) -> bytes:
@@ -70,58 +103,97 @@ class Asset:
         return b""
 
     def restore_state(self, state: bytes) -> None:
-        """Continue from a saved state, also in another process."""
+        """Continue from a saved state, also one of another process."""
 
     def close(self) -> None:
-        """Let go of what the asset holds."""
+        """Release the processes and files of the asset."""
 
 
 class StatelessAsset(Asset):
-    """An asset whose observation depends on nothing but the control and the health of the step.
+    """An asset whose observation depends on the control and the health of the step alone.
 
     Parameters
     ----------
-    observe
-        Returns the reading for control inputs and health.
+    observe : callable
+        Returns the reading for the values of the control inputs and of the state factors.
     """
 
-    def __init__(self, observe: Callable[[Mapping[str, float], Mapping[str, float]], AssetReading]) -> None:
+    def __init__(
+        self, observe: Callable[[Mapping[str, float], Mapping[str, float]], AssetReading]
+    ) -> None:
         self._observe = observe
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Return the observation under the given control inputs and health."""
+        """Return the reading under control and health."""
         return self._observe(control, health)
 
 
-def asked_table(
-    scenario: Scenario, states: Float, ask: Callable[[Mapping[str, float], Mapping[str, float]], Float]
-) -> Float:
-    """Ask what is shown under every control in every state (S, F), both by name: (S, U, G)."""
-    rows = (dict(zip(scenario.state_names, levels, strict=True)) for levels in states.tolist())
-    return np.array([[ask(control.values, health) for control in scenario.control] for health in rows])
+Predict = Callable[[Mapping[str, float], Mapping[str, float]], Float]
+"""Returns the observation (G,) for the values of the control inputs and of the state factors."""
 
 
-def shown_without_noise(scenario: Scenario, states: Float, asset: Asset) -> Float:
-    """Ask an asset as it is in all states (S, F) and controls: (S, U, G), NaN where it refuses."""
-    start = asset.save_state()
+def table_of_observations(scenario: Scenario, states: Float, predict: Predict) -> Float:
+    """Return the observation in every state under every control.
 
-    def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-        asset.restore_state(start)  # an asset with hidden effects may remember
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario, with the names of the state factors and with the controls.
+    states : (S, F) array
+        The value of each state factor in each state.
+    predict : callable
+        Returns the observation (G,) for one control and one state, both by name.
+
+    Returns
+    -------
+    (S, U, G) array
+        One row for each state, in it one row for each of the U controls of the scenario.
+    """
+    table = []
+    for levels in states.tolist():
+        health = dict(zip(scenario.state_names, levels, strict=True))
+        table.append([predict(control.values, health) for control in scenario.control])
+    return np.array(table)
+
+
+def noise_free_observations(scenario: Scenario, states: Float, asset: Asset) -> Float:
+    """Return what an asset would observe in every state under every control, without noise.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario that the asset flies in.
+    states : (S, F) array
+        The value of each state factor in each state.
+    asset : Asset
+        The asset; each observation begins in its present state.
+
+    Returns
+    -------
+    (S, U, G) array
+        NaN where the FMU refuses a state under a control.
+    """
+    present_state = asset.save_state()
+
+    def predict(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+        asset.restore_state(present_state)  # an asset with hidden effects may have a memory
         with suppress(FmuCallError):
             return asset.step(control, health).values
         return np.full(scenario.observation.count, np.nan)
 
-    return asked_table(scenario, states, ask)
+    return table_of_observations(scenario, states, predict)
 
 
 @dataclass(frozen=True)
 class FlownAndBelieved:
-    """What is flown and what the twin believes, in words.
+    """What flies and what the twin believes, in words.
 
     Attributes
     ----------
-    asset, model : str
-        What is flown, and what predicts its observations.
+    asset : str
+        What flies.
+    model : str
+        What predicts the observations of the twin.
     differ : bool
         Whether they are known to be different models.
     """
@@ -131,245 +203,308 @@ class FlownAndBelieved:
     differ: bool = False
 
 
-def calibrated_with(
+def calibration_sentence(
     record: Mapping[str, Any], asset: str, believed: str, hashes: Mapping[str, str]
 ) -> str | None:
-    """Return which model a campaign calibrated, which is flown, and whether the twin believes that one.
+    """Return which model a campaign calibrated, and whether the twin believes that one.
 
     Parameters
     ----------
     record : mapping
-        Of the calibration, as a run folder keeps it.
+        The record of the calibration that a run folder contains.
     asset, believed : str
-        What is flown and what the twin believes, in words.
+        What flies and what the twin believes, in words.
     hashes : mapping of str to str
-        Of what went into the run.
+        The hashes of what went into the run.
 
     Returns
     -------
     str or None
-        None where nothing was calibrated from a campaign.
+        None if nothing was calibrated from a campaign.
     """
     if "campaign" not in record:
         return None
-    flown = f"flown and believed is the {asset}"
+    roles = f"flown and believed is the {asset}"
     if asset != believed:
-        flown = f"flown is the {asset}, and the twin believes the {believed}"
-    own = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
-    if own is not None and own == record.get("design_hash"):
-        same = f"The twin believes the design that was calibrated, {own[:12]}."
+        roles = f"flown is the {asset}, and the twin believes the {believed}"
+    believed_hash = hashes.get("design", hashes.get(FLOWN_DESIGN_HASH))
+    if believed_hash is not None and believed_hash == record.get("design_hash"):
+        comparison = f"The twin believes the design that was calibrated, {believed_hash[:12]}."
     else:
-        same = "The calibration file does not tell whether these are one and the same."
-    return f"Calibrated was the model {record['model']}; {flown}. {same}"
+        comparison = "The calibration file does not tell whether these are one and the same."
+    return f"Calibrated was the model {record['model']}; {roles}. {comparison}"
 
 
 class AssetSource:
-    """Everything that a mission needs to know of what is flown, or of what its twin believes.
+    """Prepares what flies, or predicts the observations that a twin expects of it.
 
-    Most have in common that files are kept in the run folder, and that draws are those of a calibration.
+    A subclass may do one of the two or both. This class copies files into the run folder, and draws
+    the parameter from the calibration of the scenario.
 
     Parameters
     ----------
     scenario : Scenario
-        What is flown.
+        The scenario.
     section : FileSection, optional
-        The table that names the files.
+        The table of the scenario that names the files.
     """
 
     label: ClassVar = "asset"
-    """What is flown or believed, where that is always the same."""
+    """What flies or is believed, in words, if it is the same for all sources of the class."""
     differ: bool = False
-    """Whether what is believed is known to be another model than what is flown."""
+    """Whether the believed model is known to be another one than that which flies."""
     model: "ReducedModel | None" = None
-    """The reduced model of what is flown or believed, once prepared, where there is one."""
+    """The reduced model of what flies or is believed, once it is prepared, if there is one."""
 
     def __init__(self, scenario: Scenario, section: FileSection | None = None) -> None:
         self._scenario = scenario
         self.section = section
-        self._means: dict[str, float] = {}
+        self._drawn_means: dict[str, float] = {}
+        """Mean of the distribution from which a parameter was drawn, by its name."""
         self._folder: Path | None = None
 
     @cached_property
-    def places(self) -> dict[str, Path]:
-        """What the table names, and the calibration file, by the places of their copies in a run folder."""
-        own = {} if self.section is None else self.section.all_files()
-        return {**own, **self._scenario.calibration.all_files()}
+    def file_paths(self) -> dict[str, Path]:
+        """The files of the table, and the calibration file, by the paths of their copies."""
+        section_files = {} if self.section is None else self.section.all_files()
+        return {**section_files, **self._scenario.calibration.all_files()}
 
     def path(self, copy: str) -> Path:
-        """Return a file: its copy in the run folder, or where it is given before that."""
-        return self.places[copy] if self._folder is None else self._folder / copy
+        """Return the path of a file: that of its copy, or of the original before `prepare`.
+
+        Parameters
+        ----------
+        copy : str
+            The path of the copy inside a run folder.
+        """
+        return self.file_paths[copy] if self._folder is None else self._folder / copy
 
     @property
-    def words(self) -> str:
-        """What is flown or believed."""
+    def description(self) -> str:
+        """What flies or is believed, in words."""
         return str(self.label)
 
     @property
     def origin(self) -> FlownAndBelieved:
-        """The same twice."""
-        return FlownAndBelieved(self.words, self.words, self.differ)
+        """What flies and what the twin believes, in words; here they are the same."""
+        return FlownAndBelieved(self.description, self.description, self.differ)
 
-    def uncertain(self) -> tuple[str, int]:
-        """Return where draws of the parameter come from, in words, and how many there are."""
-        given = self._scenario.calibration
-        return given.source.replace("_", " "), 1 if given.source == "fixed" else given.draws
+    def draw_summary(self) -> tuple[str, int]:
+        """Return where the draws of the parameter come from, in words, and their number."""
+        calibration = self._scenario.calibration
+        return calibration.source.replace("_", " "), calibration.draw_count
 
     def check(self) -> None:
-        """Look at what is given before anything is made; raise what is wrong with it."""
+        """Check the inputs before anything is made; raise an error with the first fault."""
 
     def files(self) -> dict[str, bytes]:
-        """Return what the files hold, by the places of their copies.
+        """Return the contents of the files by the paths of their copies.
 
         Raises
         ------
         MissionInputError
-            One cannot be read.
+            If a file cannot be read.
         """
-        return read_files(self.places)
+        return read_files(self.file_paths)
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Copy what is given into the run folder and make what follows from it; return the hashes.
+        """Copy the files into a run folder, build what follows from them, and return the hashes.
+
+        Parameters
+        ----------
+        folder : Path
+            The run folder.
+        progress : Progress
+            Receives reports on the progress.
 
         Raises
         ------
         MissionInputError
-            A file cannot be read.
+            If a file cannot be read.
         """
         write_members(folder, self.files())
         self._folder = folder
-        hashes = {name: hash_file(folder / copy) for name, copy in HASHED.items() if copy in self.places}
-        return hashes | self._make(progress)
+        hashes = {}
+        for name, copy in HASHED_COPIES.items():
+            if copy in self.file_paths:
+                hashes[name] = hash_file(folder / copy)
+        return hashes | self._build(progress)
 
-    def use(self, folder: Path) -> None:
-        """Take what an earlier `prepare` left in a folder, without making it again."""
+    def use_prepared_folder(self, folder: Path) -> None:
+        """Use the files that an earlier `prepare` left in a run folder."""
         self._folder = folder
 
-    def _make(self, progress: Progress) -> dict[str, str]:
-        """Make what follows from the copies; return its hashes."""
+    def _build(self, progress: Progress) -> dict[str, str]:
+        """Build what follows from the copied files; return the hashes of it by name."""
         return {}
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the calibrated parameter."""
-        found = draw_parameter(self._scenario.calibration, seed, self.model)
-        self._means[found.name] = found.mean
-        return found
+        draws = draw_parameter(self._scenario.calibration, seed, self.model)
+        self._drawn_means[draws.name] = draws.mean
+        return draws
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the predicted observations (E, S, U, G)."""
+        """Return the predicted observations.
+
+        Parameters
+        ----------
+        draws : ParameterDraws
+            The E draws of the parameter.
+        model : GraphicalModel
+            The graphical model, which has the S joint states.
+
+        Returns
+        -------
+        (E, S, U, G) array
+            By draw, state, control and sensor, in the SI units of the sensors.
+        """
         raise NotImplementedError
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return what is there at the sensors (E, S, U, G), None where they show it: limits are of that."""
+        """Return the predicted values at the sensors without the effects of the sensors themselves.
+
+        The health limits apply to these. The arguments are those of `observation_table`.
+
+        Returns
+        -------
+        (E, S, U, G) array or None
+            None if they are the predicted observations.
+        """
         return None
 
     def open(self) -> Asset:
-        """Return the asset at its start."""
+        """Return the asset in its initial state."""
         raise NotImplementedError
 
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write the field under an estimated state and a control; return whether there is one."""
+    def write_field(
+        self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
+    ) -> bool:
+        """Write the field of displacement and strain, if the source has one.
+
+        Parameters
+        ----------
+        path : Path
+            The file to write.
+        state : mapping of str to float
+            The estimated value of each state factor, SI.
+        control : mapping of str to float
+            The value of each control input, SI.
+
+        Returns
+        -------
+        bool
+            Whether there is a field.
+        """
         return False
 
 
 class AssetBelief(BeliefSection):
-    """The twin asks what is flown itself what to expect: for assets without memory."""
+    """The twin predicts with what flies itself; this is for assets without a memory."""
 
     kind: Literal["asset"] = "asset"
 
     def source(self, scenario: Scenario, flown: AssetSource) -> AssetSource:
-        """Return what is flown."""
+        """Return the source of what flies."""
         return flown
 
 
 class PairedSource(AssetSource):
-    """The asset of one source; everything that the twin knows from another.
+    """The asset of one source, and the predictions of another.
 
     Parameters
     ----------
     asset : AssetSource
-        What is flown.
+        The source of what flies.
     model : AssetSource
-        Parameter draws, predicted observations and field.
+        The source of parameter draws, predicted observations and field.
     differ : bool
         Whether the two are known to be different models.
     """
 
     def __init__(self, asset: AssetSource, model: AssetSource, *, differ: bool = True) -> None:
-        self._asset, self._model, self.differ = asset, model, differ
-        told = ("uncertain", "draws", "observation_table", "structural_table", "write_field")
-        for name, source in {"open": asset, **dict.fromkeys(told, model)}.items():
-            setattr(self, name, getattr(source, name))
+        self._asset = asset
+        self._believed = model
+        self.differ = differ
 
     @property
     def origin(self) -> FlownAndBelieved:
-        """Asset of the one, model of the other."""
-        asset, model = self._asset.origin, self._model.origin
-        return FlownAndBelieved(asset.asset, model.model, differ=self.differ or asset.differ or model.differ)
+        """What flies, of the one source, and what the twin believes, of the other."""
+        asset = self._asset.origin
+        model = self._believed.origin
+        differ = self.differ or asset.differ or model.differ
+        return FlownAndBelieved(asset.asset, model.model, differ)
 
     def check(self) -> None:
-        """Check both."""
+        """Check both sources."""
         self._asset.check()
-        self._model.check()
+        self._believed.check()
 
     def files(self) -> dict[str, bytes]:
-        """Return the files of both."""
-        return {**self._asset.files(), **self._model.files()}
+        """Return the contents of the files of both sources by the paths of their copies."""
+        return {**self._asset.files(), **self._believed.files()}
 
     def prepare(self, folder: Path, progress: Progress) -> dict[str, str]:
-        """Prepare both; return the hashes of both."""
-        hashes = {**self._asset.prepare(folder, progress), **self._model.prepare(folder, progress)}
-        flown = hashes.get(FLOWN_DESIGN_HASH)
-        self.differ = self.differ or (flown is not None and hashes.get("design", flown) != flown)
+        """Prepare both sources in a run folder; return the hashes of both."""
+        asset_hashes = self._asset.prepare(folder, progress)
+        hashes = {**asset_hashes, **self._believed.prepare(folder, progress)}
+        flown_hash = hashes.get(FLOWN_DESIGN_HASH)
+        if flown_hash is not None and hashes.get("design", flown_hash) != flown_hash:
+            self.differ = True
         return hashes
+
+    def open(self) -> Asset:
+        """Return the asset in its initial state."""
+        return self._asset.open()
+
+    def draw_summary(self) -> tuple[str, int]:
+        """Return where the draws of the believed model come from, in words, and their number."""
+        return self._believed.draw_summary()
+
+    def draws(self, seed: int) -> ParameterDraws:
+        """Return draws of the parameter of the believed model."""
+        return self._believed.draws(seed)
+
+    def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
+        """Return the predicted observations (E, S, U, G) of the believed model."""
+        return self._believed.observation_table(draws, model)
+
+    def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
+        """Return the values at the sensors (E, S, U, G) of the believed model."""
+        return self._believed.structural_table(draws, model)
+
+    def write_field(
+        self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
+    ) -> bool:
+        """Write the field of the believed model; return whether there is one."""
+        return self._believed.write_field(path, state, control)
 
 
 class WatchedSection(AssetSection):
-    """A scenario without `[asset]`: it is watched, and not flown."""
+    """The asset of a scenario without `[asset]`: it is watched, and no model of it flies."""
 
     kind: Literal["watched"] = "watched"
 
     def source(self, scenario: Scenario) -> "WatchedSource":
-        """Return what can be watched only."""
+        """Return a source that refuses to fly."""
         return WatchedSource()
 
 
 class WatchedSource:
-    """What stands for a real asset; whatever a flight would ask of it ends in one sentence."""
+    """The source of a real asset; any use of it by a flight raises an error."""
 
     def __getattr__(self, name: str) -> NoReturn:
-        if name.startswith("__"):
+        if name.startswith("__"):  # Python looks for methods such as `__deepcopy__`
             raise AttributeError(name)
-        raise MissionInputError(said("assets.no_asset"))
-
-
-FLOWN_DESIGN_HASH = "flown_design"
-"""Under which a source that packs a wing tells the hash of its design; that of the model is `design`."""
-
-
-BINDING_COPY = "asset/binding.toml"
-PATCH_COPY = "asset/patch.json"
-MODEL_PATCH_COPY = "asset/model_patch.json"
-LIBRARY_COPY = "asset/UAVconfig.json"
-OBSERVATIONS_COPY = "asset/observation_library.nc"
-SSP_COPY = "asset/system.ssp"
-HASHED = {
-    "binding": BINDING_COPY,
-    "calibration": CALIBRATION_COPY,
-    "patch": PATCH_COPY,
-    "model_patch": MODEL_PATCH_COPY,
-    "observation_library": OBSERVATIONS_COPY,
-    "ssp": SSP_COPY,
-    "strain_library": LIBRARY_COPY,
-}
-"""Files whose hashes a run tells, and where their copies stand in its folder."""
+        raise MissionInputError(NO_ASSET)
 
 
 def read_files(files: Mapping[str, Path]) -> dict[str, bytes]:
-    """Return what files hold, by the places of their copies in a run folder.
+    """Return the contents of files by the paths of their copies inside a run folder.
 
     Raises
     ------
     MissionInputError
-        One cannot be read.
+        If a file cannot be read.
     """
     return {copy: read_bytes(path, MissionInputError) for copy, path in files.items()}

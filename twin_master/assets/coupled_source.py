@@ -13,6 +13,7 @@ from fmu_asset.companions import COMPANION_NAMES
 from fmu_asset.coupling.structure import (
     Component,
     ComponentSetting,
+    Connection,
     Connector,
     SystemStructure,
     expand_connection,
@@ -23,13 +24,15 @@ from reporting.toml_file import Fault, Number, Positive
 from twin_master.assets.asset_source import BINDING_COPY, SSP_COPY
 from twin_master.assets.fmu_source import FmuSection, FmuSource, Session
 from twin_master.errors import MissionInputError
+from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, Count, FileSection, Flag, Section, named_once
+from twin_master.scenario.section import Count, Flag, Section, repeated_name_fault
 
 if TYPE_CHECKING:
     from fmu_asset.coupling.wiring import Wiring
 
 COMPONENT_FOLDER = "asset/components"
+"""Folder of the FMUs of the components inside a run folder."""
 
 
 class ComponentSection(FileSection):
@@ -44,26 +47,33 @@ class ComponentSection(FileSection):
     """By the FMU's names and in its units; `gain[{1..4}]` stands for four of them."""
 
     def copies(self) -> Mapping[str, str]:
-        """Return where the copies of FMU and design stand in a run folder."""
+        """Return the paths of the copies of FMU and design inside a run folder."""
         stem = f"{COMPONENT_FOLDER}/{self.name}"
         return {"fmu": f"{stem}.fmu", "design": f"{stem}.toml"}
 
     @property
     def design_path(self) -> Path:
-        """The design that the component is packed of."""
+        """The file of the design from which the component is packed."""
         return self.all_files()[self.copies()["design"]]
 
     def _is_shipped(self, key: str, name: str) -> bool:
-        return name in COMPANION_NAMES if key == "fmu" else super()._is_shipped(key, name)
+        """Return whether a key holds the name of a companion, or of a shipped design."""
+        if key == "fmu":
+            return name in COMPANION_NAMES
+        return super()._is_shipped(key, name)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield other than one source."""
-        both = (self.fmu is None) == (self.design is None)
-        yield both, f"the component `{self.name}` needs one of `fmu` and `design`"
+        """Yield the possible faults, each with whether it is there: no FMU, or two."""
+        has_fmu = self.fmu is not None
+        has_design = self.design is not None
+        yield (
+            has_fmu == has_design,
+            f"the component `{self.name}` needs one of `fmu` and `design`",
+        )
 
 
 class ConnectionSection(Section):
-    """What flows from one FMU of a coupled asset to another, or to and from the asset itself."""
+    """A connection between two FMUs of a coupled asset, or between one and the asset itself."""
 
     source: Annotated[str, Field(min_length=1)]
     target: Annotated[str, Field(min_length=1)]
@@ -73,7 +83,7 @@ class ConnectionSection(Section):
 
 
 class SeveralSection(FmuSection):
-    """What is said of several FMUs, wherever they come from."""
+    """The keys of an asset of several FMUs."""
 
     algorithm: Literal["gauss_seidel", "jacobi"] = "gauss_seidel"
     iterations: Count = 1
@@ -81,36 +91,40 @@ class SeveralSection(FmuSection):
 
 
 class SspSection(SeveralSection):
-    """Several FMUs, joined by an SSP file."""
+    """Several FMUs that an SSP file joins."""
 
     kind: Literal["ssp"] = "ssp"
     file: str
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": SSP_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": SSP_COPY}
 
     def source(self, scenario: Scenario) -> "SspSource":
-        """Return the system of the file."""
+        """Return the source of the system in the file."""
         return SspSource(scenario, self)
 
 
 class CoupledSection(SeveralSection):
-    """Several FMUs, joined here."""
+    """Several FMUs that the scenario joins."""
 
     kind: Literal["coupled"] = "coupled"
     component: Annotated[tuple[ComponentSection, ...], Field(min_length=1)]
     connection: tuple[ConnectionSection, ...] = ()
 
     def all_files(self) -> dict[str, Path]:
-        """Return the files of the components too, but for shipped ones, which are packed anew."""
-        found = super().all_files()
-        for component in self.component:
-            found |= {component.copies()[key]: Path(path) for key, path in component.own_files().items()}
-        return found
+        """Return all files, by the paths of their copies inside a run folder.
 
-    def moved(self, folder: Path) -> Self:
-        """Return the table with its relative paths from a folder."""
-        components = tuple(component.moved(folder) for component in self.component)
-        return super().moved(folder).model_copy(update={"component": components})
+        The shipped files of components are left out: these components are packed in the run folder.
+        """
+        files = super().all_files()
+        for component in self.component:
+            for key, path in component.user_files().items():
+                files[component.copies()[key]] = Path(path)
+        return files
+
+    def with_paths_from(self, folder: Path) -> Self:
+        """Return the table with its relative paths joined to a folder."""
+        components = tuple(component.with_paths_from(folder) for component in self.component)
+        return super().with_paths_from(folder).model_copy(update={"component": components})
 
     def portable(self) -> FileSection:
         """Return the table with the paths of the copies inside a run folder."""
@@ -118,13 +132,14 @@ class CoupledSection(SeveralSection):
         return super().portable().model_copy(update={"component": components})
 
     def source(self, scenario: Scenario) -> "CoupledSource":
-        """Return the FMUs together."""
+        """Return the source of the coupled FMUs."""
         return CoupledSource(scenario, self)
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what an FMU has, and names that come twice."""
+        """Yield the possible faults, each with whether it is there: names of components."""
         yield from super().faults()
-        yield named_once("component", [component.name for component in self.component])
+        names = [component.name for component in self.component]
+        yield repeated_name_fault("component", names)
 
 
 class SeveralSource(FmuSource):
@@ -133,34 +148,49 @@ class SeveralSource(FmuSource):
     Parameters
     ----------
     scenario : Scenario
-        What is flown.
+        The scenario.
     section : SeveralSection
-        Its table `asset`; variables of the binding are connectors of the system, or `component.variable`.
+        Its table `asset`. The variables of the binding are connectors of the system, or
+        `component.variable`.
     """
 
+    section: SeveralSection
+
     def wiring(self) -> "Wiring":
-        """Return the system as it is flown, once prepared."""
+        """Return the system of the FMUs, once they are prepared."""
         raise NotImplementedError
 
-    def _packed(self, progress: Progress) -> dict[str, Path]:
-        """Pack what is not an FMU yet; return what is flown, by the names of the hashes."""
+    def _pack_fmus(self, progress: Progress) -> dict[str, Path]:
+        """Pack the components that are no FMUs yet; return all FMUs by the names of the hashes."""
         return {}
 
-    def _make(self, progress: Progress) -> dict[str, str]:
-        hashes = {name: hash_file(file) for name, file in self._packed(progress).items()}
-        # What does not fit is said before anything is flown.
-        self._session(self.binding(), self.parameters()).close()
+    def _build(self, progress: Progress) -> dict[str, str]:
+        """Pack the FMUs and check that they fit together; return their hashes."""
+        fmus = self._pack_fmus(progress)
+        hashes = {name: hash_file(fmu) for name, fmu in fmus.items()}
+        self._open_session(self.binding(), self.parameters()).close()
         return hashes
 
-    def _session(
+    def _open_session(
         self, binding: Binding, parameters: Mapping[str, float], wiring: "Wiring | None" = None
     ) -> "Session":
-        """Join the system as it is flown, or another one."""
+        """Return the coupled FMUs, ready to be started.
+
+        The system is that of `wiring()`, or the given one.
+        """
         from fmu_asset.coupling.asset import CoupledAsset
 
-        keys = ("algorithm", "iterations", "tolerance", "isolated", "step_timeout")
-        said = {key: getattr(self.section, key) for key in keys}
-        return CoupledAsset(wiring or self.wiring(), binding, parameters=parameters, **said)
+        section = self.section
+        return CoupledAsset(
+            wiring or self.wiring(),
+            binding,
+            algorithm=section.algorithm,
+            iterations=section.iterations,
+            tolerance=section.tolerance,
+            isolated=section.isolated,
+            step_timeout=section.step_timeout,
+            parameters=parameters,
+        )
 
 
 class SspSource(SeveralSource):
@@ -169,19 +199,27 @@ class SspSource(SeveralSource):
     label = "system of an SSP file"
 
     def wiring(self, folder: Path | None = None) -> "Wiring":
-        """Return the system as it is flown, once prepared, or with its FMUs in a folder."""
+        """Return the system of the file.
+
+        Parameters
+        ----------
+        folder : Path, optional
+            The folder into which the FMUs are extracted; by default that of the run.
+        """
         from fmu_asset.ssp.check import join_ssp
         from fmu_asset.ssp.reader import read_ssp
 
         return join_ssp(read_ssp(self.path(SSP_COPY), folder or self.path(COMPONENT_FOLDER)))
 
-    def _fitted(self, binding: Binding, folder: Path) -> Binding:
+    def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding, after it is checked with the system of the file."""
         from fmu_asset.ssp.check import left_out_sentence
 
-        wiring = self.wiring(folder)
-        if sentence := left_out_sentence(wiring, self.path(SSP_COPY)):
+        wiring = self.wiring(scratch)
+        sentence = left_out_sentence(wiring, self.path(SSP_COPY))
+        if sentence:
             raise MissionInputError(sentence)
-        self._session(binding, self.parameters(), wiring)
+        self._open_session(binding, self.parameters(), wiring)
         return binding
 
 
@@ -191,75 +229,111 @@ class CoupledSource(SeveralSource):
     section: CoupledSection
 
     @property
-    def words(self) -> str:
-        """How many there are."""
+    def description(self) -> str:
+        """The number of FMUs, in words."""
         return f"{len(self.section.component)} coupled FMUs"
 
-    def _fitted(self, binding: Binding, folder: Path) -> Binding:
+    def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding, after it is checked with the FMUs if none must be packed."""
         from fmu_asset.coupling.wiring import Wiring
 
         components = self.section.component
         for component in components:
             if component.design not in (None, CALIBRATED_DESIGN_NAME):
                 load_design(component.design_path)
-        if all(component.design is None for component in components):
-            files = {component.name: _given_fmu(component, folder) for component in components}
-            self._session(binding, self.parameters(), Wiring(self._structure(files)))
+        needs_packing = any(component.design is not None for component in components)
+        if needs_packing:
+            # Packing takes too long for a check. Components and connections are checked with a
+            # path in the place of each FMU.
+            self._system_structure({component.name: scratch for component in components})
         else:
-            self._structure({component.name: folder for component in components})
+            fmus = {
+                component.name: _fmu_of_file_or_companion(component, scratch)
+                for component in components
+            }
+            self._open_session(binding, self.parameters(), Wiring(self._system_structure(fmus)))
         return binding
 
-    def _packed(self, progress: Progress) -> dict[str, Path]:
+    def _pack_fmus(self, progress: Progress) -> dict[str, Path]:
+        """Pack the components that are no FMUs yet; return all FMUs by the names of the hashes."""
+        fmus = {}
         with progress.stage("Packing the FMUs"):
-            return {f"fmu_{part.name}": self._fmu(part, progress) for part in self.section.component}
+            for component in self.section.component:
+                fmus[f"fmu_{component.name}"] = self._pack_fmu(component, progress)
+        return fmus
 
-    def _fmu(self, component: ComponentSection, progress: Progress) -> Path:
-        """Return the FMU of a component in the run folder; packed if it is not there."""
+    def _pack_fmu(self, component: ComponentSection, progress: Progress) -> Path:
+        """Return the FMU of a component in the run folder; it is packed unless it is there."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
-        target = self.path(component.copies()["fmu"])
-        if target.exists():
-            return target
+        fmu = self.path(component.copies()["fmu"])
+        if fmu.exists():
+            return fmu
         if component.design is None:
-            return _given_fmu(component, target.parent)
-        options = {}
+            return _fmu_of_file_or_companion(component, fmu.parent)
         if component.design == CALIBRATED_DESIGN_NAME:
             from calibration.result.file import load_calibration, tailoring
 
-            wing = load_calibration(Path(self._scenario.calibration.file or ""))
-            design, options = wing.wing_design, tailoring(wing)
+            calibration = load_calibration(Path(self._scenario.calibration.file or ""))
+            design = calibration.wing_design
+            pack_wing(design, fmu, replace=True, progress=progress, **tailoring(calibration))
         else:
             design = load_design(component.design_path)
-        pack_wing(design, target, replace=True, progress=progress, **options)
-        return target
+            pack_wing(design, fmu, replace=True, progress=progress)
+        return fmu
 
     def wiring(self) -> "Wiring":
-        """Return the system as it is flown, once prepared."""
+        """Return the system of the FMUs, once they are prepared."""
         from fmu_asset.coupling.wiring import Wiring
 
-        files = {component.name: component.copies()["fmu"] for component in self.section.component}
-        return Wiring(self._structure({name: self.path(copy) for name, copy in files.items()}))
+        fmus = {}
+        for component in self.section.component:
+            fmus[component.name] = self.path(component.copies()["fmu"])
+        return Wiring(self._system_structure(fmus))
 
-    def _structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
-        """Return the system of the scenario's components and connections."""
-        asset = self.section
-        names = [component.name for component in asset.component]
-        connections = tuple(
-            connection
-            for entry in asset.connection
-            for connection in expand_connection(**entry.model_dump(), components=names)
+    def _system_structure(self, fmus: Mapping[str, Path]) -> SystemStructure:
+        """Return the system of the components and connections of the scenario.
+
+        Parameters
+        ----------
+        fmus : mapping of str to Path
+            The file of each component's FMU, by the name of the component.
+        """
+        names = [component.name for component in self.section.component]
+        connections: list[Connection] = []
+        for entry in self.section.connection:
+            connections += expand_connection(**entry.model_dump(), components=names)
+        components = []
+        for section in self.section.component:
+            settings = _component_settings(section)
+            component = Component(section.name, fmus[section.name], settings, section.substeps)
+            components.append(component)
+        return SystemStructure(
+            self._scenario.mission.name,
+            tuple(components),
+            _system_connectors(connections),
+            tuple(connections),
         )
-        # A connector of the system is an output where something comes to it, and an input where it gives.
-        connectors = dict.fromkeys(
-            [Connector(c.target.variable, "output") for c in connections if not c.target.component]
-            + [Connector(c.source.variable, "input") for c in connections if not c.source.component]
-        )
-        components = tuple(Component(c.name, fmus[c.name], _settings(c), c.substeps) for c in asset.component)
-        return SystemStructure(self._scenario.mission.name, components, tuple(connectors), connections)
 
 
-def _given_fmu(component: ComponentSection, folder: Path) -> Path:
-    """Return the FMU of a component that is a file or a companion, packed in the folder."""
+def _system_connectors(connections: list[Connection]) -> tuple[Connector, ...]:
+    """Return the connectors of the system itself, each once: first its outputs, then its inputs.
+
+    A connection whose target has no component leads to an output of the system; one whose source
+    has none comes from an input.
+    """
+    outputs = []
+    inputs = []
+    for connection in connections:
+        if not connection.target.component:
+            outputs.append(Connector(connection.target.variable, "output"))
+        if not connection.source.component:
+            inputs.append(Connector(connection.source.variable, "input"))
+    return tuple(dict.fromkeys([*outputs, *inputs]))
+
+
+def _fmu_of_file_or_companion(component: ComponentSection, folder: Path) -> Path:
+    """Return the FMU of a component: its file, or a companion that is packed in a folder."""
     from fmu_asset.companions.build import companion_bytes
 
     assert component.fmu is not None
@@ -268,7 +342,8 @@ def _given_fmu(component: ComponentSection, folder: Path) -> Path:
     return atomic_write_bytes(folder / f"{component.name}.fmu", companion_bytes(component.fmu))
 
 
-def _settings(component: ComponentSection) -> dict[str, ComponentSetting]:
+def _component_settings(component: ComponentSection) -> dict[str, ComponentSetting]:
+    """Return the parameters of a component by name; patterns are expanded."""
     settings: dict[str, ComponentSetting] = {}
     where = f"the component `{component.name}`"
     for pattern, value in component.parameters.items():

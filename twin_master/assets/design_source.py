@@ -1,16 +1,18 @@
-"""A wing: its design, or that inside a calibration file, packed as the asset or believed as a model.
+"""A wing from its design or from a calibration file: packed as the asset, or believed as a model.
 
-It is a structure whose mesh follows from its design, and can carry effects.
+A wing is a structure whose mesh follows from its design, and it can carry effects.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, PointMass, PortForce, SensorDrift
 from fe.runtime.state import wing_input_names
+from fe.runtime.wing_rows import OVERHANG
 from fe.structure.tables import StructureDesign
 from fe.wing.design import WingDesign, load_design, wing_structure
 from fmu_asset.client.binding import Binding
@@ -21,54 +23,57 @@ from twin_master.assets.asset_source import (
     MODEL_PATCH_COPY,
     PATCH_COPY,
     AssetSource,
-    asked_table,
+    table_of_observations,
 )
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection
-from twin_master.assets.parameter import (
-    OWN_OF_WING,
-    ParameterDraws,
-    check_calibration,
-)
-from twin_master.assets.reduced_model import NamedStructure, ReducedModelSource
+from twin_master.assets.parameter import WING_CALIBRATION, ParameterDraws, check_calibration
+from twin_master.assets.reduced_model import Advice, NamedStructure, ReducedModelSource
 from twin_master.assets.structure_source import StructureFmuSource
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, BeliefSection
+from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, BeliefSection
+from twin_master.scenario.mission import CALIBRATION_COPY
+from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     from calibration.result.record import Calibration
+    from fe.runtime.patch import Primitive
     from fe.runtime.patch_arrays import PatchArrays
     from fe.runtime.reduced import ReducedModel
-    from fmu_asset.packing.patch_file import PatchFile
+    from fmu_asset.packing.patch_file import PatchFile, PatchFileEffect
 
-DESIGN_COPY, FLOWN_DESIGN_COPY = "asset/design.toml", "asset/flown_design.toml"
+DESIGN_COPY = "asset/design.toml"
+"""The design that the twin believes, inside a run folder."""
+FLOWN_DESIGN_COPY = "asset/flown_design.toml"
+"""The design that flies, inside a run folder."""
+_ASK_ASSET = "set `belief.kind` to `asset` to ask what is flown itself"
 
 
 class DesignSection(FmuSection):
-    """The FMU that is packed of a wing design."""
+    """The FMU that is packed from a wing design."""
 
     kind: Literal["design", "calibration"] = "design"
     design: str
     patch: str | None = None
-    """A patch file: missing effects that the FMU carries, switched on from the start unless `parameters` says
-    otherwise. The twin does not know of them."""
+    """A patch file: missing effects that the FMU carries. They are switched on from the start
+    unless `parameters` says otherwise. The twin does not know them."""
     packed: Literal["python", "compiled"] = "python"
-    """What evaluates the FMU: Python, or C compiled here, which carries no patch."""
+    """What evaluates the FMU: Python, or C that is compiled on this machine and carries no
+    patch."""
 
-    kept: ClassVar[Mapping[str, str]] = {
+    copy_paths: ClassVar[Mapping[str, str]] = {
         "binding": BINDING_COPY,
         "design": FLOWN_DESIGN_COPY,
         "patch": PATCH_COPY,
     }
 
     def source(self, scenario: Scenario) -> "WingFmuSource":
-        """Return the FMU of the wing."""
+        """Return the source of the FMU."""
         return WingFmuSource(scenario, self)
 
 
 class CalibrationSection(DesignSection):
-    """The FMU that is packed of the design inside the calibration file, with its figures."""
+    """The FMU that is packed from the design and the figures of a calibration file."""
 
     kind: Literal["calibration"] = "calibration"
     design: Literal["calibration"] = "calibration"
@@ -82,258 +87,413 @@ class DesignBelief(BeliefSection):
     patch: str | None = None
     """A patch file: effects that the model carries."""
 
-    kept: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"design": DESIGN_COPY, "patch": MODEL_PATCH_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "DesignSource":
-        """Return the model of the wing."""
+        """Return the source of the model."""
         return DesignSource(scenario, section=self)
 
 
 class CalibrationBelief(DesignBelief):
-    """The reduced model of the design inside the calibration file."""
+    """The reduced model of the design inside a calibration file."""
 
     kind: Literal["calibration"] = "calibration"
     design: Literal["calibration"] = "calibration"
 
 
 class _Wing(NamedStructure):
-    """A wing by its design, or by the design of a calibration."""
+    """A wing from its design, or from the design inside a calibration file."""
 
     section: DesignSection | DesignBelief
-    effects: ClassVar = "effects"
-    advice: ClassVar = {
-        "calibration": OWN_OF_WING,
-        **dict.fromkeys(("parameter", "state"), "set `belief.kind` to `asset` to ask what is flown itself"),
-    }
+    effects_label: ClassVar = "effects"
+    """What the effects of the patch are called in the description."""
+    advice: ClassVar = Advice(calibration=WING_CALIBRATION, parameter=_ASK_ASSET, state=_ASK_ASSET)
 
     @cached_property
     def calibration(self) -> "Calibration | None":
-        """The calibration that the wing is tailored to; None for a design of its own.
+        """The calibration whose design the wing has; None if it has a design of its own.
 
         Raises
         ------
         MissionInputError, CalibrationRecordError
-            There is no calibration file, or it is damaged.
+            If there is no calibration file, or it is damaged.
         """
         if self.section.design != CALIBRATED_DESIGN_NAME:
             return None
         from calibration.result.file import load_calibration
 
-        if CALIBRATION_COPY not in self.places:
-            raise MissionInputError("the design of a calibration is asked for, and there is no such file.")
+        if CALIBRATION_COPY not in self.file_paths:
+            raise MissionInputError(
+                "the design of a calibration is asked for, and there is no such file."
+            )
         return load_calibration(self.path(CALIBRATION_COPY))
 
     @cached_property
     def wing_design(self) -> WingDesign:
-        """The design that is given, or that of the calibration file."""
+        """The design of the wing."""
         if self.calibration is not None:
             return self.calibration.wing_design
         return load_design(self.path(self.section.copies()["design"]))
 
     @cached_property
     def design(self) -> StructureDesign:
-        """By name what can be chosen of it, commanded and read."""
-        return wing_structure(self.wing_design.regions, len(self.wing_design.gauges.positions))
+        """The names of the wing's inputs and outputs."""
+        gauge_count = len(self.wing_design.gauges.positions)
+        return wing_structure(self.wing_design.regions, gauge_count)
 
     @property
-    def where(self) -> str:
-        """What has these names, in words."""
+    def full_name(self) -> str:
+        """The design by its name, for messages."""
         return f"the design {self.wing_design.name}"
 
     @property
-    def words(self) -> str:
-        """The FMU or model of the design with its name."""
-        return super().words + ("" if self.patch_path is None else f", with {self.effects}")
+    def description(self) -> str:
+        """The FMU or model, the name of the design, and whether there are effects."""
+        effects = "" if self.patch_path is None else f", with {self.effects_label}"
+        return super().description + effects
 
     @property
-    def hash(self) -> str:
-        """SHA-256 of its design."""
+    def design_hash(self) -> str:
+        """The SHA-256 of the design."""
         return self.wing_design.hash
 
     @property
     def parameter_names(self) -> list[str]:
-        """What may be calibrated: strains tell nothing of the masses."""
-        return [part.name for part in self.design.parameter]
+        """The parameters that may be calibrated; masses are not, as strains do not show them."""
+        return [parameter.name for parameter in self.design.parameter]
 
-    def reduced(self, progress: Progress) -> "ReducedModel":
-        """Return the reduced model, from the cache if it is there."""
+    def load_reduced_model(self, progress: Progress) -> "ReducedModel":
+        """Return the reduced model; it comes from the cache if it is there."""
         from fe.reduction.model_cache import reduced_model
 
         return reduced_model(self.wing_design, progress=progress)
 
     def check_model(self) -> None:
-        """Look at what the reduced model is made of: a design that can be read is right."""
+        """Check nothing: a wing design was checked when it was read."""
 
     @property
     def patch_path(self) -> Path | None:
-        """The patch file, if there is one."""
+        """The patch file; None if there is none."""
         copy = self.section.copies()["patch"]
-        return self.path(copy) if copy in self.places else None
+        return self.path(copy) if copy in self.file_paths else None
 
     @cached_property
     def patch(self) -> "PatchFile | None":
-        """The patch, if there is one, with outputs in the place of channels.
+        """The patch, with the names of outputs instead of channels; None if there is none.
 
         Raises
         ------
         PatchFileError, MissionInputError
-            It is none, the wing cannot carry it, or an effect depends on time or on what happened before and
-            is believed, for which a model has no time.
+            If the file is not a patch, the wing cannot carry it, or an effect that the twin is to
+            believe depends on time or on the loads before.
         """
-        from fe.runtime.patch import LoadPlace, LocalStiffnessLoss, PointMass, PortForce, SensorDrift
-        from fe.runtime.wing_rows import OVERHANG
         from fmu_asset.packing.patch_file import load_patch
 
         if self.patch_path is None:
             return None
-        wing, believed = self.wing_design, isinstance(self.section, DesignBelief)
-        span, patch = wing.planform.semi_span, load_patch(self.patch_path)
+        wing = self.wing_design
+        patch = load_patch(self.patch_path)
+        is_believed = isinstance(self.section, DesignBelief)
         for effect in patch.effects:
-            for item in effect.patch:
-                first, length, beyond = 0.0, 0.0, (1.0 + OVERHANG) * span
-                if isinstance(item, LocalStiffnessLoss):
-                    first, length, beyond = item.start, item.length, span
-                elif isinstance(item, PointMass):
-                    first = item.station
-                elif isinstance(item, LoadPlace):
-                    first = span - wing.tip_load.distance_from_tip + item.along_span
-                if first > beyond or first + length < 0.0:
-                    of = {"effect": effect, "kind": item.kind, "place": first, "span": span}
-                    raise MissionInputError(said("assets.place", where=self.patch_path, **of))
-                drifts = isinstance(item, SensorDrift) and item.exponent != 0.0
-                if believed and (drifts or (isinstance(item, PortForce) and item.hysteretic)):
-                    what = "time" if drifts else "the loads before"
-                    raise MissionInputError(said("assets.remembers", effect=effect, what=what))
+            for primitive in effect.patch:
+                _check_location(effect, primitive, wing, self.patch_path)
+                if is_believed:
+                    _check_has_no_memory(effect, primitive)
         return patch.for_gauges(len(wing.gauges.positions), str(self.patch_path))
 
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write displacement and strain under a state and a control as VTU; return whether there is a field.
+    def write_field(
+        self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
+    ) -> bool:
+        """Write displacement and strain of the wing as VTU, if it has the states and controls.
 
-        Young's modulus is that of the true wing where the scenario tells it, else the mean of the
-        calibration.
+        Young's modulus is that of the true wing if the scenario states it, and otherwise the mean
+        of the calibration.
+
+        Parameters
+        ----------
+        path : Path
+            The file to write.
+        state : mapping of str to float
+            The estimated value of each state factor, SI.
+        control : mapping of str to float
+            The value of each control input, SI.
+
+        Returns
+        -------
+        bool
+            Whether the file was written.
 
         Raises
         ------
         FileNotWrittenError
-            The disk is full or the folder cannot be written.
+            If the disk is full or the folder cannot be written.
         """
         from fe.reduction.model_cache import wing_fields, write_wing_vtu
 
-        name, asset = "young_modulus_factor", self._scenario.asset
-        if not {*state, *control} <= {*wing_input_names(self.wing_design.regions)}:
+        input_names = set(wing_input_names(self.wing_design.regions))
+        if not {*state, *control} <= input_names:
             return False
+        name = "young_modulus_factor"
+        asset = self._scenario.asset
+        mean = self._drawn_means.get(name, 1.0)
+        values = {
+            name: asset.true_parameters.get(name, mean),
+            "tip_force": asset.constant_load.get("tip_force", 0.0),
+            **control,
+        }
         wing = wing_fields(self.wing_design)
-        e = asset.true_parameters.get(name, self._means.get(name, 1.0))
-        values = {name: e, "tip_force": asset.constant_load.get("tip_force", 0.0), **control}
         write_wing_vtu(path, wing, wing.vector(values, state))
         return True
 
 
+class _SpanLocation(NamedTuple):
+    """Where a change of the model is along the span [m from the root].
+
+    Attributes
+    ----------
+    start : float
+        Its location, or where it begins.
+    length : float
+        Its length; 0 for a point.
+    limit : float
+        How far out it may begin.
+    """
+
+    start: float
+    length: float
+    limit: float
+
+
+def _location_on_span(primitive: "Primitive", wing: WingDesign) -> _SpanLocation | None:
+    """Return where a change of the model is along the span; None if it has no location."""
+    span = wing.planform.semi_span
+    farthest = (1.0 + OVERHANG) * span  # masses and forces may be somewhat beyond the tip
+    if isinstance(primitive, LocalStiffnessLoss):
+        return _SpanLocation(primitive.start, primitive.length, span)
+    if isinstance(primitive, PointMass):
+        return _SpanLocation(primitive.station, 0.0, farthest)
+    if isinstance(primitive, LoadPlace):
+        load_point = span - wing.tip_load.distance_from_tip
+        return _SpanLocation(load_point + primitive.along_span, 0.0, farthest)
+    return None
+
+
+def _check_location(
+    effect: "PatchFileEffect", primitive: "Primitive", wing: WingDesign, patch_path: Path
+) -> None:
+    """Refuse a change of the model at a location that is not on the wing."""
+    location = _location_on_span(primitive, wing)
+    if location is None:
+        return
+    ends_before_root = location.start + location.length < 0.0
+    if location.start > location.limit or ends_before_root:
+        raise MissionInputError(
+            f"{patch_path}: the effect {effect.id!r} has a {primitive.kind} at "
+            f"{location.start:g} m from the root, and the wing is "
+            f"{wing.planform.semi_span:g} m long: give a place on the wing."
+        )
+
+
+def _check_has_no_memory(effect: "PatchFileEffect", primitive: "Primitive") -> None:
+    """Refuse an effect that depends on time or on the loads before.
+
+    The twin predicts each state and control once, without an order in time.
+    """
+    dependence = ""
+    if isinstance(primitive, SensorDrift) and primitive.exponent != 0.0:
+        dependence = "time"
+    elif isinstance(primitive, PortForce) and primitive.hysteretic:
+        dependence = "the loads before"
+    if dependence:
+        raise MissionInputError(
+            f"the effect {effect.id!r} depends on {dependence}, and the twin predicts the readings "
+            "of each state and control once for the whole mission: leave it out of `belief.patch`."
+        )
+
+
 class WingFmuSource(_Wing, StructureFmuSource):
-    """The FMU that is packed of a wing design, with hidden effects where a patch gives some.
+    """The FMU that is packed from a wing design, with hidden effects if there is a patch.
 
     The first reduction of a design takes about twenty seconds; after that it comes from the cache.
     """
 
     label = "FMU of the reduced model"
-    effects = "hidden effects"
+    effects_label = "hidden effects"
     section: DesignSection
 
     def binding(self) -> Binding:
         """Return the binding with an input for each damage region of the design."""
         return super().binding().with_regions(self.wing_design.regions)
 
-    def _check_calibration(self, binding: Binding) -> tuple[str, ...]:
-        from fmu_asset.packing.structure_fmu import check_form
+    def _effect_parameters(self) -> tuple[str, ...]:
+        """Return the names of the parameters that switch and size the effects of the patch."""
         from fmu_asset.slaves.effects import effect_rows
 
+        if self.patch is None:
+            return ()
+        return tuple(variable.name for variable in effect_rows(self.patch.plain, 0, {}))
+
+    def _check_calibration(self, binding: Binding) -> None:
+        """Refuse a form of FMU that cannot be packed here, and a calibration that does not fit."""
+        from fmu_asset.packing.structure_fmu import check_form
+
         check_form(self.section.packed, patched=self.patch_path is not None)
-        given = [] if self.patch is None else self.patch.plain
-        effects = tuple(row.name for row in effect_rows(given, 0, {}))
-        known_names, where = (*binding.parameter, *effects), f"the binding {binding.name}"
-        check_calibration(self._scenario.calibration, known_names, where, advice=OWN_OF_WING)
-        return effects
+        check_calibration(
+            self._scenario.calibration,
+            (*binding.parameter, *self._effect_parameters()),
+            f"the binding {binding.name}",
+            advice=WING_CALIBRATION,
+        )
 
     def _pack(self, progress: Progress) -> None:
+        """Pack the wing, with the figures of its calibration, as the FMU in the run folder."""
         from fmu_asset.packing.structure_fmu import pack_wing
 
-        options = {}
+        options: dict[str, Any] = {}
         if self.calibration is not None:
             from calibration.result.file import tailoring  # takes a second to load
 
             options = tailoring(self.calibration)
         pack_wing(
-            self.wing_design, self.path(FMU_COPY), kind=self.section.packed, patch=self.patch, activate=True,
-            replace=True, progress=progress, **options,
-        )  # fmt: skip
+            self.wing_design,
+            self.path(FMU_COPY),
+            kind=self.section.packed,
+            patch=self.patch,
+            activate=True,
+            replace=True,
+            progress=progress,
+            **options,
+        )
 
 
 class DesignSource(_Wing, ReducedModelSource):
-    """The reduced model of a wing design as what is believed, with effects where a patch gives some."""
+    """The reduced model of a wing design as what is believed, with effects if there is a patch."""
 
     section: DesignBelief
 
     def check_model(self) -> None:
-        """Refuse effects that the twin cannot believe."""
+        """Refuse a patch if other things than strains are observed."""
         role = self._scenario.observation.role
         if self.patch is not None and role != "strain":
-            raise MissionInputError(said("assets.patched_role", role=role))
+            raise MissionInputError(
+                f"with `belief.patch` the twin predicts strains, and `{role}` is observed: leave "
+                "out `belief.patch`."
+            )
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the strains (E, S, U, G)."""
-        return self._strains(draws, model, self.patch)
+        """Return the predicted strains (E, S, U, G) with all effects of the patch."""
+        return self._predict_strains(draws, model, self.patch)
 
     def structural_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float | None:
-        """Return the strains of the structure itself (E, S, U, G); None where no effect is of its gauges."""
-        patch = self.patch
-        kept = None if patch is None else patch.of_structure
-        return None if kept == patch else self._strains(draws, model, kept)
+        """Return the strains of the structure (E, S, U, G), without the effects of its gauges.
 
-    def _strains(self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None") -> Float:
+        Without such effects it is None: the predicted strains are those of the structure.
+        """
+        if self.patch is None:
+            return None
+        structural_patch = self.patch.of_structure
+        if structural_patch == self.patch:
+            return None
+        return self._predict_strains(draws, model, structural_patch)
+
+    def _predict_strains(
+        self, draws: ParameterDraws, model: GraphicalModel, patch: "PatchFile | None"
+    ) -> Float:
         """Return the strains (E, S, U, G) that the twin predicts with the effects of a patch.
 
         Raises
         ------
         PatchFileError, MissionInputError
-            The model cannot carry the patch.
+            If the model cannot carry the patch.
         """
         if patch is None or not patch.effects:
             return super().observation_table(draws, model)
         from fmu_asset.packing.structure_fmu import needed_patch_arrays
         from fmu_asset.slaves.contents import UnacceptableValuesError
 
-        scenario, where = self._scenario, str(self.patch_path)
-        ask = strains_with_effects(self.wing, patch, needed_patch_arrays(self.wing_design, patch))
-        force = scenario.asset.constant_load.get("tip_force", 0.0)
-        before, states = f"the twin's model cannot carry {where}: ", model.states.coordinates
+        scenario = self._scenario
+        patch_arrays = needed_patch_arrays(self.wing_design, patch)
+        predict_strains = strain_predictor(self.prepared_model, patch, patch_arrays)
+        tip_force = scenario.asset.constant_load.get("tip_force", 0.0)
+        tables = []
+        before = f"the twin's model cannot carry {self.patch_path}: "
         with MissionInputError.instead_of(UnacceptableValuesError, before=before):
-            draw = (partial(ask, e, force) for e in draws.values.tolist())
-            return np.array([asked_table(scenario, states, asked) for asked in draw])
+            for young_modulus_factor in draws.values.tolist():
+                predict = partial(predict_strains, young_modulus_factor, tip_force)
+                table = table_of_observations(scenario, model.states.coordinates, predict)
+                tables.append(table)
+        return np.array(tables)
 
 
-def strains_with_effects(
-    wing: "ReducedModel", patch: "PatchFile", arrays: "PatchArrays | None"
-) -> Callable[[float, float, Mapping[str, float], Mapping[str, float]], Float]:
-    """Return what gives the strains (G,) of a wing with the effects of a patch, all of them switched on.
+class StrainPredictor(Protocol):
+    """A function that predicts the strains of a wing with effects."""
 
-    It is asked with the factor of Young's modulus, the tip force [N], the control, and the losses by region.
+    def __call__(
+        self,
+        young_modulus_factor: float,
+        tip_force: float,
+        control: Mapping[str, float],
+        health: Mapping[str, float],
+        /,
+    ) -> Float:
+        """Return the strains (G,).
+
+        Parameters
+        ----------
+        young_modulus_factor : float
+            The factor on Young's modulus.
+        tip_force : float
+            The force at the load point near the tip [N].
+        control : mapping of str to float
+            The value of each control input, SI.
+        health : mapping of str to float
+            The stiffness loss of each region, as a fraction.
+        """
+
+
+def strain_predictor(
+    wing: "ReducedModel", patch: "PatchFile", patch_arrays: "PatchArrays | None"
+) -> StrainPredictor:
+    """Return a function that predicts the strains of a wing with all effects of a patch.
+
+    Parameters
+    ----------
+    wing : ReducedModel
+        The wing.
+    patch : PatchFile
+        The effects.
+    patch_arrays : PatchArrays, optional
+        The wing in the basis for patches; None if the effects do not need it.
     """
     from fmu_asset.slaves.behaviour import StructureBehaviour
     from fmu_asset.slaves.effects import SwitchableEffects, effect_rows, switch_name
     from fmu_asset.slaves.table import structure_table
 
+    # The same code as inside the FMU of the wing.
     effects = patch.plain
-    rows, roles = structure_table(wing, {})
-    behaviour = StructureBehaviour(wing, rows, roles, SwitchableEffects(effects, len(wing.gauges), arrays))
-    on = {switch_name(effect): 1.0 for effect in effects}
-    behaviour.tune({row.name: float(row.start or 0.0) for row in effect_rows(effects, 0, on)}, 0.0)
-    nominal = {row.name: row.start or 0.0 for row in rows}
-    inputs = [row.name for row in rows if row.causality == "input"]
+    gauge_count = len(wing.gauges)
+    variables, roles = structure_table(wing, {})
+    switchable_effects = SwitchableEffects(effects, gauge_count, patch_arrays)
+    behaviour = StructureBehaviour(wing, variables, roles, switchable_effects)
+    switched_on = {switch_name(effect): 1.0 for effect in effects}
+    effect_values = {}
+    for variable in effect_rows(effects, 0, switched_on):
+        effect_values[variable.name] = float(variable.start or 0.0)
+    behaviour.tune(effect_values, 0.0)
+    nominal = {variable.name: variable.start or 0.0 for variable in variables}
+    input_names = [variable.name for variable in variables if variable.causality == "input"]
 
-    def ask(e: float, force: float, control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-        losses = {f"health.{name}": loss for name, loss in health.items()}
-        given = {**nominal, "tip_force": force, **control, **losses}
-        start = {**nominal, "young_modulus_factor": e}
-        return np.array(behaviour.start(start, 0.0, [given[name] for name in inputs])[: len(wing.gauges)])
+    def predict(
+        young_modulus_factor: float,
+        tip_force: float,
+        control: Mapping[str, float],
+        health: Mapping[str, float],
+    ) -> Float:
+        values = {**nominal, "tip_force": tip_force, **control}
+        values |= {f"health.{region}": loss for region, loss in health.items()}
+        inputs = [values[name] for name in input_names]
+        parameters = {**nominal, "young_modulus_factor": young_modulus_factor}
+        outputs = behaviour.start(parameters, 0.0, inputs)
+        return np.array(outputs[:gauge_count])
 
-    return ask
+    return predict

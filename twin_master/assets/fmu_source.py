@@ -1,6 +1,7 @@
-"""An FMU as the asset of a mission: any FMU with a binding, given or packed of a model script."""
+"""An FMU as the asset of a mission: any FMU with a binding, or one that is packed from a script."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar, Literal, Union
 
@@ -24,8 +25,8 @@ from twin_master.assets.asset_source import (
     AssetBelief,
     AssetReading,
     AssetSource,
-    asked_table,
     read_files,
+    table_of_observations,
 )
 from twin_master.assets.parameter import (
     ParameterDraws,
@@ -33,40 +34,44 @@ from twin_master.assets.parameter import (
     check_calibration,
     read_calibration,
 )
-from twin_master.errors import MissionInputError, check_names, said
+from twin_master.errors import MissionInputError, check_names
 from twin_master.network.graphical_model import GraphicalModel
+from twin_master.scenario.kinds import AssetSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import AssetSection, Flag, Name
+from twin_master.scenario.section import Flag, Name
 from twin_master.seeds import generator
 
 if TYPE_CHECKING:
+    from calibration.result.record import Calibration as CalibrationRecord
     from fmu_asset.coupling.asset import CoupledAsset
 
 
 Session = Union[FmiAsset, "CoupledAsset"]
-"""One FMU, or several as one, with the same face."""
+"""One FMU, or several coupled ones; both have the same methods."""
 FMU_COPY = "asset/asset.fmu"
-LARGEST_SEED = 2**31 - 1
-"""Of an FMU's integer parameter."""
+LARGEST_FMU_SEED = 2**31 - 1
+"""The largest value of an integer parameter of an FMU."""
+_RESERVED_NAMES = ("state", "sensor_status", "step", "region", "sensor")
+"""Names that the truth of a run contains already."""
 
 
 class FmuSection(AssetSection):
-    """What is said of any asset that is an FMU, or several."""
+    """The keys of any asset that is one or several FMUs."""
 
     is_fmu: ClassVar[bool] = True
     binding: str
     isolated: Flag = True
     step_timeout: Positive | None = None
-    """Wall-clock limit of a step [s]; otherwise that of the binding."""
+    """Limit of the wall-clock time of a step [s]; by default that of the binding."""
     parameters: dict[str, Number] = Field(default_factory=dict)
     load: dict[str, Number] = Field(default_factory=dict)
     seeds: tuple[Name, ...] = ()
-    """Parameters of the binding that are given a number drawn from the seed of the run."""
+    """Parameters of the binding whose values are drawn from the seed of the run."""
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY}
 
     def faults(self) -> Iterator[Fault]:
-        """Yield parameters that are seeds, too."""
+        """Yield the possible faults, each with whether it is there: parameters that are seeds."""
         for name in self.seeds:
             yield (
                 name in self.parameters,
@@ -75,60 +80,71 @@ class FmuSection(AssetSection):
 
 
 class FmuFileSection(FmuSection):
-    """An FMU, made by whatever tool."""
+    """An FMU from a file, made by any tool."""
 
     kind: Literal["fmu"] = "fmu"
     file: str
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": FMU_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "file": FMU_COPY}
 
     def source(self, scenario: Scenario) -> "FmuSource":
-        """Return the FMU."""
+        """Return the source of the FMU."""
         return FmuSource(scenario, self)
 
 
 class ScriptSection(FmuSection):
-    """A pythonfmu script that is packed as the FMU: a shipped one, or a file."""
+    """A script of pythonfmu, which is packed as an FMU: a shipped one, or a file."""
 
     kind: Literal["script"] = "script"
     script: str
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "script": FMU_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "script": FMU_COPY}
 
     def portable(self) -> FmuFileSection:
-        """Return the FMU that was packed: from then on it is what is flown."""
-        common = {name: getattr(self, name) for name in FmuSection.model_fields if name != "kind"}
-        binding = super().portable().model_dump()["binding"]
-        return FmuFileSection.model_validate(common | {"binding": binding, "file": FMU_COPY})
+        """Return the table of the packed FMU, with the paths of the copies inside a run folder."""
+        common_keys = [name for name in FmuSection.model_fields if name != "kind"]
+        table = {name: getattr(self, name) for name in common_keys}
+        table["binding"] = super().portable().model_dump()["binding"]
+        table["file"] = FMU_COPY
+        return FmuFileSection.model_validate(table)
 
     def source(self, scenario: Scenario) -> "ScriptSource":
-        """Return the FMU of the script."""
+        """Return the source of the FMU."""
         return ScriptSource(scenario, self)
 
 
-InnerRoles = tuple[Mapping[str, str], slice, slice | None]
-"""Where an asset with damage and sensors of its own tells the truth; see `[truth]` of a scenario.
+@dataclass(frozen=True)
+class TruthOutputs:
+    """The outputs in which an asset with damage and sensors of its own reports the truth.
 
-The monitor of each state factor; among the observations of the binding the noise-free one, and where it tells
-whether each sensor is received.
-"""
-_TAKEN = ("state", "sensor_status", "step", "region", "sensor")
-"""What the truth of a run holds already."""
+    Attributes
+    ----------
+    state_monitors : mapping of str to str
+        The monitor of the binding that holds the true value of each state factor, by its name.
+    observation : slice
+        The positions of the values without noise among the observations of the binding.
+    received : slice or None
+        The positions of the values that are 0 for a lost sensor; None if none is lost.
+    """
+
+    state_monitors: Mapping[str, str]
+    observation: slice
+    received: slice | None
 
 
 class FmuAsset(Asset):
-    """An FMU, or several coupled ones, as the mission flies them.
+    """One or several coupled FMUs, as a mission flies them.
 
     Parameters
     ----------
     session : FmiAsset or CoupledAsset
-        The asset, at its start.
+        The FMU or the FMUs, in their initial state.
     observation : slice
-        Where the observed quantity stands among the observations of the binding.
+        The positions of the observed quantity among the observations of the binding.
     load : mapping of str to float
-        Load inputs, the same in every step.
-    inner : InnerRoles, optional
-        Given where damage and sensors are the asset's own.
+        The load inputs, the same in every step.
+    truth_outputs : TruthOutputs, optional
+        Given if the asset has damage and sensors of its own.
     """
 
     def __init__(
@@ -136,45 +152,65 @@ class FmuAsset(Asset):
         session: "Session",
         observation: slice,
         load: Mapping[str, float],
-        inner: InnerRoles | None = None,
+        truth_outputs: TruthOutputs | None = None,
     ) -> None:
-        self._session, self._observation, self._load, self._inner = session, observation, dict(load), inner
-        binding, self._names = session.binding, dict[str, str]()
-        taken = {*binding.control, *binding.observation, *_TAKEN}
-        for name in session.recorded_units:  # stored under a name without `/` that is not taken
-            plain = "".join("_" if c == "/" or not c.isprintable() else c for c in name).strip()
-            while plain in taken or not plain:
-                plain += "_"
-            taken.add(plain)
-            self._names[name] = plain
-        inputs = (*binding.parameter.items(), *binding.control.items())
-        recorded = {self._names[name]: unit for name, unit in session.recorded_units.items()}
-        self.units = {name: scalar.unit for name, scalar in inputs} | recorded
+        self._session = session
+        self._observation = observation
+        self._load = dict(load)
+        self._truth_outputs = truth_outputs
+        binding = session.binding
+        reserved_names = {*binding.control, *binding.observation, *_RESERVED_NAMES}
+        self._stored_names = _stored_names(session.recorded_units, reserved_names)
+        units = {name: entry.unit for name, entry in binding.parameter.items()}
+        units |= {name: entry.unit for name, entry in binding.control.items()}
+        for name, unit in session.recorded_units.items():
+            units[self._stored_names[name]] = unit
+        self.units = units
 
     def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Make one communication step."""
+        """Make one communication step with the control and the health of the step (SI)."""
         observation = self._session.step(control, health, self._load)
         sensed = observation.values[self._observation]
-        extra = {self._names[name]: value for name, value in observation.extra.items()}
-        if self._inner is None:
-            return AssetReading(sensed, extra)
-        monitors, free, received = self._inner
-        state = {name: observation.extra[monitor] for name, monitor in monitors.items()}
-        if received is not None:
-            sensed = np.where(observation.values[received] == 0.0, np.nan, sensed)
-        return AssetReading(observation.values[free], extra, state, sensed)
+        monitors = {self._stored_names[name]: value for name, value in observation.extra.items()}
+        outputs = self._truth_outputs
+        if outputs is None:
+            return AssetReading(sensed, monitors)
+        state = {}
+        for factor, monitor in outputs.state_monitors.items():
+            state[factor] = observation.extra[monitor]
+        if outputs.received is not None:
+            is_lost = observation.values[outputs.received] == 0.0
+            sensed = np.where(is_lost, np.nan, sensed)
+        return AssetReading(observation.values[outputs.observation], monitors, state, sensed)
 
     def save_state(self) -> bytes:
         """Return the state of the FMU."""
         return self._session.save_state()
 
     def restore_state(self, state: bytes) -> None:
-        """Bring the FMU to a saved state."""
+        """Continue from a saved state."""
         self._session.restore_state(state)
 
     def close(self) -> None:
-        """End the worker."""
+        """Close the FMU."""
         self._session.close()
+
+
+def _stored_names(names: Iterable[str], reserved_names: Iterable[str]) -> dict[str, str]:
+    """Return for each name one under which a run can store a variable.
+
+    It has no `/`, which would make a group, and differs from the reserved and from the other names.
+    """
+    used_names = set(reserved_names)
+    stored_names = {}
+    for name in names:
+        characters = ["_" if char == "/" or not char.isprintable() else char for char in name]
+        stored_name = "".join(characters).strip()
+        while not stored_name or stored_name in used_names:
+            stored_name += "_"
+        used_names.add(stored_name)
+        stored_names[name] = stored_name
+    return stored_names
 
 
 class FmuSource(AssetSource):
@@ -183,203 +219,290 @@ class FmuSource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        What is flown.
+        The scenario.
     section : FmuSection
         Its table `asset`.
     """
 
-    label = "FMU"  # it may hold any model, also that of a design: whether they differ is not known
+    # An FMU may hold any model, also that of the believed design, so that it is not known whether
+    # the two differ.
+    label = "FMU"
     section: FmuSection
 
     def binding(self) -> Binding:
-        """Return the binding: where it is given, or its copy once prepared."""
+        """Return the binding: the original before `prepare`, and the copy after it."""
         return load_binding(self.path(BINDING_COPY))
 
     def check(self) -> None:
-        """Read what is given where it is, without copying or starting anything.
+        """Check the files in their original places; nothing is copied or started.
 
         Raises
         ------
         MissionInputError
-            A file cannot be read, or the binding observes another number of values than the scenario.
+            If a file cannot be read, or the binding does not fit the scenario.
         CalibrationRecordError
-            The calibration file is damaged or of another kind, or has no samples of the parameter.
+            If the calibration file is damaged or of another kind, or has no samples of the
+            parameter.
         FmuError, FiniteElementError
-            Binding, FMU, script, design or structure is wrong, or the binding does not fit the FMU.
+            If binding, FMU, script, design or structure is wrong, or the binding does not fit the
+            FMU.
         """
-        scenario, section = self._scenario, self.section
-        found = read_calibration(scenario.calibration)
+        calibration = read_calibration(self._scenario.calibration)
         self.files()
         binding = self.binding()
-        parameters = [*binding.parameter, *self._check_calibration(binding)]
-        rows = (
-            ("control input", scenario.control[0].values, binding.control),
-            ("state", () if scenario.truth.kind == "asset" else scenario.state_names, binding.health),
-            ("load", section.load, binding.load),
-            ("parameter", (*section.parameters, *section.seeds), parameters),
-        )
-        check_names("the scenario has the", f"the binding {binding.name}", rows)
-        try:
-            with scratch_folder() as folder:
-                binding = self._fitted(binding, folder)
-        except FmuInputError as error:
-            means = calibrated_means(scenario.calibration)
-            own = [f"{name} = {mean:.6g}" for name, mean in means.items() if name not in section.parameters]
-            if not own:
-                raise
-            raise MissionInputError(said("assets.calibrated", error=error, own=", ".join(own))) from error
-        self._observed(binding)
-        self._inner_roles(binding)
-        told = scenario.truth.state
-        for factor in scenario.state:
-            of = binding.monitor[told[factor.name]] if told else binding.health[factor.name]
-            _check_unit(binding, f"the state {factor.name}", of.unit, "state.unit", factor.unit)
-        for prior in found.priors if found is not None and found.design is None else ():
-            if prior.name in binding.parameter:
-                unit = binding.parameter[prior.name].unit
-                _check_unit(binding, f"the parameter {prior.name}", unit, "calibration.file", prior.unit)
+        self._check_calibration(binding)
+        self._check_names(binding)
+        binding = self._fit_binding(binding)
+        self._observation_slice(binding)
+        self._find_truth_outputs(binding)
+        self._check_state_units(binding)
+        if calibration is not None and calibration.design is None:
+            _check_calibrated_units(binding, calibration)
 
-    def _check_calibration(self, binding: Binding) -> tuple[str, ...]:
-        """Check the calibration; return what parameters there are beside those of the binding."""
-        believed = isinstance(self._scenario.belief, AssetBelief)
-        design_hash = packed_design_hash(self.path(FMU_COPY)) if believed and FMU_COPY in self.places else ""
+    def _check_calibration(self, binding: Binding) -> None:
+        """Refuse a calibration file that does not fit the FMU."""
+        calibration = self._scenario.calibration
+        believes_fmu = isinstance(self._scenario.belief, AssetBelief)
+        design_hash = ""
+        if believes_fmu and FMU_COPY in self.file_paths:
+            design_hash = packed_design_hash(self.path(FMU_COPY))
         where = f"the binding {binding.name}"
-        check_calibration(self._scenario.calibration, binding.parameter, where, design_hash=design_hash)
+        check_calibration(calibration, binding.parameter, where, design_hash=design_hash)
+
+    def _effect_parameters(self) -> tuple[str, ...]:
+        """Return the names of the FMU's parameters of effects, which the binding does not have."""
         return ()
 
-    def _fitted(self, binding: Binding, folder: Path) -> Binding:
-        """Return the binding as the FMU fits it: only with that it is known how many values an array has."""
+    def _check_names(self, binding: Binding) -> None:
+        """Refuse names of the scenario that the binding does not have."""
+        scenario = self._scenario
+        section = self.section
+        states = () if scenario.truth.kind == "asset" else scenario.state_names
+        given_parameters = (*section.parameters, *section.seeds)
+        known_parameters = (*binding.parameter, *self._effect_parameters())
+        names_by_sort = (
+            ("control input", scenario.control[0].values, binding.control),
+            ("state", states, binding.health),
+            ("load", section.load, binding.load),
+            ("parameter", given_parameters, known_parameters),
+        )
+        check_names("the scenario has the", f"the binding {binding.name}", names_by_sort)
+
+    def _fit_binding(self, binding: Binding) -> Binding:
+        """Return the binding with the lengths of arrays that the FMU has, after both are checked.
+
+        If the FMU refuses a parameter, the error also names those that the calibration sets.
+        """
+        try:
+            with scratch_folder() as scratch:
+                return self._fit_to_fmu(binding, scratch)
+        except FmuInputError as error:
+            calibrated = []
+            for name, mean in calibrated_means(self._scenario.calibration).items():
+                if name not in self.section.parameters:
+                    calibrated.append(f"{name} = {mean:.6g}")
+            if not calibrated:
+                raise
+            raise MissionInputError(
+                f"{error} The calibration has {', '.join(calibrated)}: give one of what is flown, "
+                "or name the parameter in `asset.parameters`."
+            ) from error
+
+    def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding with the lengths of arrays that the FMU has.
+
+        A subclass may write into the scratch folder, which is removed afterwards.
+        """
         return FmiAsset(self.path(FMU_COPY), binding, parameters=self.parameters()).binding
 
-    def _make(self, progress: Progress) -> dict[str, str]:
-        packed = packed_design_hash(self.path(FMU_COPY))
-        return ({FLOWN_DESIGN_HASH: packed} if packed else {}) | {"fmu": hash_file(self.path(FMU_COPY))}
+    def _check_state_units(self, binding: Binding) -> None:
+        """Refuse state factors with other units than in the binding."""
+        state_monitors = self._scenario.truth.state
+        for factor in self._scenario.state:
+            if state_monitors:
+                bound_unit = binding.monitor[state_monitors[factor.name]].unit
+            else:
+                bound_unit = binding.health[factor.name].unit
+            what = f"the state {factor.name}"
+            _check_unit(binding, what, bound_unit, "state.unit", factor.unit)
+
+    def _build(self, progress: Progress) -> dict[str, str]:
+        """Return the hashes of the FMU, and of the wing design inside it, if there is one."""
+        hashes = {}
+        design_hash = packed_design_hash(self.path(FMU_COPY))
+        if design_hash:
+            hashes[FLOWN_DESIGN_HASH] = design_hash
+        hashes["fmu"] = hash_file(self.path(FMU_COPY))
+        return hashes
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Ask the FMU for its observation (E, S, U, G) at every draw, state and control.
+        """Return the observations (E, S, U, G) of the FMU at every draw, state and control.
 
-        That holds for assets without memory.
+        They are right for an FMU without a memory.
         """
-        scenario, load, rows = self._scenario, self.section.load, []
-        with self._session(self.binding(), self.parameters()) as session:
-            chosen = self._observed(session.binding)
+        load = self.section.load
+        tables = []
+        with self._open_session(self.binding(), self.parameters()) as session:
+            observation = self._observation_slice(session.binding)
+            bound_parameters = session.binding.parameter
 
-            def ask(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
-                return session.step(control, health, load).values[chosen]
+            def predict(control: Mapping[str, float], health: Mapping[str, float]) -> Float:
+                return session.step(control, health, load).values[observation]
 
-            for row, value in enumerate(draws.values):
-                others = {
-                    name: float(values[row])
-                    for name, values in draws.others.items()
-                    if name in session.binding.parameter
-                }
-                session.reset({**self.parameters(), **others, draws.name: float(value)})
-                rows.append(asked_table(scenario, model.states.coordinates, ask))
-        return np.array(rows)
+            for draw, value in enumerate(draws.values):
+                parameters = self.parameters()
+                for name, values in draws.others.items():
+                    if name in bound_parameters:
+                        parameters[name] = float(values[draw])
+                parameters[draws.name] = float(value)
+                session.reset(parameters)
+                states = model.states.coordinates
+                tables.append(table_of_observations(self._scenario, states, predict))
+        return np.array(tables)
 
-    def _observed(self, binding: Binding, role: str = "") -> slice:
-        """Return where a role stands among the observations of the binding, in the units of the scenario."""
-        role = role or self._scenario.observation.role
-        chosen = self._slice(binding, role)
-        bound, given = binding.observation[role].units, self._scenario.observation.sensor_units
-        for number, (there, here) in enumerate(zip(bound, given, strict=True), 1):
-            _check_unit(binding, f"value {number} of `{role}`", there, "observation.unit", here)
-        return chosen
+    def _observation_slice(self, binding: Binding, role: str = "") -> slice:
+        """Return the positions of a role among the observations of the binding.
 
-    def _slice(self, binding: Binding, role: str) -> slice:
+        By default it is the role that the scenario observes. The units must be the scenario's.
+        """
+        observation = self._scenario.observation
+        role = role or observation.role
+        positions = self._slice_of_role(binding, role)
+        bound_units = binding.observation[role].units
+        pairs = zip(bound_units, observation.sensor_units, strict=True)
+        for number, (bound_unit, unit) in enumerate(pairs, 1):
+            what = f"value {number} of `{role}`"
+            _check_unit(binding, what, bound_unit, "observation.unit", unit)
+        return positions
+
+    def _slice_of_role(self, binding: Binding, role: str) -> slice:
+        """Return the positions of a role, which must have as many values as the scenario."""
         expected = self._scenario.observation.count
-        chosen = binding.observation_slice(role)
-        if chosen.stop - chosen.start != expected:
-            came = binding.name, chosen.stop - chosen.start
-            raise MissionInputError(said("assets.width", came=came, role=role, expected=expected))
-        return chosen
+        positions = binding.observation_slice(role)
+        count = positions.stop - positions.start
+        if count != expected:
+            raise MissionInputError(
+                f"the binding {binding.name} observes {count} values of `{role}`, and the scenario "
+                f"expects {expected}."
+            )
+        return positions
 
-    def _inner_roles(self, binding: Binding) -> InnerRoles | None:
-        """Return where the asset tells of its own damage and sensors; None where the truth is the scenario's.
+    def _find_truth_outputs(self, binding: Binding) -> TruthOutputs | None:
+        """Return the outputs in which the asset reports the truth; None if the scenario states it.
 
         Raises
         ------
         MissionInputError
-            The binding has no such monitor or observation.
+            If the binding has no such monitor or observation, or the twin is to believe the asset.
         """
         truth = self._scenario.truth
         if truth.kind != "asset":
             return None
         if isinstance(self._scenario.belief, AssetBelief):
-            raise MissionInputError(said("assets.own_damage"))
-        rows = [("monitor", truth.state.values(), binding.monitor)]
-        check_names("`truth.state` names the", f"the binding {binding.name}", rows)
-        received = None if truth.received is None else self._slice(binding, truth.received)
-        return truth.state, self._observed(binding, truth.observation or ""), received
+            raise MissionInputError(
+                "an asset that carries its own damage cannot be asked what the twin should expect "
+                "of each state: name a model for the twin in the table `belief`."
+            )
+        names_by_sort = [("monitor", truth.state.values(), binding.monitor)]
+        check_names("`truth.state` names the", f"the binding {binding.name}", names_by_sort)
+        received = None
+        if truth.received is not None:
+            received = self._slice_of_role(binding, truth.received)
+        observation = self._observation_slice(binding, truth.observation or "")
+        return TruthOutputs(truth.state, observation, received)
 
     def parameters(self) -> dict[str, float]:
-        """Return the parameters of the scenario, and the numbers drawn for its seeds.
+        """Return the parameters of the FMU.
 
-        What was calibrated from a campaign and the scenario does not name is at its posterior mean.
+        They are those of the scenario, the numbers that are drawn for its seeds, and the posterior
+        means of the other parameters that were calibrated from a campaign.
         """
-        section, seed = self.section, self._scenario.mission.seed
-        drawn = generator(seed, "asset").integers(LARGEST_SEED, size=len(section.seeds))
+        section = self.section
+        random = generator(self._scenario.mission.seed, "asset")
+        drawn = random.integers(LARGEST_FMU_SEED, size=len(section.seeds))
         seeds = {name: float(value) for name, value in zip(section.seeds, drawn, strict=True)}
         return calibrated_means(self._scenario.calibration) | section.parameters | seeds
 
-    def _session(self, binding: Binding, parameters: Mapping[str, float]) -> "Session":
-        section = self.section
+    def _open_session(self, binding: Binding, parameters: Mapping[str, float]) -> "Session":
+        """Return the FMU with a binding and parameters, ready to be started."""
         return FmiAsset(
-            self.path(FMU_COPY), binding, isolated=section.isolated, step_timeout=section.step_timeout,
+            self.path(FMU_COPY),
+            binding,
+            isolated=self.section.isolated,
+            step_timeout=self.section.step_timeout,
             parameters=parameters,
-        )  # fmt: skip
+        )
 
     def open(self) -> Asset:
-        """Return the FMU at its start, with the parameters of the scenario.
+        """Return the FMU in its initial state, with the parameters of the scenario.
 
         Raises
         ------
         FmuError
-            The FMU cannot be flown, or the binding does not fit it.
+            If the FMU cannot be flown, or the binding does not fit it.
         MissionInputError
-            The FMU observes another number of values than the scenario.
+            If the binding does not fit the scenario.
         """
-        session = self._session(self.binding(), self.parameters())
-        chosen, inner = self._observed(session.binding), self._inner_roles(session.binding)
+        session = self._open_session(self.binding(), self.parameters())
+        observation = self._observation_slice(session.binding)
+        truth_outputs = self._find_truth_outputs(session.binding)
         try:
             session.reset()
         except BaseException:
             session.close()
             raise
-        return FmuAsset(session, chosen, self.section.load, inner)
+        return FmuAsset(session, observation, self.section.load, truth_outputs)
 
 
-def _check_unit(binding: Binding, which: str, there: str, key: str, here: str) -> None:
-    """Refuse another unit in a scenario than in a binding; "1" is of any dimension, but not a percentage."""
-    if there == here:
-        return  # pint takes a third of a second to load
-    meant = meaning_of(there)
-    share = meant is not None and not any(meant.exponents) and meant.factor != 1.0
-    if here != "1" or share:
-        units = there, here
-        raise MissionInputError(said("assets.unit", binding=binding, which=which, units=units, key=key))
+def _check_calibrated_units(binding: Binding, calibration: "CalibrationRecord") -> None:
+    """Refuse parameters of a campaign's calibration with other units than in the binding."""
+    for prior in calibration.priors:
+        if prior.name in binding.parameter:
+            bound_unit = binding.parameter[prior.name].unit
+            what = f"the parameter {prior.name}"
+            _check_unit(binding, what, bound_unit, "calibration.file", prior.unit)
+
+
+def _check_unit(binding: Binding, what: str, bound_unit: str, key: str, unit: str) -> None:
+    """Refuse a unit of the scenario that is not the unit in the binding.
+
+    The unit "1", the default of a scenario, fits any quantity but a fraction in another unit, such
+    as a percentage.
+    """
+    if bound_unit == unit:
+        return  # without the third of a second that the library of units takes to load
+    meaning = meaning_of(bound_unit)
+    is_scaled_fraction = (
+        meaning is not None and not any(meaning.exponents) and meaning.factor != 1.0
+    )
+    if unit != "1" or is_scaled_fraction:
+        raise MissionInputError(
+            f"the binding {binding.name} gives {what} in {bound_unit}, and `{key}` of the scenario "
+            f"says {unit}: write the same unit in both."
+        )
 
 
 class ScriptSource(FmuSource):
-    """An FMU that is packed of a model script."""
+    """An FMU that is packed from a model script."""
 
     def files(self) -> dict[str, bytes]:
-        """Return the binding, and the FMU made of the script.
+        """Return the contents of the binding and of the packed FMU by the paths of their copies.
 
         Raises
         ------
         MissionInputError
-            A file cannot be read.
+            If a file cannot be read.
         FmuBuildError
-            The script cannot be packed.
+            If the script cannot be packed.
         """
         from fmu_asset.packing.script import script_fmu
 
-        given = dict(self.places)
-        script = given.pop(FMU_COPY)
-        return {**read_files(given), FMU_COPY: script_fmu(script)[0]}
+        other_files = dict(self.file_paths)
+        script = other_files.pop(FMU_COPY)
+        return {**read_files(other_files), FMU_COPY: script_fmu(script).content}
 
-    def _fitted(self, binding: Binding, folder: Path) -> Binding:
-        packed = folder / "asset.fmu"
+    def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding with the lengths of arrays of the FMU, packed in a scratch folder."""
+        packed = scratch / "asset.fmu"
         packed.write_bytes(self.files()[FMU_COPY])
         return FmiAsset(packed, binding, parameters=self.parameters()).binding

@@ -1,13 +1,14 @@
-"""Observation libraries: what an FMU showed at every draw of a parameter, state and control, as NetCDF.
+"""Observation libraries: what an FMU observed at every draw, state and control, as NetCDF.
 
-`uav-twin library sample` writes them, and a scenario with a `belief` of the kind `library` believes one.
-The published strain library of Kapteyn et al. 2021 has a format of its own, see `strain_library_source`.
+`uav-twin library sample` writes them, and a scenario with a `belief` of the kind `library` believes
+one. The published strain library of Kapteyn et al. 2021 has a format of its own, see
+`strain_library_source`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -19,15 +20,16 @@ from reporting.arrays import Float
 from reporting.errors import DamagedFileError
 from reporting.files import atomic_write_bytes, hash_file
 from reporting.progress import Progress
+from reporting.words import comma_list
 from twin_master.assets.asset_source import OBSERVATIONS_COPY, AssetSource
 from twin_master.assets.design_source import DESIGN_COPY, DesignBelief, DesignSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.errors import InvalidModelError, MissionInputError, said
+from twin_master.errors import InvalidModelError, MissionInputError
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
 from twin_master.network.twin import build_graphical_model
+from twin_master.scenario.kinds import BeliefSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import BeliefSection
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -36,9 +38,13 @@ if TYPE_CHECKING:
 KIND = "uav-twin observation library"
 FORMAT = 1
 RESERVED = ("draw", "control", "sensor", "observation", "parameter_value", "sensor_unit")
-"""Names that a state cannot have, because the file has them already."""
+"""Names that a state cannot have, because the file uses them."""
 
-_SAME = 1e-12
+_RELATIVE_TOLERANCE = 1e-12
+"""Values of control inputs and draws that differ by less are the same."""
+_CONTROL_PREFIX = "control_"
+"""Begins the names of the variables that contain the values of control inputs."""
+_ADVICE = "sample one for this scenario."
 
 
 class ObservationLibrary:
@@ -47,133 +53,226 @@ class ObservationLibrary:
     Parameters
     ----------
     dataset : Dataset
-        Of the layout that `sampled_dataset` makes.
+        A dataset with the layout of `sampled_dataset`.
 
     Attributes
     ----------
-    values : (E, S, U, G)
-        In the units of the sensors.
+    values : (E, S, U, G) array
+        The observations, in the units of the sensors.
     role : str
-        Observation of the binding.
+        The observation of the binding.
     sensors, sensor_units : tuple of str
-        FMU variable and unit of each sensor.
+        The FMU variable and the unit of each sensor.
     states : StateSpace
-        Factors with their levels.
+        The state factors with their levels.
     state_units : tuple of str
-        Unit of each factor.
+        The unit of each state factor.
     controls : tuple of str
-        Names of the controls, labels only.
-    control_values : dict of str to (U,)
-        Value of each control input under each control.
+        The names of the controls, which are labels only.
+    control_values : dict of str to (U,) array
+        The value of each control input under each control.
     parameter : str
         The uncertain parameter; empty without one.
-    draws : (E,)
-        Its values; NaN without one.
+    draws : (E,) array
+        Its values; NaN without a parameter.
     load, parameters : dict of str to float
-        What else was set.
+        The loads and the other parameters of the FMU.
     settling_steps : int
-        Steps from a fresh start at every point; 0: the FMU has no memory, and each point is one step.
+        The number of steps from a fresh start at every point; 0 if the FMU has no memory, and each
+        point is one step.
     fmu_hash : str
-        SHA-256 of the FMU.
+        The SHA-256 of the FMU.
 
     Raises
     ------
     KeyError, ValueError, TypeError, InvalidModelError
-        It is no such dataset.
+        If the dataset has another layout.
     """
 
     def __init__(self, dataset: xr.Dataset) -> None:
-        about = dataset.attrs
-        names: list[str] = json.loads(about["states"])
         self.dataset = dataset
-        self.states = StateSpace(tuple(Factor(name, tuple(dataset[name].values.tolist())) for name in names))
-        self.state_units = tuple(str(dataset[name].attrs["units"]) for name in names)
-        self.role, self.parameter, self.fmu_hash = (
-            str(about[name]) for name in ("role", "parameter", "fmu_sha256")
-        )
-        self.settling_steps = int(about["settling_steps"])
-        self.load: Mapping[str, float] = json.loads(about["load"])
-        self.parameters: Mapping[str, float] = json.loads(about["parameters"])
-        self.sensors, self.sensor_units, self.controls = (
-            tuple(str(text) for text in dataset[name].values) for name in ("sensor", "sensor_unit", "control")
-        )
-        inputs = [f"control_{name}" for name in json.loads(about["control_units"])]
-        for name in (*inputs, *["parameter_value"] * bool(self.parameter)):
-            if not np.all(np.isfinite(dataset[name].values)):
-                raise ValueError(f"a value of {name} is not finite")
-        self.control_values: dict[str, Float] = {
-            name.removeprefix("control_"): np.asarray(dataset[name].values, np.float64) for name in inputs
-        }
-        self.draws: Float = np.asarray(dataset["parameter_value"].values, np.float64)
-        table = dataset["observation"].transpose("draw", *names, "control", "sensor").values
-        self.values: Float = np.array(table, np.float64).reshape(
-            len(table), self.states.size, *table.shape[-2:]
-        )
-        if not np.all(np.isfinite(self.values)):
-            raise ValueError("an observation is not finite")
-        self.values.setflags(write=False)
+        attributes = dataset.attrs
+        state_names: list[str] = json.loads(attributes["states"])
+        factors = [Factor(name, tuple(dataset[name].values.tolist())) for name in state_names]
+        self.states = StateSpace(tuple(factors))
+        self.state_units = tuple(str(dataset[name].attrs["units"]) for name in state_names)
+        self.role = str(attributes["role"])
+        self.parameter = str(attributes["parameter"])
+        self.fmu_hash = str(attributes["fmu_sha256"])
+        self.settling_steps = int(attributes["settling_steps"])
+        self.load: Mapping[str, float] = json.loads(attributes["load"])
+        self.parameters: Mapping[str, float] = json.loads(attributes["parameters"])
+        self.sensors = _read_texts(dataset, "sensor")
+        self.sensor_units = _read_texts(dataset, "sensor_unit")
+        self.controls = _read_texts(dataset, "control")
+        self.control_values: dict[str, Float] = {}
+        for name in json.loads(attributes["control_units"]):
+            self.control_values[name] = _read_finite_values(dataset, f"{_CONTROL_PREFIX}{name}")
+        if self.parameter:
+            self.draws = _read_finite_values(dataset, "parameter_value")
+        else:
+            self.draws = np.asarray(dataset["parameter_value"].values, np.float64)
+        self.values = self._read_observations(state_names)
 
-    def rows_of(self, names: tuple[str, ...], coordinates: Float) -> list[int]:
-        """Return the index of each state (N, F), whose factors are named in any order.
+    def _read_observations(self, state_names: list[str]) -> Float:
+        """Return the observations (E, S, U, G), which cannot be written to."""
+        observation = self.dataset["observation"]
+        # One axis for each state factor, between those of the draw and the control.
+        table = observation.transpose("draw", *state_names, "control", "sensor").values
+        shape = (len(table), self.states.size, *table.shape[-2:])
+        values: Float = np.array(table, np.float64).reshape(shape)
+        if not np.all(np.isfinite(values)):
+            raise ValueError("an observation is not finite")
+        values.setflags(write=False)
+        return values
+
+    def state_indices(self, names: tuple[str, ...], coordinates: Float) -> list[int]:
+        """Return the index of each of several states in the library.
+
+        Parameters
+        ----------
+        names : tuple of str
+            The names of the state factors, in any order.
+        coordinates : (N, F) array
+            The level of each factor in each of N states.
 
         Raises
         ------
         MissionInputError
-            The library has other states, or a level is none of its levels.
+            If the library has other state factors, or lacks a level.
         """
         if set(names) != set(self.states.names):
-            raise MissionInputError(said("assets.states", self=self, names=names))
-        wanted = coordinates[:, [names.index(name) for name in self.states.names]]
-        before, after = "the observation library lacks a state: ", "; sample one for this scenario."
-        with MissionInputError.instead_of(InvalidModelError, before=before, after=after):
-            return [self.states.index(state) for state in wanted]
+            raise MissionInputError(
+                f"the observation library has the states {comma_list(self.states.names)}, and the "
+                f"scenario asks for {comma_list(names)}: {_ADVICE}"
+            )
+        states = coordinates[:, [names.index(name) for name in self.states.names]]
+        before = "the observation library lacks a state: "
+        with MissionInputError.instead_of(InvalidModelError, before=before, after=f"; {_ADVICE}"):
+            return [self.states.index(state) for state in states]
 
-    def control_of(self, name: str, values: Mapping[str, float]) -> int:
-        """Return the index of the control whose inputs have the given values; its name does not matter.
+    def control_index(self, name: str, values: Mapping[str, float]) -> int:
+        """Return the index of the control whose inputs have given values.
+
+        Parameters
+        ----------
+        name : str
+            The name of the control in the scenario, for the message only.
+        values : mapping of str to float
+            The value of each control input.
 
         Raises
         ------
         MissionInputError
-            There is none, or the library has other control inputs.
+            If the library has no such control, or has other control inputs.
         """
         if set(values) != set(self.control_values):
-            raise MissionInputError(said("assets.inputs", self=self, values=values))
-        known, wanted = np.column_stack([self.control_values[key] for key in values]), [*values.values()]
-        if not (same := np.isclose(known, wanted, rtol=_SAME, atol=0.0).all(axis=1)).any():
-            shown = ", ".join(f"{key} = {value:g}" for key, value in values.items())
-            raise MissionInputError(said("assets.control", shown=shown, name=name, self=self))
-        return int(np.argmax(same))
+            raise MissionInputError(
+                "the observation library has the control inputs "
+                f"{comma_list(self.control_values)}, and the scenario sets {comma_list(values)}: "
+                f"{_ADVICE}"
+            )
+        sampled = np.column_stack([self.control_values[key] for key in values])
+        wanted = list(values.values())
+        is_same = np.isclose(sampled, wanted, rtol=_RELATIVE_TOLERANCE, atol=0.0).all(axis=1)
+        if not is_same.any():
+            settings = ", ".join(f"{key} = {value:g}" for key, value in values.items())
+            raise MissionInputError(
+                f"the observation library was not sampled at {settings}, the control {name} of the "
+                f"scenario; it has {comma_list(self.controls)}: {_ADVICE}"
+            )
+        return int(np.argmax(is_same))
 
-    def at_draws(self, name: str, draws: Float) -> Float:
-        """Return the observations (N, S, U, G) at N values of the parameter, linear between the sampled ones.
+    def check_parameter(self, name: str) -> None:
+        """Refuse a parameter that is not the uncertain one of the library.
+
+        A library without an uncertain parameter passes: one draw of any parameter can use it.
 
         Raises
         ------
         MissionInputError
-            The library has another parameter, or a value lies outside the sampled ones.
+            If the library has another parameter.
+        """
+        if self.parameter and name != self.parameter:
+            raise self._other_parameter_error(name)
+
+    def _other_parameter_error(self, name: str) -> MissionInputError:
+        """Return the error that the library has another parameter than the scenario."""
+        return MissionInputError(
+            f"the observation library was sampled over the parameter {self.parameter or 'none'}, "
+            f"and the scenario calibrates {name}: {_ADVICE}"
+        )
+
+    def observations_at(self, name: str, draws: Float) -> Float:
+        """Return the observations at given values of the parameter.
+
+        They are interpolated linearly between the values that were sampled.
+
+        Parameters
+        ----------
+        name : str
+            The parameter.
+        draws : (N,) array
+            Its values.
+
+        Returns
+        -------
+        (N, S, U, G) array
+
+        Raises
+        ------
+        MissionInputError
+            If the library has another parameter, or a value is outside the sampled ones.
         """
         if not self.parameter and len(draws) == 1:
             return self.values
         if name != self.parameter:
-            own = self.parameter or "none"
-            raise MissionInputError(said("assets.parameter", own=own, name=name))
+            raise self._other_parameter_error(name)
         order = np.argsort(self.draws, kind="stable")
         nodes = self.draws[order]
-        slack = _SAME * float(np.abs(nodes).max())
-        if draws.min() < nodes[0] - slack or draws.max() > nodes[-1] + slack:
-            ends = draws.min(), draws.max(), nodes[0], nodes[-1]
-            raise MissionInputError(said("assets.draws", name=name, ends=ends))
-        share = np.array([np.interp(draws, nodes, own) for own in np.eye(len(nodes))])
-        return np.tensordot(share.T, self.values[order], axes=1)
+        tolerance = _RELATIVE_TOLERANCE * float(np.abs(nodes).max())
+        if draws.min() < nodes[0] - tolerance or draws.max() > nodes[-1] + tolerance:
+            raise MissionInputError(
+                f"the draws of {name} reach from {draws.min():.6g} to {draws.max():.6g}, and the "
+                f"observation library from {nodes[0]:.6g} to {nodes[-1]:.6g}: sample one for this "
+                f"scenario and seed, or over a wider range with --grid parameter.{name}=..."
+            )
+        # The weight of a node is the piecewise linear function that is 1 there: (nodes, N).
+        weights = np.array([np.interp(draws, nodes, unit) for unit in np.eye(len(nodes))])
+        return np.tensordot(weights.T, self.values[order], axes=1)
+
+
+def _read_texts(dataset: xr.Dataset, name: str) -> tuple[str, ...]:
+    """Return the values of a variable as texts."""
+    return tuple(str(text) for text in dataset[name].values)
+
+
+def _read_finite_values(dataset: xr.Dataset, name: str) -> Float:
+    """Return the values of a variable; raise `ValueError` if one is not finite."""
+    if not np.all(np.isfinite(dataset[name].values)):
+        raise ValueError(f"a value of {name} is not finite")
+    return np.asarray(dataset[name].values, np.float64)
 
 
 def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
-    """Write a library in one step; equal libraries give equal bytes.
+    """Write a library as a whole; equal libraries give equal bytes.
+
+    Parameters
+    ----------
+    path : Path
+        The NetCDF file.
+    library : ObservationLibrary
+        The library.
+
+    Returns
+    -------
+    Path
+        The file.
 
     Raises
     ------
     FileNotWrittenError
-        The disk is full or the folder cannot be written.
+        If the disk is full or the folder cannot be written.
     """
     return atomic_write_bytes(path, bytes(library.dataset.to_netcdf(engine="h5netcdf")))
 
@@ -181,48 +280,65 @@ def write_observation_library(path: Path, library: ObservationLibrary) -> Path:
 def load_observation_library(path: Path) -> ObservationLibrary:
     """Read a library.
 
+    Parameters
+    ----------
+    path : Path
+        The NetCDF file.
+
     Raises
     ------
     MissionInputError
-        There is no whole library; the sentence says what is wrong.
+        If the file does not exist, or is not a whole library of this version.
     """
     if not path.is_file():
-        raise MissionInputError(said("assets.no_library", path=path))
-    from reporting.netcdf import read_groups  # which loads xarray
+        raise MissionInputError(
+            f"there is no observation library {path}: make it with `uav-twin library sample`."
+        )
+    from reporting.netcdf import read_groups  # it loads xarray
 
     try:
         dataset = read_groups(path).to_dataset()
     except DamagedFileError as error:
-        raise MissionInputError(said("assets.not_whole", path=path)) from error
+        raise MissionInputError(
+            f"{path} is not a whole NetCDF file: sample the library again."
+        ) from error
     if dataset.attrs.get("kind") != KIND or dataset.attrs.get("format") != FORMAT:
-        raise MissionInputError(said("assets.format", path=path, format=FORMAT))
+        raise MissionInputError(
+            f"{path} is no observation library of this version (format {FORMAT}): sample it again."
+        )
     try:
         return ObservationLibrary(dataset)
     except (KeyError, ValueError, TypeError, InvalidModelError) as error:
         reason = error.args[0] if error.args else error
-        raise MissionInputError(said("assets.layout", path=path, reason=reason)) from error
+        raise MissionInputError(
+            f"{path} does not have the layout of an observation library ({reason}): sample it "
+            "again."
+        ) from error
 
 
 class LibraryBelief(BeliefSection):
-    """An observation library, as `uav-twin library sample` writes it."""
+    """The twin believes an observation library that `uav-twin library sample` wrote."""
 
     kind: Literal["library"] = "library"
     file: str
     design: str | None = None
-    """The wing whose stiffness curve the calibration takes, and whose field is drawn, where there is one."""
+    """A wing design, whose stiffness curve the calibration uses and whose field is drawn."""
 
-    kept: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"file": OBSERVATIONS_COPY, "design": DESIGN_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> LibrarySource:
-        """Return the library.
+        """Return the source of the library.
 
         Raises
         ------
         MissionInputError
-            What flies is no FMU.
+            If what flies is not an FMU.
         """
         if not isinstance(flown, FmuSource):
-            raise MissionInputError(said("assets.not_sampled", kind=scenario.asset.kind))
+            raise MissionInputError(
+                "an observation library was sampled from an FMU, and the kind of the asset is "
+                f"`{scenario.asset.kind}`: set `belief.kind` to `asset` or `design`."
+            )
         return LibrarySource(scenario, self, flown)
 
 
@@ -232,105 +348,146 @@ class LibrarySource(AssetSource):
     Parameters
     ----------
     scenario : Scenario
-        What is flown.
+        The scenario.
     section : LibraryBelief
-        What is believed.
+        Its table `belief`.
     flown : FmuSource
-        Gives the draws of the parameter and the field where no design does.
+        The FMU that flies. Without a design it draws the parameter and writes the field.
     """
 
     def __init__(self, scenario: Scenario, section: LibraryBelief, flown: FmuSource) -> None:
         super().__init__(scenario, section)
         self._flown = flown
-        self._model: AssetSource = flown
+        self._design_source: DesignSource | None = None
         if section.design is not None:
-            self._model = DesignSource(scenario, section=DesignBelief(design=section.design))
-        self._of = " of it"
+            belief = DesignBelief(design=section.design)
+            self._design_source = DesignSource(scenario, section=belief)
+        self._relation_to_flown = " of it"
+        """How the library is related to the FMU that flies, in words."""
 
     @property
-    def words(self) -> str:
-        """The library; it differs if it was sampled from another FMU or with other parameters."""
-        return f"observation library{self._of}"
+    def _model_source(self) -> AssetSource:
+        """The source of parameter draws and field: the design, or the FMU that flies."""
+        return self._flown if self._design_source is None else self._design_source
+
+    @property
+    def description(self) -> str:
+        """The library, and whether it was sampled from the FMU that flies, in words."""
+        return f"observation library{self._relation_to_flown}"
 
     @cached_property
     def library(self) -> ObservationLibrary:
-        """The library, which has what the scenario asks for.
+        """The library, which contains what the scenario needs.
 
         Raises
         ------
         MissionInputError
-            It is missing or damaged, or lacks something.
+            If it is missing or damaged, or lacks something.
         """
         library = load_observation_library(self.path(OBSERVATIONS_COPY))
-        scenario, section = self._scenario, self._scenario.observation
-        vector = self._flown.binding().observation.get(section.role)
-        units = zip(library.states.names, library.state_units, strict=True)
-        of_states = {f"{factor.name}: {factor.unit}" for factor in scenario.state}
-        for what, has, wanted in (
-            ("observes", (library.role,), (section.role,)),
-            ("has the sensors", library.sensors, () if vector is None else vector.variables),
-            ("has them in", library.sensor_units, section.sensor_units),
-            ("has the states in", sorted(f"{name}: {unit}" for name, unit in units), sorted(of_states)),
-            ("was sampled under the load", _shown(library.load), _shown(scenario.asset.constant_load)),
-        ):
-            if has != wanted:
-                what = f"{self.path(OBSERVATIONS_COPY).name} {what}"
-                both = [", ".join(names) or "none" for names in (has, wanted)]
-                raise MissionInputError(said("assets.differs", what=what, both=both))
-        if not library.parameter or library.parameter == scenario.calibration.parameter:
-            self._places(library, build_graphical_model(scenario))
-        else:
-            library.at_draws(scenario.calibration.parameter, np.zeros(2))  # says what is wrong
+        self._check_labels(library)
+        library.check_parameter(self._scenario.calibration.parameter)
+        model = build_graphical_model(self._scenario)
+        self._state_and_control_indices(library, model)  # raises an error if one is missing
         return library
 
+    def _check_labels(self, library: ObservationLibrary) -> None:
+        """Refuse a library whose role, sensors, units or load are not those of the scenario."""
+        scenario = self._scenario
+        observation = scenario.observation
+        self._check_same_texts("observes", [library.role], [observation.role])
+        vector = self._flown.binding().observation.get(observation.role)
+        sensors = () if vector is None else vector.variables
+        self._check_same_texts("has the sensors", library.sensors, sensors)
+        self._check_same_texts("has them in", library.sensor_units, observation.sensor_units)
+        names_and_units = zip(library.states.names, library.state_units, strict=True)
+        library_units = sorted(f"{name}: {unit}" for name, unit in names_and_units)
+        units = sorted({f"{factor.name}: {factor.unit}" for factor in scenario.state})
+        self._check_same_texts("has the states in", library_units, units)
+        load = _named_values_as_texts(scenario.asset.constant_load)
+        self._check_same_texts(
+            "was sampled under the load", _named_values_as_texts(library.load), load
+        )
+
+    def _check_same_texts(
+        self, verb: str, of_library: Sequence[str], of_scenario: Sequence[str]
+    ) -> None:
+        """Refuse a library that has other texts than the scenario.
+
+        The verb says in the message what the library has: "has the sensors".
+        """
+        if list(of_library) != list(of_scenario):
+            raise MissionInputError(
+                f"the observation library {self.path(OBSERVATIONS_COPY).name} {verb} "
+                f"{', '.join(of_library) or 'none'}, and the scenario with its binding asks for "
+                f"{', '.join(of_scenario) or 'none'}: {_ADVICE}"
+            )
+
     def check(self) -> None:
-        """Check that the library has what the scenario asks for."""
+        """Check that the library contains what the scenario needs."""
         _ = self.library
 
-    def _make(self, progress: Progress) -> dict[str, str]:
-        """Prepare the design if one is named; what is flown is prepared before."""
+    def _build(self, progress: Progress) -> dict[str, str]:
+        """Prepare the design, if there is one; find out how the library is related to the FMU.
+
+        The FMU that flies is prepared before.
+        """
         assert self._folder is not None
-        fmu, own, library = self._folder / FMU_COPY, self._model is not self._flown, self.library
-        flown = {k: value for k, value in self._flown.parameters().items() if k != library.parameter}
-        hashes = self._model.prepare(self._folder, progress) if own else {}
-        if not fmu.exists():  # of several FMUs each has its own hash
-            self._of = ""
+        library = self.library
+        hashes = {}
+        if self._design_source is not None:
+            hashes = self._design_source.prepare(self._folder, progress)
+        fmu = self._folder / FMU_COPY
+        flown_parameters = self._flown.parameters()
+        flown_parameters.pop(library.parameter, None)
+        if not fmu.exists():  # several FMUs fly, and each has a hash of its own
+            self._relation_to_flown = ""
         elif library.fmu_hash != hash_file(fmu):
-            self._of, self.differ = " of another FMU", True
-        elif library.parameters != flown:
-            self._of, self.differ = " of it under other parameters", True
+            self._relation_to_flown = " of another FMU"
+            self.differ = True
+        elif library.parameters != flown_parameters:
+            self._relation_to_flown = " of it under other parameters"
+            self.differ = True
         return hashes
 
     def draws(self, seed: int) -> ParameterDraws:
         """Return draws of the parameter, from the calibration of the scenario."""
-        draws = self._model.draws(seed)
+        draws = self._model_source.draws(seed)
         if not self.library.parameter or np.isin(draws.values, self.library.draws).all():
             return draws
-        return replace(
-            draws, source=f"{draws.source}; the observation library is interpolated between its own"
-        )
+        source = f"{draws.source}; the observation library is interpolated between its own"
+        return replace(draws, source=source)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the observations (E, S, U, G) in the order of the scenario's states and controls.
+        """Return the observations (E, S, U, G) for the states and controls of the scenario.
 
         Raises
         ------
         MissionInputError
-            The library lacks a state, control or range of the parameter.
+            If the library lacks a state, a control or a range of the parameter.
         """
-        rows, controls = self._places(self.library, model)
-        return self.library.at_draws(draws.name, draws.values)[:, rows][:, :, controls]
+        states, controls = self._state_and_control_indices(self.library, model)
+        observations = self.library.observations_at(draws.name, draws.values)
+        return observations[:, states][:, :, controls]
 
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Write the field of the model."""
-        return self._model.write_field(path, state, control)
+    def write_field(
+        self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
+    ) -> bool:
+        """Write the field of the design or of what flies; return whether there is one."""
+        return self._model_source.write_field(path, state, control)
 
-    def _places(self, library: ObservationLibrary, model: GraphicalModel) -> tuple[list[int], list[int]]:
-        """Return where the states and controls of the scenario stand in the library."""
-        rows = library.rows_of(self._scenario.state_names, model.states.coordinates)
-        controls = [library.control_of(control.name, control.values) for control in self._scenario.control]
-        return rows, controls
+    def _state_and_control_indices(
+        self, library: ObservationLibrary, model: GraphicalModel
+    ) -> tuple[list[int], list[int]]:
+        """Return the indices in the library of the states and of the controls of the scenario."""
+        scenario = self._scenario
+        states = library.state_indices(scenario.state_names, model.states.coordinates)
+        controls = [
+            library.control_index(control.name, control.values) for control in scenario.control
+        ]
+        return states, controls
 
 
-def _shown(values: Mapping[str, float]) -> list[str]:
+def _named_values_as_texts(values: Mapping[str, float]) -> list[str]:
+    """Return named values as texts such as "mass = 2", sorted by name."""
     return [f"{name} = {value:g}" for name, value in sorted(values.items())]

@@ -1,4 +1,4 @@
-"""Draws of the uncertain parameter of the model, from a calibration."""
+"""Draws of the uncertain parameter of the model, and the calibration file of a scenario."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, fields
@@ -9,17 +9,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from reporting.arrays import Float
-from twin_master.errors import MissionInputError, check_names, said
-from twin_master.scenario.schema import Calibration
+from twin_master.errors import MissionInputError, check_names
+from twin_master.scenario.mission import Calibration
 from twin_master.seeds import generator, seed_sequence
 
 if TYPE_CHECKING:
-    from calibration.result.record import Calibration as Calibrated
+    from calibration.result.record import Calibration as CalibrationRecord
+    from calibration.static.posterior import ScalarPosterior
     from fe.runtime.reduced import ReducedModel
 
 
 SAME_NAMES = "give parameters the same names in the model file of the calibration"
-OWN_OF_WING = "give a calibration of the wing's own, which `uav-twin calibrate` makes"
+WING_CALIBRATION = "give a calibration of the wing's own, which `uav-twin calibrate` makes"
 
 
 @dataclass(frozen=True)
@@ -29,17 +30,17 @@ class ParameterDraws:
     Attributes
     ----------
     name : str
-        Parameter.
-    values : (E,)
-        Draws, SI.
+        The parameter.
+    values : (E,) array
+        The draws, SI.
     mean, standard_deviation : float
-        Of the distribution that was drawn from.
+        Those of the distribution that was drawn from.
     source : str
         Where the distribution comes from.
     record : mapping or None
-        The whole calibration, ready for JSON.
-    others : mapping of str to (E,)
-        What the other calibrated parameters are expected to be at each draw, SI.
+        The whole calibration as plain data.
+    others : mapping of str to (E,) array
+        The expectation of each other calibrated parameter at each draw, SI.
     """
 
     name: str
@@ -56,117 +57,160 @@ def draw_parameter(
 ) -> ParameterDraws:
     """Return draws of the calibrated parameter: Kapteyn et al. 2021, calibration step 2.
 
-    From the file of a whole calibration they are drawn from its samples, one from each of as many strata.
-
     Parameters
     ----------
     calibration : Calibration
-        Section of the scenario.
+        The table of the scenario.
     seed : int
-        Seed of the run.
+        The seed of the run.
     model : ReducedModel, optional
-        The structural model, where its own stiffness curve is to be used.
+        The structural model, whose stiffness curve is used if the scenario asks for it.
 
     Raises
     ------
     MissionInputError
-        The scenario asks for the stiffness curve of a design and there is none.
+        If the scenario asks for the stiffness curve of a design, and there is none.
     CalibrationError
-        The measurements do not fit the model, or the calibration file cannot be read.
+        If the measurements do not fit the model, or the calibration file cannot be read.
     """
-    name, count, found = calibration.parameter, calibration.draws, read_calibration(calibration)
+    record = read_calibration(calibration)
     if calibration.source == "file":
-        assert found is not None  # the schema asks for it
-        values = found.stratified_draws(name, count, seed_sequence(seed, "calibration"))
-        from calibration.result.file import run_record
-
-        return ParameterDraws(
-            name, values, found.mean(name), found.standard_deviation(name),
-            f"calibration of {found.asset}, {found.procedure}, {len(found.samples)} samples",
-            run_record(found, name), found.given(name, values),
-        )  # fmt: skip
-    if calibration.source in ("fixed", "normal"):
-        mean, deviation = calibration.mean, calibration.standard_deviation or 0.0
-        assert mean is not None  # the schema asks for it
-        if calibration.source == "fixed":
-            return ParameterDraws(name, np.array([mean]), mean, 0.0, "fixed in the scenario")
-        from calibration.static.posterior import GaussianPrior, stratified
-
-        random = generator(seed, "calibration")
-        values = GaussianPrior(mean, deviation).quantile(stratified(random, count))
-        others = {} if found is None else found.given(name, values)
-        source = "normal distribution of the scenario"
-        return ParameterDraws(name, values, mean, deviation, source, others=others)
-    if calibration.curve == "design" and model is None:
-        raise MissionInputError(said("assets.curve"))
-    return _draws_of_load_test(calibration, seed, model if calibration.curve == "design" else None)
+        assert record is not None  # the schema requires the file
+        return _draws_of_record(calibration, seed, record)
+    if calibration.source == "fixed":
+        assert calibration.mean is not None  # the schema requires it
+        name = calibration.parameter
+        mean = calibration.mean
+        return ParameterDraws(name, np.array([mean]), mean, 0.0, "fixed in the scenario")
+    if calibration.source == "normal":
+        return _draws_of_normal(calibration, seed, record)
+    if calibration.curve == "published":
+        return _draws_of_load_test(calibration, seed, None)
+    if model is None:
+        raise MissionInputError(
+            "`calibration.curve` asks for the stiffness curve of a design, and the asset has none: "
+            "let the twin believe a `design`, or set `calibration.curve` to `published`."
+        )
+    return _draws_of_load_test(calibration, seed, model)
 
 
-def _draws_of_load_test(calibration: Calibration, seed: int, model: "ReducedModel | None") -> ParameterDraws:
-    """Return draws of e from the published load test, on the stiffness of a model or the published line."""
-    # A scenario can be read without any of this, and it takes a while to load.
+def _draws_of_record(
+    calibration: Calibration, seed: int, record: "CalibrationRecord"
+) -> ParameterDraws:
+    """Return draws from the samples of a calibration file, one from each of as many strata."""
+    from calibration.result.file import run_record
+
+    name = calibration.parameter
+    seeds = seed_sequence(seed, "calibration")
+    values = record.stratified_draws(name, calibration.draws, seeds)
+    return ParameterDraws(
+        name=name,
+        values=values,
+        mean=record.mean(name),
+        standard_deviation=record.standard_deviation(name),
+        source=f"calibration of {record.asset}, {record.procedure}, {len(record.samples)} samples",
+        record=run_record(record, name),
+        others=record.given(name, values),
+    )
+
+
+def _draws_of_normal(
+    calibration: Calibration, seed: int, record: "CalibrationRecord | None"
+) -> ParameterDraws:
+    """Return stratified draws from the normal distribution that the scenario states.
+
+    If there is a calibration file, the other parameters follow from it.
+    """
+    from calibration.static.posterior import GaussianPrior, stratified
+
+    assert calibration.mean is not None  # the schema requires it
+    deviation = calibration.standard_deviation or 0.0
+    probabilities = stratified(generator(seed, "calibration"), calibration.draws)
+    values = GaussianPrior(calibration.mean, deviation).quantile(probabilities)
+    return ParameterDraws(
+        name=calibration.parameter,
+        values=values,
+        mean=calibration.mean,
+        standard_deviation=deviation,
+        source="normal distribution of the scenario",
+        others={} if record is None else record.given(calibration.parameter, values),
+    )
+
+
+def _draws_of_load_test(
+    calibration: Calibration, seed: int, model: "ReducedModel | None"
+) -> ParameterDraws:
+    """Return draws of the Young's modulus factor from the published load test.
+
+    The stiffness curve is that of a model, or the published line without one.
+    """
+    # These modules take a while to load, and a scenario can be read without them.
     from calibration.paper.load_test import particle_filter, push_forward
     from calibration.static.errors_in_variables import exact_posterior
     from calibration.static.experiments import published_measurements
-    from calibration.static.posterior import (
-        PUBLISHED_LINE,
-        GaussianPrior,
-        ScalarPosterior,
-        stiffness_curve_of,
-    )
+    from calibration.static.posterior import PUBLISHED_LINE, GaussianPrior, stiffness_curve_of
     from reporting.json_file import plain
 
-    sequence, pairs = seed_sequence(seed, "calibration"), published_measurements()
-    curve = (
-        PUBLISHED_LINE
-        if model is None
-        else stiffness_curve_of(model.tip_stiffness, model.validity["young_modulus_factor"])
-    )
+    seeds = seed_sequence(seed, "calibration")
+    measurements = published_measurements()
+    curve = PUBLISHED_LINE
+    if model is not None:
+        validity = model.validity["young_modulus_factor"]
+        curve = stiffness_curve_of(model.tip_stiffness, validity)
     if calibration.method == "exact":
-        posterior = exact_posterior(pairs, curve=curve)
+        posterior = exact_posterior(measurements, curve=curve)
     else:
-        posterior = particle_filter(pairs, seed=int(sequence.generate_state(1)[0]), curve=curve)
+        filter_seed = int(seeds.generate_state(1)[0])
+        posterior = particle_filter(measurements, seed=filter_seed, curve=curve)
     stiffness = push_forward(posterior, curve)
-    density = [item for item in fields(ScalarPosterior) if item.init]
     return ParameterDraws(
         name=calibration.parameter,
-        values=posterior.samples(sequence, calibration.draws),
+        values=posterior.samples(seeds, calibration.draws),
         mean=posterior.mean,
         standard_deviation=posterior.standard_deviation,
         source=f"static test of the wing, {calibration.method.replace('_', ' ')}, {curve.name}",
         record={
             "parameter": calibration.parameter,
             "prior": plain(GaussianPrior()),
-            "posterior": {item.name: plain(getattr(posterior, item.name)) for item in density},
+            "posterior": _plain_density(posterior),
             "tip_stiffness": {
                 "unit": "N/m",
                 "mean": stiffness.mean,
                 "standard_deviation": stiffness.standard_deviation,
             },
             "data": {
-                "source": pairs.source,
-                "load": pairs.load.tolist(),
-                "displacement": pairs.displacement.tolist(),
+                "source": measurements.source,
+                "load": measurements.load.tolist(),
+                "displacement": measurements.displacement.tolist(),
             },
         },
     )
 
 
-def read_calibration(calibration: Calibration) -> "Calibrated | None":
-    """Return the calibration that a scenario names; None if it names none.
+def _plain_density(posterior: "ScalarPosterior") -> dict[str, Any]:
+    """Return the arguments of a posterior as plain data, without what follows from them."""
+    from calibration.static.posterior import ScalarPosterior
+    from reporting.json_file import plain
+
+    names = [attribute.name for attribute in fields(ScalarPosterior) if attribute.init]
+    return {name: plain(getattr(posterior, name)) for name in names}
+
+
+def read_calibration(calibration: Calibration) -> "CalibrationRecord | None":
+    """Return the calibration whose file a scenario names; None if it names none.
 
     Raises
     ------
     CalibrationRecordError
-        It is damaged or of another kind, or has no samples of the parameter.
+        If the file is damaged or of another kind, or has no samples of the parameter.
     """
     if calibration.file is None:
         return None
     from calibration.result.file import load_calibration
 
-    found = load_calibration(Path(calibration.file))
-    found.draws_of(calibration.parameter)
-    return found
+    record = load_calibration(Path(calibration.file))
+    record.draws_of(calibration.parameter)  # raises an error if there are none
+    return record
 
 
 def check_calibration(
@@ -178,61 +222,69 @@ def check_calibration(
     design_hash: str = "",
     advice: str = SAME_NAMES,
 ) -> None:
-    """Read the calibration file, if there is one, and see whether one from a campaign fits what is there.
+    """Check that a campaign's calibration fits the model that flies or is believed.
+
+    Nothing is checked if the scenario names no calibration file, or one of a wing.
 
     Parameters
     ----------
     calibration : Calibration
-        Section of the scenario.
+        The table of the scenario.
     known : collection of str
-        Parameters of what is believed or flown; one of these each parameter of a calibration from a campaign
-        must be.
+        The parameters of the model, which must contain all parameters of the calibration.
     where : str
-        What has these, in the sentence.
+        What has these parameters, for the sentence.
     ranges : mapping of str to (float, float)
-        Where what has these parameters holds, SI; a name that is not there has no range.
+        Where the model is valid, by parameter, SI; a parameter without an entry has no range.
     design_hash : str
-        Of the design of what is believed; empty where it is not known, or of what is only flown.
+        The hash of the believed design; empty if it is not known, or the model only flies.
     advice : str
-        What to do where it is not, in the sentence.
+        What to do about an unknown parameter, for the sentence.
 
     Raises
     ------
     CalibrationRecordError
-        It is damaged or of another kind, or has no samples of the parameter.
+        If the file is damaged or of another kind, or has no samples of the parameter.
     MissionInputError
-        It has a parameter that is not known, or one whose posterior mean lies outside its range; or it is of
+        If it has an unknown parameter, a parameter whose posterior mean is outside its range, or
         another design.
     """
-    found = read_calibration(calibration)
-    if found is None or found.design is not None:
+    record = read_calibration(calibration)
+    if record is None or record.design is not None:
         return
-    names = {prior.name for prior in found.priors}
-    rows = [("parameter", names, known)]
-    check_names(f"the calibration of {found.asset} has the", where, rows, advice=advice)
-    if design_hash and found.design_hash not in ("", design_hash):
-        asked = where, design_hash[:12]
-        raise MissionInputError(said("assets.another_design", found=found, asked=asked))
+    names = {prior.name for prior in record.priors}
+    names_by_sort = [("parameter", names, known)]
+    check_names(f"the calibration of {record.asset} has the", where, names_by_sort, advice=advice)
+    if design_hash and record.design_hash not in ("", design_hash):
+        raise MissionInputError(
+            f"the calibration of {record.asset} is of the model {record.model} with the design "
+            f"{record.design_hash:.12}, and {where}, which the twin believes, has the design "
+            f"{design_hash[:12]}: calibrate what is believed, or let the twin believe what was "
+            "calibrated."
+        )
     for name, (low, high) in ranges.items():
-        if name in names and not low <= found.mean(name) <= high:
-            value, of = f"{name} = {found.mean(name):.6g}", found.asset
-            raise MissionInputError(said("assets.range", of=of, value=value, where=where, low=low, high=high))
+        if name in names and not low <= record.mean(name) <= high:
+            raise MissionInputError(
+                f"the calibration of {record.asset} has {name} = {record.mean(name):.6g}, but "
+                f"{where} holds from {low:g} to {high:g} of it: give one of that, or widen the "
+                "range if its file has one."
+            )
 
 
 def is_of_parameters(file: Path | str) -> bool:
-    """Return whether a file is the calibration of a model's parameters from a campaign; a wing's is not."""
+    """Return whether a file is a campaign's calibration of parameters, and not that of a wing."""
     from calibration.errors import CalibrationRecordError
     from calibration.result.file import load_calibration
 
     try:
         return load_calibration(file).design is None
-    except CalibrationRecordError:  # said where the file is used
+    except CalibrationRecordError:  # the use of the file raises it again
         return False
 
 
 def calibrated_means(calibration: Calibration) -> dict[str, float]:
-    """Return the posterior means of the parameters of a model that were calibrated from a campaign, SI."""
-    found = read_calibration(calibration)
-    if found is None or found.design is not None:
+    """Return the posterior means of the parameters that were calibrated from a campaign, SI."""
+    record = read_calibration(calibration)
+    if record is None or record.design is not None:
         return {}
-    return {prior.name: found.mean(prior.name) for prior in found.priors}
+    return {prior.name: record.mean(prior.name) for prior in record.priors}

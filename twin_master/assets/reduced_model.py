@@ -1,17 +1,17 @@
-"""A reduced model, of a wing or a structure: what it predicts, itself as an asset, and modes of records."""
+"""The reduced model of a wing or structure: its predictions, and the model itself as an asset."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from fe.runtime.modal_system import rayleigh_damping_ratio
 from fe.structure.tables import StructureDesign, StructureSettings
-from fmu_asset.client.binding import Binding
 from reporting.arrays import Float
 from reporting.progress import Progress
+from reporting.words import comma_list
 from twin_master.assets.asset_source import Asset, AssetReading, AssetSource, StatelessAsset
 from twin_master.assets.parameter import (
     SAME_NAMES,
@@ -19,94 +19,150 @@ from twin_master.assets.parameter import (
     calibrated_means,
     check_calibration,
 )
-from twin_master.errors import MissionInputError, check_names, said
+from twin_master.assets.recorded_structure import modal_features
+from twin_master.errors import MissionInputError, check_names
 from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.identified import packed_row
+from twin_master.scenario.kinds import FileSection
+from twin_master.scenario.observation import ModesSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import ROLE, FileSection, ModesSection
-from twin_master.seeds import seed_sequence
 
 if TYPE_CHECKING:
     from fe.runtime.reduced import ReducedModel
-    from twin_master.assets.fmu_source import Session
 
 
 FIELD_NAME = "structure.vtu"
 UNITS = {"strain": "1", "displacement": "m", "frequency": "Hz"}
-"""Of what a reduced model shows, by role."""
+"""The units of what a reduced model predicts, by role."""
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What a user can do about something that a structure does not have, for the messages.
+
+    Attributes
+    ----------
+    calibration : str
+        About a calibration with other parameters.
+    parameter : str
+        About a calibrated parameter that the structure does not have.
+    state : str
+        About a state, control or observation that the structure does not have; if empty, the
+        message names the table that is missing in the structure file.
+    static_test : str
+        About the calibration source `static_test`; empty if the structure can have it.
+    """
+
+    calibration: str
+    parameter: str
+    state: str = ""
+    static_test: str = ""
+
+
+class ChosenValue(NamedTuple):
+    """A value of a structure's input that a scenario chooses.
+
+    Attributes
+    ----------
+    description : str
+        Which value it is, in words.
+    name : str
+        The input.
+    value : float
+        The value, SI.
+    """
+
+    description: str
+    name: str
+    value: float
 
 
 class NamedStructure(AssetSource):
-    """A structure that a scenario names, and whether the scenario speaks of what it has."""
+    """A structure from a file; checks that it has everything that the scenario names."""
 
-    section: Any
-    advice: ClassVar[Mapping[str, str]] = {
-        "calibration": SAME_NAMES,
-        "parameter": "give it in a table [[parameter]]",
-        "state": "",
-        "static_test": "the calibration source `static_test` is for wings: of a structure give `file`, or "
-        "`normal` or `fixed` with `mean`.",
-    }
-    """What to do about names that it does not have, and about a source of calibrations that it cannot."""
+    section: Any  # each subclass has a section of its own
+    advice: ClassVar[Advice] = Advice(
+        calibration=SAME_NAMES,
+        parameter="give it in a table [[parameter]]",
+        static_test=(
+            "the calibration source `static_test` is for wings: of a structure give `file`, or "
+            "`normal` or `fixed` with `mean`."
+        ),
+    )
 
     @property
     def file(self) -> Path:
-        """Its file, where it is given, or its copy once kept."""
+        """The structure file: the original before `prepare`, and its copy after it."""
         return self.path(self.section.copies()["structure"])
 
     @cached_property
     def design(self) -> StructureDesign:
-        """By name what can be chosen of it, commanded and read."""
+        """The design, which names the inputs and outputs of the structure."""
         from fe.structure.design import load_structure
 
         return load_structure(self.file)
 
     @property
-    def where(self) -> str:
-        """What has these names, in words."""
+    def full_name(self) -> str:
+        """The structure by its name, for messages."""
         return f"the structure {self.design.name}"
 
     @property
-    def words(self) -> str:
-        """The FMU or model with its name."""
-        return f"{self.label} of {self.where}"
+    def description(self) -> str:
+        """The FMU or model, and the name of the structure."""
+        return f"{self.label} of {self.full_name}"
 
     @property
-    def hash(self) -> str:
-        """SHA-256 of its design."""
+    def design_hash(self) -> str:
+        """The SHA-256 of the design."""
         from fe.structure.design import structure_hash
 
         return structure_hash(self.design, self.file.parent)
 
     @property
     def parameter_names(self) -> list[str]:
-        """What may be calibrated."""
-        free = [part.name for part in self.design.mass if part.free]
-        return [part.name for part in self.design.parameter] + free
+        """The parameters that may be calibrated."""
+        free_masses = [mass.name for mass in self.design.mass if mass.free]
+        return [parameter.name for parameter in self.design.parameter] + free_masses
 
-    def reduced(self, progress: Progress) -> "ReducedModel":
-        """Return the reduced model, from the cache if it is there."""
+    def load_reduced_model(self, progress: Progress) -> "ReducedModel":
+        """Return the reduced model; it comes from the cache if it is there."""
         from fe.reduction.model_cache import reduced_model
 
         return reduced_model(self.file, progress=progress)
 
     def check_model(self) -> None:
-        """Look at what the reduced model is made of, as far as that takes no time."""
+        """Check what the reduced model is made of, as far as that takes no time."""
         from fe.reduction.model_cache import check_structure
 
         check_structure(self.file)
 
     def parameters(self) -> dict[str, float]:
-        """Return what it is drawn with, by name; what is not among them is nominal."""
-        return calibrated_means(self._scenario.calibration) | self._means
+        """Return the mean of each uncertain parameter by name; other parameters are nominal."""
+        return calibrated_means(self._scenario.calibration) | self._drawn_means
 
-    def write_field(self, path: Path, state: Mapping[str, float], control: Mapping[str, float]) -> bool:
-        """Solve the full structure and write displacement and strain as VTU, if it has a mesh.
+    def write_field(
+        self, path: Path, state: Mapping[str, float], control: Mapping[str, float]
+    ) -> bool:
+        """Write displacement and strain of the full structure as VTU, if it has a mesh.
+
+        Parameters
+        ----------
+        path : Path
+            A file in the folder of the VTU file, which is called `structure.vtu`.
+        state : mapping of str to float
+            The estimated value of each state factor, SI.
+        control : mapping of str to float
+            The value of each control input, SI.
+
+        Returns
+        -------
+        bool
+            Whether the structure has a mesh.
 
         Raises
         ------
         FileNotWrittenError
-            The disk is full or the folder cannot be written.
+            If the disk is full or the folder cannot be written.
         """
         from fe.structure.matrix_design import MatrixDesign
         from fe.structure.operators import load_and_assemble, write_structure_vtu
@@ -117,326 +173,300 @@ class NamedStructure(AssetSource):
         write_structure_vtu(path.with_name(FIELD_NAME), load_and_assemble(self.file), values)
         return True
 
-    def _frequencies(self) -> int:
-        """Return how many natural frequencies are observed; raises `MissionInputError` for too many."""
-        if self._scenario.observation.role != "frequency":
+    def _frequency_count(self) -> int:
+        """Return how many natural frequencies are observed; refuse too many."""
+        observation = self._scenario.observation
+        if observation.role != "frequency":
             return 0
-        count, most = self._scenario.observation.count, StructureSettings.mode_count
-        if count > most:
-            raise MissionInputError(said("assets.frequencies", most=most, count=count))
-        return count
+        most = StructureSettings.mode_count
+        if observation.count > most:
+            raise MissionInputError(
+                f"a structure tells its first {most} frequencies, and {observation.count} are "
+                "observed."
+            )
+        return observation.count
 
     def _check_observed(self) -> None:
-        """Refuse observations that the structure does not have; raises `MissionInputError`.
+        """Refuse observations that the structure does not have; raise `MissionInputError`."""
+        modes = self._scenario.observation.modes
+        if modes is None:
+            self._check_observed_sensors()
+        else:
+            self._check_observed_modes(modes)
 
-        Titles that are its sensors in another order raise `MissionInputError`: they would name the wrong
-        ones.
-        """
-        design, observation = self.design, self._scenario.observation
-        where, role, modes = self.where, observation.role, observation.modes
-        names = {
-            "strain": [part.name for part in design.gauge],
-            "displacement": [part.name for part in design.displacement],
-        }
-        known = {name: len(sensors) for name, sensors in names.items()}
-        known |= {"frequency": self._frequencies() or 1}
-        row, table = ("observation", [role], [name for name, count in known.items() if count]), role
-        if modes is not None:
-            known[ROLE] = observation.count
-            there = [part.name for part in design.acceleration]
-            row, table = ("accelerometer", [*modes.accelerometers], there), "acceleration"
-            most = StructureSettings.mode_count
-            if max(modes.places) >= most:
-                number = max(modes.places) + 1
-                raise MissionInputError(said("assets.modes", most=most, number=number))
-        advice = self.advice["state"] or f"give it in a table [[{table}]]"
-        check_names("the scenario has the", where, [row], advice=advice)
-        if modes is None and (came := sorted({*observation.sensor_units} - {"1", UNITS[role]})):
+    def _check_observed_modes(self, modes: ModesSection) -> None:
+        """Refuse modes and accelerometers that the structure does not have."""
+        most = StructureSettings.mode_count
+        highest = max(modes.mode_indices) + 1
+        if highest > most:
             raise MissionInputError(
-                said("assets.own_unit", where=where, role=role, own=UNITS[role], came=came)
+                f"a structure tells its first {most} modes, and mode {highest} is observed."
             )
-        if observation.count != known[role]:
-            both = {"has": known[role], "count": observation.count}
-            raise MissionInputError(said("assets.sensors", where=where, role=role, **both))
-        titles, own = [*observation.titles], names.get(role, [])
-        if titles != own and sorted(titles) == sorted(own):
-            raise MissionInputError(said("assets.titles", titles=titles, where=where, own=own))
+        accelerometers = [acceleration.name for acceleration in self.design.acceleration]
+        names_by_sort = [("accelerometer", modes.accelerometers, accelerometers)]
+        advice = self.advice.state or "give it in a table [[acceleration]]"
+        check_names("the scenario has the", self.full_name, names_by_sort, advice=advice)
+
+    def _check_observed_sensors(self) -> None:
+        """Refuse sensors that the structure does not have: their role, unit, number and titles."""
+        observation = self._scenario.observation
+        role = observation.role
+        sensors = {
+            "strain": [gauge.name for gauge in self.design.gauge],
+            "displacement": [sensor.name for sensor in self.design.displacement],
+        }
+        counts = {name: len(names) for name, names in sensors.items()}
+        counts["frequency"] = self._frequency_count() or 1  # any structure has frequencies
+        roles = [name for name, count in counts.items() if count]
+        advice = self.advice.state or f"give it in a table [[{role}]]"
+        check_names(
+            "the scenario has the", self.full_name, [("observation", [role], roles)], advice=advice
+        )
+        other_units = sorted(set(observation.sensor_units) - {"1", UNITS[role]})
+        if other_units:
+            raise MissionInputError(
+                f"{self.full_name} shows `{role}` in {UNITS[role]}, and `observation.unit` says "
+                f"{comma_list(other_units)}: write the former."
+            )
+        if observation.count != counts[role]:
+            raise MissionInputError(
+                f"{self.full_name} has {counts[role]} sensors of `{role}`, and the scenario "
+                f"expects {observation.count}."
+            )
+        # Titles that are the names of the sensors in another order would name the wrong ones.
+        titles = list(observation.titles)
+        names = sensors.get(role, [])
+        if titles != names and sorted(titles) == sorted(names):
+            raise MissionInputError(
+                f"`observation.titles` are {comma_list(titles)}, and {self.full_name} has these "
+                f"sensors in the order {comma_list(names)}: give the titles in that order."
+            )
 
     def _check_parameter(self, *, believed: bool) -> None:
-        """Refuse a calibration that the structure cannot have; raises `MissionInputError`."""
-        calibration, known = self._scenario.calibration, self.parameter_names
-        if refusal := self.advice.get(calibration.source):
-            raise MissionInputError(refusal)
+        """Refuse a calibration whose source, parameters or design are not those of the structure.
+
+        Its design is compared only if the structure is believed: what only flies may differ.
+        """
+        calibration = self._scenario.calibration
+        if calibration.source == "static_test" and self.advice.static_test:
+            raise MissionInputError(self.advice.static_test)
         check_calibration(
-            calibration, known, self.where, ranges=self.design.ranges, advice=self.advice["calibration"],
-            design_hash=self.hash if believed else "",
-        )  # fmt: skip
-        rows = [("parameter", [calibration.parameter], known)]
-        check_names("the scenario calibrates the", self.where, rows, advice=self.advice["parameter"])
+            calibration,
+            self.parameter_names,
+            self.full_name,
+            ranges=self.design.ranges,
+            advice=self.advice.calibration,
+            design_hash=self.design_hash if believed else "",
+        )
+        names_by_sort = [("parameter", [calibration.parameter], self.parameter_names)]
+        check_names(
+            "the scenario calibrates the",
+            self.full_name,
+            names_by_sort,
+            advice=self.advice.parameter,
+        )
 
     def _check_ranges(self, parameters: Mapping[str, float]) -> None:
-        """Refuse levels, controls, loads and `parameters` outside the ranges; raises `MissionInputError`.
+        """Refuse values of the scenario outside the ranges of the structure's inputs.
 
-        A name that the structure does not have is passed over.
+        Inputs that the structure does not have are passed over.
         """
-        scenario, ranges = self._scenario, self.design.ranges
-        given = [(f"parameter {name}", name, value) for name, value in parameters.items()]
-        given += [(f"load {name}", name, value) for name, value in scenario.asset.constant_load.items()]
-        if (mean := scenario.calibration.mean) is not None:
-            given.append(("mean of the calibration", scenario.calibration.parameter, mean))
-        given += [(f"level of {f.name}", f.name, level) for f in scenario.state for level in f.levels]
-        given += [
-            (f"{name} of the control {control.name}", name, value)
-            for control in scenario.control
-            for name, value in control.values.items()
-        ]
-        if scenario.truth.kind == "scripted":
-            given += [
-                (f"{name} that `truth.gains` give in {scenario.mission.step_name} {step}", name, value)
-                for step, state in enumerate(scenario.scripted_history().tolist())
-                for name, value in zip(scenario.state_names, state, strict=True)
-            ]
-        for what, name, value in given:
-            low, high = ranges.get(name, (value, value))
+        for description, name, value in self._chosen_values(parameters):
+            low, high = self.design.ranges.get(name, (value, value))
             if not low <= value <= high:
-                what, ends = f"{what} is {value:.6g}, but {self.where}", (low, high)
-                raise MissionInputError(said("assets.outside", what=what, name=name, ends=ends))
+                raise MissionInputError(
+                    f"the {description} is {value:.6g}, but {self.full_name} gives {name} the "
+                    f"range {low:g} to {high:g}; give a value inside, or widen the range in its "
+                    "file."
+                )
+
+    def _chosen_values(self, parameters: Mapping[str, float]) -> Iterator[ChosenValue]:
+        """Yield the values that the scenario chooses: levels, controls, loads and parameters."""
+        scenario = self._scenario
+        for name, value in parameters.items():
+            yield ChosenValue(f"parameter {name}", name, value)
+        for name, value in scenario.asset.constant_load.items():
+            yield ChosenValue(f"load {name}", name, value)
+        calibration = scenario.calibration
+        if calibration.mean is not None:
+            description = "mean of the calibration"
+            yield ChosenValue(description, calibration.parameter, calibration.mean)
+        for factor in scenario.state:
+            for level in factor.levels:
+                yield ChosenValue(f"level of {factor.name}", factor.name, level)
+        for control in scenario.control:
+            for name, value in control.values.items():
+                yield ChosenValue(f"{name} of the control {control.name}", name, value)
+        if scenario.truth.kind != "scripted":
+            return
+        for step, state in enumerate(scenario.scripted_history().tolist()):
+            when = f"in {scenario.mission.step_name} {step}"
+            for name, value in zip(scenario.state_names, state, strict=True):
+                yield ChosenValue(f"{name} that `truth.gains` give {when}", name, value)
 
 
 class ReducedModelSource(NamedStructure):
-    """A reduced model, believed or flown without an FMU.
+    """A reduced model, which is believed, or flies without an FMU.
 
     Parameters
     ----------
     scenario : Scenario
-        What is flown.
+        The scenario.
     model : ReducedModel, optional
-        Where it is there already, of a wing.
+        The reduced model of a wing, if it exists already.
     section : FileSection, optional
-        The table that names the files.
+        The table of the scenario that names the files.
     """
 
     label = "reduced model"
 
     def __init__(
-        self, scenario: Scenario, model: "ReducedModel | None" = None, section: FileSection | None = None
+        self,
+        scenario: Scenario,
+        model: "ReducedModel | None" = None,
+        section: FileSection | None = None,
     ) -> None:
         super().__init__(scenario, section)
         self.model = model
 
     @property
-    def wing(self) -> "ReducedModel":
-        """The reduced model, once prepared."""
+    def prepared_model(self) -> "ReducedModel":
+        """The reduced model, once it is prepared."""
         assert self.model is not None
         return self.model
 
     def check(self) -> None:
-        """Read the file without building anything.
+        """Check the files and the scenario without building anything.
 
         Raises
         ------
         MissionInputError, FiniteElementError
-            A file cannot be read or is wrong, or the mesh does not hold what the structure names; or the
-            scenario's states, controls, sensors or calibrated parameter are not those of the structure.
+            If a file cannot be read or is wrong; if the mesh does not have what the structure
+            names; or if the structure does not have the scenario's states, controls, sensors or
+            calibrated parameter.
         """
         self.files()
-        design, scenario = self.design, self._scenario
+        design = self.design
+        scenario = self._scenario
         self._check_parameter(believed=True)
-        rows = (
-            ("state", scenario.state_names, [part.name for part in design.damage]),
-            ("control input", scenario.control[0].values, [part.name for part in design.control]),
+        damage_names = [damage.name for damage in design.damage]
+        control_names = [control.name for control in design.control]
+        names_by_sort = (
+            ("state", scenario.state_names, damage_names),
+            ("control input", scenario.control[0].values, control_names),
         )
-        check_names("the scenario has the", self.where, rows, advice=self.advice["state"])
+        advice = self.advice.state
+        check_names("the scenario has the", self.full_name, names_by_sort, advice=advice)
         self._check_observed()
         self._check_ranges({})
         self.check_model()
 
-    def _make(self, progress: Progress) -> dict[str, str]:
-        self.model = self.model or self.reduced(progress)
+    def _build(self, progress: Progress) -> dict[str, str]:
+        """Reduce the structure; return the hash of its design."""
+        self.model = self.model or self.load_reduced_model(progress)
         return {"design": self.model.design_hash}
 
     @property
-    def _outputs(self) -> slice:
-        """Which outputs of the model are observed, where those at rest are."""
-        gauges = len(self.wing.gauges)
-        return slice(0, gauges) if self._scenario.observation.role == "strain" else slice(gauges, None)
+    def _observes_modes(self) -> bool:
+        """Whether natural frequencies or other features of modes are observed."""
+        observation = self._scenario.observation
+        return observation.modes is not None or observation.role == "frequency"
+
+    @property
+    def _observed_outputs(self) -> slice:
+        """The positions of the observed strains or displacements among the static outputs."""
+        gauge_count = len(self.prepared_model.gauges)
+        if self._scenario.observation.role == "strain":
+            return slice(0, gauge_count)
+        return slice(gauge_count, None)
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return strains, displacements, natural frequencies or features of modes (E, S, U, G).
+        """Return the predicted strains, displacements, frequencies or features of modes.
 
-        Kapteyn et al. 2021, eqs. (13), (15). Frequencies are in rising order; they and modes do not depend on
-        the control.
+        Kapteyn et al. 2021, eqs. (13), (15). Frequencies are in rising order. Frequencies and modes
+        do not depend on the control.
+
+        Parameters
+        ----------
+        draws : ParameterDraws
+            The E draws of the parameter.
+        model : GraphicalModel
+            The graphical model, which has the S joint states.
+
+        Returns
+        -------
+        (E, S, U, G) array
+            By draw, state, control and sensor, SI.
 
         Raises
         ------
         OutsideModelError
-            A state, control or draw lies outside the ranges of the model.
+            If a state, control or draw is outside the ranges of the model.
         """
-        reduced, scenario = self.wing, self._scenario
-        states, controls = model.states.coordinates, scenario.control
-        shape = (len(draws.values), len(states), len(controls))
-        draw, state, control = (index.ravel() for index in np.indices(shape))
-        beside = {**scenario.asset.constant_load, **{n: values[draw] for n, values in draws.others.items()}}
-        columns: dict[str, Float | float] = {
-            n: value for n, value in beside.items() if n in reduced.input_names
-        }
+        controls = self._scenario.control
+        shape = (len(draws.values), len(model.states.coordinates), len(controls))
+        inputs = self._inputs_of_all_cases(draws, model.states.coordinates)
+        if not self._observes_modes:
+            outputs = self.prepared_model.static_outputs(inputs)
+            return outputs[:, self._observed_outputs].reshape(*shape, -1)
+        # One control is enough, as modes do not depend on it.
+        inputs_of_first_control = inputs.reshape(*shape, -1)[:, :, 0]
+        rows = inputs_of_first_control.reshape(-1, inputs.shape[1])
+        features = np.array([self._observed_features(row) for row in rows])
+        features = features.reshape(*shape[:2], 1, -1)
+        return np.repeat(features, len(controls), axis=2)
+
+    def _inputs_of_all_cases(self, draws: ParameterDraws, states: Float) -> Float:
+        """Return the model's inputs (E * S * U, V) in every draw, state and control.
+
+        The control varies fastest. The states are (S, F).
+        """
+        reduced = self.prepared_model
+        scenario = self._scenario
+        controls = scenario.control
+        indices = np.indices((len(draws.values), len(states), len(controls)))
+        draw, state, control = (index.ravel() for index in indices)
+        columns: dict[str, Float | float] = {}
+        for name, value in scenario.asset.constant_load.items():
+            if name in reduced.input_names:
+                columns[name] = value
+        for name, values in draws.others.items():
+            if name in reduced.input_names:
+                columns[name] = values[draw]
         columns[draws.name] = draws.values[draw]
         columns |= zip(scenario.state_names, states[state].T, strict=True)
         for name in controls[0].values:
-            columns[name] = np.array([item.values[name] for item in controls])[control]
-        vectors = reduced.vectors(columns)
-        observation = scenario.observation
-        if observation.modes is None and observation.role != "frequency":
-            return reduced.static_outputs(vectors)[:, self._outputs].reshape(*shape, -1)
-        first = vectors.reshape(*shape, -1)[:, :, 0].reshape(-1, vectors.shape[1])
-        found = np.array([self._moving(vector) for vector in first]).reshape(*shape[:2], 1, -1)
-        return np.repeat(found, shape[2], axis=2)
+            values_by_control = np.array([entry.values[name] for entry in controls])
+            columns[name] = values_by_control[control]
+        return reduced.vectors(columns)
 
-    def _moving(self, vector: Float) -> Float:
-        """Return the natural frequencies or features of modes that are observed (G,)."""
+    def _observed_features(self, inputs: Float) -> Float:
+        """Return the observed frequencies or features of modes (G,) under the inputs (V,)."""
         observation = self._scenario.observation
+        model = self.prepared_model
         if observation.modes is not None:
-            return observation.modes.observed(modal_values(self.wing, vector, observation.modes))
-        return np.asarray(self.wing.modes(vector).frequency[: observation.count])
+            features = modal_features(model, inputs, observation.modes)
+            return observation.modes.observed_features(features)
+        return np.asarray(model.modes(inputs).frequency[: observation.count])
 
     def open(self) -> Asset:
         """Return the model as an asset, with the parameters of the scenario's true asset."""
-        model, observation, outputs = self.wing, self._scenario.observation, self._outputs
-        asset, means = self._scenario.asset, calibrated_means(self._scenario.calibration)
-        given = {**means, **asset.true_parameters, **asset.constant_load}
-        known = {name: value for name, value in given.items() if name in model.input_names}
+        model = self.prepared_model
+        observed_outputs = self._observed_outputs
+        asset = self._scenario.asset
+        means = calibrated_means(self._scenario.calibration)
+        constants = {**means, **asset.true_parameters, **asset.constant_load}
+        constant_inputs = {
+            name: value for name, value in constants.items() if name in model.input_names
+        }
 
         def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-            values = {**known, **health, **control}
-            if observation.modes is not None or observation.role == "frequency":
-                return AssetReading(self._moving(model.vector(values)))
-            found = model.static_response(values)
-            shown = np.concatenate((found.strain, found.displacement))[outputs]
-            return AssetReading(shown, {"strain_error_bound": found.strain_error_bound})
+            values = {**constant_inputs, **health, **control}
+            if self._observes_modes:
+                return AssetReading(self._observed_features(model.vector(values)))
+            response = model.static_response(values)
+            outputs = np.concatenate((response.strain, response.displacement))
+            monitors = {"strain_error_bound": response.strain_error_bound}
+            return AssetReading(outputs[observed_outputs], monitors)
 
         return StatelessAsset(observe)
-
-
-def modal_values(
-    model: "ReducedModel", vector: Float, section: ModesSection, damping: tuple[float, float] | None = None
-) -> Float:
-    """Return frequency [Hz], damping ratio and relative shape (M, 1 + A) of the observed modes of a model.
-
-    Parameters
-    ----------
-    model : ReducedModel
-    vector : (V,)
-        Values of all that can be chosen.
-    section : ModesSection
-        Which modes, at which accelerometers.
-    damping : (float, float), optional
-        Rayleigh's alpha [1/s] and beta [s]; those of the model by default.
-
-    Raises
-    ------
-    OutsideModelError
-        A value lies outside the ranges of the model.
-    """
-    modes = model.modes(vector)
-    alpha, beta = model.damping.tolist() if damping is None else damping
-    frequency = modes.frequency[section.places]
-    rows = [model.static_output_count + model.accelerations.index(name) for name in section.accelerometers]
-    shape = modes.output[rows][:, section.places]
-    return np.column_stack(
-        [frequency, rayleigh_damping_ratio(alpha, beta, frequency), *(shape[1:] / shape[0])]
-    )
-
-
-class RecordedStructure(Asset):
-    """The FMU of a structure in motion: each step makes a record of accelerations and identifies its modes.
-
-    Each record begins anew at rest; what the sensors say are the features that were identified, with their
-    covariance, and the noise-free observation are those of the model that was packed.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        With `observation.modes` and `truth.record`.
-    model : ReducedModel
-        The model that was packed.
-    session : callable
-        Opens the FMU with a binding and parameters.
-    binding : Binding
-        Of the FMU.
-    parameters : mapping of str to float
-        Of the true structure.
-    """
-
-    def __init__(
-        self,
-        scenario: Scenario,
-        model: "ReducedModel",
-        session: "Callable[[Binding, Mapping[str, float]], Session]",
-        binding: Binding,
-        parameters: Mapping[str, float],
-    ) -> None:
-        assert scenario.observation.modes is not None
-        assert scenario.truth.record is not None
-        self._scenario, self._model = scenario, model
-        self._section, self._record = scenario.observation.modes, scenario.truth.record
-        bound = binding.with_header(step_size=1.0 / self._record.sampling_rate, decimation=1)
-        self._parameters = {**parameters, "response": 2.0}
-        self._session = session(bound, self._parameters)
-        begin, names = bound.observation_slice("acceleration").start, self._section.accelerometers
-        variables = bound.observation["acceleration"].variables
-        self._chosen = [begin + variables.index(f"acceleration.{name}") for name in names]
-        self.units = {name: item.unit for name, item in (*bound.parameter.items(), *bound.control.items())}
-        self._step = 0
-
-    def step(self, control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-        """Make and identify the record of a step.
-
-        Raises
-        ------
-        FmuError
-            The FMU refuses an input, or fails.
-        ExperimentDataError
-            The record is too short for the bands.
-        """
-        from calibration.dynamics.modal_identification import identify_modes
-
-        section, record, model = self._section, self._record, self._model
-        root = seed_sequence(self._scenario.mission.seed, "asset")
-        random = np.random.default_rng([*root.generate_state(4).tolist(), self._step])
-        count = round(record.duration * record.sampling_rate)
-        held: dict[str, float] = dict(control)
-        course: dict[str, Float | float] = dict(control)
-        if record.kind == "ambient":
-            course[record.input] = held[record.input] + record.amplitude * random.standard_normal(count)
-        else:
-            held[record.input] += record.amplitude
-        self._session.reset(self._parameters, control=held, health=health)
-        history = self._session.simulate(control=course, health=health, steps=count)
-        acceleration = history.values[:, self._chosen]
-        acceleration = acceleration + record.noise * random.standard_normal(acceleration.shape)
-        found = identify_modes(acceleration, record.sampling_rate, section.bands, record.kind)
-        self._step += 1
-        given = {**self._parameters, **control, **health}
-        vector = model.vector({name: value for name, value in given.items() if name in model.input_names})
-        alpha, beta = model.damping.tolist()
-        damping = given.get("damping_alpha", alpha), given.get("damping_beta", beta)
-        errors = section.observed(found.standard_error).tolist()
-        titles = self._scenario.observation.titles
-        sensed = packed_row(section.observed(found.value), section.covariance(found.covariance))
-        return AssetReading(
-            section.observed(modal_values(model, vector, section, damping)),
-            {f"standard_error_{title}": error for title, error in zip(titles, errors, strict=True)},
-            sensed=sensed,
-        )
-
-    def save_state(self) -> bytes:
-        """Return the number of records made: each begins anew."""
-        return str(self._step).encode()
-
-    def restore_state(self, state: bytes) -> None:
-        """Go on behind as many records."""
-        self._step = int(state)
-
-    def close(self) -> None:
-        """End the worker."""
-        self._session.close()

@@ -1,4 +1,4 @@
-"""What is flown: the scenario with the command line's overrides, and where its asset comes from."""
+"""The scenario with the overrides of the command line, and the sources of what it flies."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,41 +9,43 @@ from typing import Any, Literal
 from pydantic import ConfigDict, Field
 
 from reporting.toml_file import read_toml, validate
-from twin_master.assets.asset_source import AssetSource, PairedSource
+from reporting.words import comma_list
+from twin_master.assets.asset_source import NO_ASSET, AssetSource, PairedSource, WatchedSource
 from twin_master.assets.parameter import is_of_parameters
 from twin_master.assets.strain_library_source import FILE_NAME
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.network.transition import NUMBER, TRANSITION_COPIES, check_fits, transition_bytes
+from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME, AssetSection
 from twin_master.scenario.reading import LoadedScenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME, AssetSection, Section
+from twin_master.scenario.section import Section, Table
 
 
 @dataclass(frozen=True)
 class Overrides:
-    """What the command line says otherwise than the scenario file.
+    """What the command line states otherwise than the scenario file.
 
     Attributes
     ----------
     seed : int or None
-        Seed of the run.
+        The seed of the run.
     fmu, binding : Path or None
-        FMU to fly, and its binding.
+        The FMU to fly, and its binding.
     strain_library : Path or None
-        Fly the library instead of an FMU, as asset and model; where the scenario flies a library anyway, the
-        file of that library.
+        The strain library to fly instead of an FMU, as asset and model; if the scenario flies a
+        strain library anyway, the file of it.
     library : Path or None
-        Believe this observation library.
+        The observation library to believe.
     learnt : Path or None
-        Fly with what a fleet has learnt, the file of `uav-twin fleet learn`.
+        The file of `uav-twin fleet learn`, whose results the twin assumes.
     learnt_group : str or None
-        With what it has learnt of this group, where the file tells.
+        The group whose results are used, if the file has it.
     in_process : bool
-        Fly the FMU in this process instead of a worker.
+        Whether the FMU flies in this process instead of a worker.
     calibration : Path or None
-        The calibration file, instead of what the scenario says of its calibration.
+        The calibration file, instead of what the scenario states of its calibration.
     ssp : Path or None
-        SSP file to fly in the place of the scenario's asset.
+        The SSP file to fly instead of the scenario's asset.
     """
 
     __pydantic_config__ = ConfigDict(extra="forbid")
@@ -60,72 +62,91 @@ class Overrides:
     learnt_group: str | None = None
 
 
-def given_overrides(given: Overrides | Mapping[str, Any] | None) -> Overrides:
-    """Return overrides as a record; a mapping has the fields of `Overrides`, paths as texts too.
+def as_overrides(overrides: Overrides | Mapping[str, Any] | None) -> Overrides:
+    """Return overrides as a record.
+
+    Parameters
+    ----------
+    overrides : Overrides or mapping, optional
+        A record, or a mapping from its fields to values; a path may be a text.
 
     Raises
     ------
     MissionInputError
-        A key is no such field, or holds no such thing.
+        If a key is not a field of `Overrides`, or a value has the wrong type.
     """
-    if isinstance(given, Overrides):
-        return given
+    if isinstance(overrides, Overrides):
+        return overrides
     where = "what differs from the scenario"
-    return validate(Overrides, dict(given or {}), where, MissionInputError, what="`Overrides`")
+    return validate(Overrides, dict(overrides or {}), where, MissionInputError, what="`Overrides`")
 
 
-def resolve_scenario(loaded: LoadedScenario, given: Overrides | Mapping[str, Any] | None = None) -> Scenario:
-    """Return the scenario with the overrides, its paths absolute.
+def resolve_scenario(
+    loaded: LoadedScenario, overrides: Overrides | Mapping[str, Any] | None = None
+) -> Scenario:
+    """Return the scenario with the overrides and with absolute paths.
 
     Relative paths of a scenario file start at the folder of that file.
 
+    Parameters
+    ----------
+    loaded : LoadedScenario
+        The scenario and its file.
+    overrides : Overrides or mapping, optional
+        What differs from the scenario.
+
     Raises
     ------
     MissionInputError
-        The overrides contradict each other, or the scenario.
+        If the overrides contradict each other, or the scenario.
     ScenarioError
-        The scenario does not hold with them.
+        If the scenario with the overrides breaks the schema.
     """
-    overrides = given_overrides(given)
-    table = loaded.scenario.moved(loaded.path.resolve().parent).to_dict()
-    _change_asset(table, overrides)
+    overrides = as_overrides(overrides)
+    folder = loaded.path.resolve().parent
+    table = loaded.scenario.with_paths_from(folder).to_dict()
+    _override_asset(table, overrides)
     if overrides.library:
         design = table["belief"].get("design")
-        table["belief"] = {"kind": "library", "file": str(overrides.library.resolve()), "design": design}
+        file = str(overrides.library.resolve())
+        table["belief"] = {"kind": "library", "file": file, "design": design}
     if overrides.calibration:
-        table["calibration"] |= {"source": "file", "file": str(overrides.calibration.resolve())}
-    file = table["calibration"]["file"]
-    if file and not is_of_parameters(file):
-        _tailor(table)
-    elif any(part.get("design") == CALIBRATED_DESIGN_NAME for part in _wings(table)):
-        raise MissionInputError(said("assets.no_calibration"))
+        table["calibration"]["source"] = "file"
+        table["calibration"]["file"] = str(overrides.calibration.resolve())
+    calibration_file = table["calibration"]["file"]
+    if calibration_file and not is_of_parameters(calibration_file):
+        _use_calibrated_design(table)
+    elif any(part.get("design") == CALIBRATED_DESIGN_NAME for part in _design_tables(table)):
+        raise MissionInputError(
+            "the design of a calibration is asked for, and there is no calibration file: give "
+            '--calibration, or `source = "file"` in the table `calibration`.'
+        )
+    source = str(loaded.path)
     if overrides.learnt:
         apply_learnt(table, overrides.learnt, overrides.learnt_group)
+        source += f" with {overrides.learnt}"
     if overrides.seed is not None:
         table["mission"]["seed"] = overrides.seed
-    beside = f" with {overrides.learnt}" if overrides.learnt else ""
-    return parse_scenario(table, f"{loaded.path}{beside}")
+    return parse_scenario(table, source)
 
 
-def _change_asset(table: dict[str, Any], overrides: Overrides) -> None:
-    """Let something else fly; what is said of the asset stays, as far as the other kind knows it."""
-    flown, library = table["asset"], overrides.strain_library
-    others = {"ssp": overrides.ssp, "fmu": overrides.fmu, "strain_library": library}
-    given = [(kind, file) for kind, file in others.items() if file]
-    if len(given) > 1:
-        raise MissionInputError("one asset flies: give one of an SSP file, --fmu and --strain-library.")
-    if library and (overrides.binding or overrides.library):
-        raise MissionInputError(said("assets.itself"))
-    if overrides.fmu and flown["kind"] in ("coupled", "ssp"):
-        raise MissionInputError(said("assets.several"))
-    if given and flown.get("patch"):
-        raise MissionInputError(said("assets.patch"))
-    for kind, file in given:
-        known = AssetSection.kinds()[kind].model_fields
-        place = file / FILE_NAME if library and file.is_dir() else file
-        kept = {key: value for key, value in flown.items() if key in known and value != ""}
-        table["asset"] = kept | {"kind": kind, "file": str(place.resolve())}
-    if library and flown["kind"] != "strain_library":
+def _override_asset(table: Table, overrides: Overrides) -> None:
+    """Change what flies in the table of a scenario.
+
+    The keys of the asset stay as far as the kind that flies has them.
+    """
+    former = table["asset"]
+    library = overrides.strain_library
+    files_by_kind = {"ssp": overrides.ssp, "fmu": overrides.fmu, "strain_library": library}
+    given_files = {kind: file for kind, file in files_by_kind.items() if file}
+    _check_asset_overrides(former, overrides, len(given_files))
+    for kind, file in given_files.items():  # there is one at most
+        keys_of_kind = AssetSection.kinds()[kind].model_fields
+        asset = {key: value for key, value in former.items() if key in keys_of_kind and value != ""}
+        if kind == "strain_library" and file.is_dir():
+            file = file / FILE_NAME
+        table["asset"] = asset | {"kind": kind, "file": str(file.resolve())}
+    if library and former["kind"] != "strain_library":
         table["belief"] = {"kind": "asset"}
     if overrides.binding:
         table["asset"]["binding"] = str(overrides.binding.resolve())
@@ -133,44 +154,89 @@ def _change_asset(table: dict[str, Any], overrides: Overrides) -> None:
         table["asset"]["isolated"] = False
 
 
-def _wings(table: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return the tables that may name a design."""
+def _check_asset_overrides(asset: Table, overrides: Overrides, file_count: int) -> None:
+    """Refuse overrides that contradict each other, or the table of the asset.
+
+    The number of files is that of the overrides which replace what flies.
+    """
+    if file_count > 1:
+        raise MissionInputError(
+            "one asset flies: give one of an SSP file, --fmu and --strain-library."
+        )
+    if overrides.strain_library and (overrides.binding or overrides.library):
+        raise MissionInputError(
+            "--strain-library is asset and model itself, and no FMU: give it without --binding and "
+            "--library."
+        )
+    if overrides.fmu and asset["kind"] in ("coupled", "ssp"):
+        raise MissionInputError(
+            "--fmu flies one FMU, and the scenario couples several: change its components."
+        )
+    if file_count and asset.get("patch"):
+        raise MissionInputError(
+            "`asset.patch` goes into the FMU that is packed of a design, and another asset is "
+            "flown: leave it out."
+        )
+
+
+def _design_tables(table: Table) -> list[Table]:
+    """Return the tables of a scenario that may name a design."""
     return [table["asset"], table["belief"], *table["asset"].get("component", ())]
 
 
-def _tailor(table: dict[str, Any]) -> None:
-    """Put the wing of the calibration file in the place of the designs that it describes."""
-    asset, belief = table["asset"], table["belief"]
+def _use_calibrated_design(table: Table) -> None:
+    """Replace the designs in the table of a scenario by that of the calibration file.
+
+    The design of the asset is replaced, and every other one that the twin believes as well.
+    """
+    asset = table["asset"]
+    belief = table["belief"]
     if asset["kind"] == "strain_library" and belief["kind"] == "asset":
-        raise MissionInputError(said("assets.own_samples"))
-    believed = belief.get("design")
-    for part in _wings(table):
-        if part.get("design") and (part is asset or part["design"] == believed):
+        raise MissionInputError(
+            "a strain library brings its own samples of its parameter: fly it without a "
+            "calibration file."
+        )
+    believed_design = belief.get("design")
+    for part in _design_tables(table):
+        design = part.get("design")
+        if design and (part is asset or design == believed_design):
             part["design"] = CALIBRATED_DESIGN_NAME
             if part.get("kind") == "design":
                 part["kind"] = "calibration"
 
 
 _PREDICTION_COPIES = 8
-"""The table, the checked copy, the copy ordered for the likelihood, and what the quantiles are taken from."""
+"""Copies of the predictions in memory: the table, the checked one, the one that is ordered for the
+likelihood, and those from which quantiles are taken."""
 _HISTORY_COPIES = 4
-"""Belief before and after the observation, its logarithm, and the smoothed one."""
+"""Copies of the beliefs: before and after the observation, its logarithm, and the smoothed one."""
 
 
 def scenario_bytes(scenario: Scenario) -> dict[str, float]:
-    """Return what the twin of a scenario keeps in memory, in words with its numbers, and its size [bytes]."""
-    states = prod(len(factor.levels) for factor in scenario.state)
-    controls, sensors = len(scenario.control), scenario.observation.count
-    steps, ahead = scenario.mission.steps, scenario.mission.prediction_steps
-    draws = 1 if scenario.calibration.source == "fixed" else scenario.calibration.draws
-    tables = sum(transition_bytes(len(factor.levels), controls) for factor in scenario.state)
-    belief = NUMBER * (states + sensors)
-    predictions = NUMBER * draws * states * controls * sensors
+    """Return the sizes of what the twin of a scenario keeps in memory [bytes].
+
+    The keys describe the parts in words, with their numbers.
+    """
+    state_count = prod(len(factor.levels) for factor in scenario.state)
+    control_count = len(scenario.control)
+    sensor_count = scenario.observation.count
+    draw_count = scenario.calibration.draw_count
+    steps = scenario.mission.steps
+    steps_ahead = scenario.mission.prediction_steps
+
+    transitions = f"{len(scenario.state)} state factors under {control_count} controls"
+    transition_sizes = [
+        transition_bytes(len(factor.levels), control_count) for factor in scenario.state
+    ]
+    predictions = f"{draw_count} draws of {sensor_count} sensors in {state_count} states"
+    prediction_size = NUMBER * draw_count * state_count * control_count * sensor_count
+    step_size = NUMBER * (state_count + sensor_count)
     return {
-        f"the transitions of {len(scenario.state)} state factors under {controls} controls": TRANSITION_COPIES
-        * tables,
-        f"{draws} draws of {sensors} sensors in {states} states": _PREDICTION_COPIES * predictions,
-        f"the beliefs of {steps} steps and {ahead} ahead": _HISTORY_COPIES * belief * (steps + ahead),
+        f"the transitions of {transitions}": TRANSITION_COPIES * sum(transition_sizes),
+        predictions: _PREDICTION_COPIES * prediction_size,
+        f"the beliefs of {steps} steps and {steps_ahead} ahead": (
+            _HISTORY_COPIES * step_size * (steps + steps_ahead)
+        ),
     }
 
 
@@ -180,84 +246,142 @@ def check_scenario_fits(scenario: Scenario) -> None:
     Raises
     ------
     InvalidModelError
-        It does not.
+        If it does not fit.
     """
     check_fits(scenario_bytes(scenario), "take fewer levels, state factors, draws or steps")
 
 
 def asset_source(scenario: Scenario) -> AssetSource:
-    """Return what a resolved scenario flies and what its twin believes.
+    """Return the source of what a resolved scenario flies and of what its twin believes.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        A scenario as `resolve_scenario` returns it.
 
     Raises
     ------
     MissionInputError
-        The scenario flies a strain library and names none, or one that is missing, damaged or does not fit;
-        or the twin cannot believe what it is told to.
+        If the scenario has no asset; if it flies a strain library and names none, or one that is
+        missing, damaged or does not fit; or if the twin cannot believe what it is to believe.
     InvalidModelError
-        The twin of the scenario does not fit in memory.
+        If the twin of the scenario does not fit in memory.
     """
     check_scenario_fits(scenario)
     flown: AssetSource = scenario.asset.source(scenario)
     believed: AssetSource = scenario.belief.source(scenario, flown)
-    if believed is flown:
+    if believed is flown:  # `belief.kind` is `asset`
         return flown
-    return PairedSource(flown, believed, differ=scenario.another_model)
+    if isinstance(flown, WatchedSource):
+        raise MissionInputError(NO_ASSET)
+    return PairedSource(flown, believed, differ=scenario.models_differ)
 
 
 def believed_source(scenario: Scenario) -> AssetSource:
-    """Return what the twin of a scenario believes; what flies is asked only where it is believed itself."""
+    """Return the source of what the twin of a scenario believes.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        A scenario as `resolve_scenario` returns it; it may lack an asset.
+
+    Raises
+    ------
+    MissionInputError
+        If the twin cannot believe what it is to believe.
+    InvalidModelError
+        If the twin of the scenario does not fit in memory.
+    """
     check_scenario_fits(scenario)
     source: AssetSource = scenario.belief.source(scenario, scenario.asset.source(scenario))
     return source
 
 
 class LearntFile(Section):
-    """What takes the place of tables of a scenario: for a new asset, and for groups of assets."""
+    """What replaces tables of a scenario: for a new asset, and for groups of assets."""
 
     format: Literal[1]
-    source: dict[str, Any] = Field(default_factory=dict)
-    transition: dict[str, Any] | None = None
-    observation: dict[str, Any] | None = None
-    calibration: dict[str, Any] | None = None
-    """Distribution of the parameter over the assets: what a new one begins with."""
-    group: dict[str, dict[str, dict[str, Any]]] = Field(default_factory=dict)
+    source: Table = Field(default_factory=dict)
+    transition: Table | None = None
+    observation: Table | None = None
+    calibration: Table | None = None
+    """Distribution of the parameter over the assets, with which a new one begins."""
+    group: dict[str, dict[str, Table]] = Field(default_factory=dict)
+    """The tables of each group of assets, by its name."""
+
+    def tables_of_group(self, group: str | None) -> dict[str, Table]:
+        """Return the tables of a group; those of a new asset if the file does not have it."""
+        if group in self.group:
+            return self.group[group]
+        tables = {
+            "transition": self.transition,
+            "observation": self.observation,
+            "calibration": self.calibration,
+        }
+        return {name: table for name, table in tables.items() if table is not None}
 
 
-def apply_learnt(table: dict[str, Any], path: Path, group: str | None = None) -> None:
-    """Put what was learnt in the place of what the twin of a scenario assumes; the truth stays as it is.
+def apply_learnt(table: Table, path: Path, group: str | None = None) -> None:
+    """Replace what the twin of a scenario assumes by what a fleet has learnt.
+
+    The truth of the scenario stays as it is.
 
     Parameters
     ----------
     table : dict
-        Of a scenario, in SI; changed.
+        The table of a scenario, in SI; it is changed.
     path : Path
-        Of the file.
+        The file of `uav-twin fleet learn`.
     group : str, optional
-        Its group: what was learnt of it where the file tells, else what holds for all.
+        The group of assets. If the file does not have it, what was learnt for a new asset is used.
 
     Raises
     ------
     MissionInputError
-        The file is none, or is of other controls or another parameter.
+        If the file is not of this kind, or has other controls or another parameter.
     """
     content = read_toml(path, MissionInputError, what="file of what was learnt")
-    found = validate(LearntFile, content, str(path), MissionInputError, what="a file of what was learnt")
-    learnt = found.group.get(
-        group or "", found.model_dump(include={"transition", "observation", "calibration"})
+    learnt_file = validate(
+        LearntFile, content, str(path), MissionInputError, what="a file of what was learnt"
     )
-    truth, given = table["truth"], table["calibration"]
-    if moves := learnt.get("transition"):
-        own, names = moves.get("probability", {}), sorted(entry["name"] for entry in table["control"])
-        kind = table["transition"]["kind"]
-        if sorted(own) != names or kind != "independent_worsening":
-            both = {"own": own, "names": names}
-            raise MissionInputError(said("assets.learnt_controls", path=path, **both, kind=kind))
-        if truth["kind"] == "random_growth":
-            truth["probability"] = truth["probability"] or table["transition"]["probability"]
-    if drawn := learnt.get("calibration"):
-        if drawn.get("parameter") != given["parameter"]:
-            of = drawn.get("parameter"), given["parameter"]
-            raise MissionInputError(said("assets.learnt_parameter", path=path, of=of))
-        table["calibration"] = {"draws": given["draws"], "file": given["file"], "source": "normal"}
-    for name, part in learnt.items():
-        table[name] |= part or {}
+    learnt = learnt_file.tables_of_group(group)
+    if learnt.get("transition"):
+        _check_learnt_transition(table, learnt["transition"], path)
+        truth = table["truth"]
+        if truth["kind"] == "random_growth" and not truth["probability"]:
+            # The truth had the probabilities of the twin by default, and keeps them.
+            truth["probability"] = table["transition"]["probability"]
+    if learnt.get("calibration"):
+        learnt_parameter = learnt["calibration"].get("parameter")
+        table["calibration"] = _normal_calibration(table["calibration"], learnt_parameter, path)
+    for name, learnt_table in learnt.items():
+        table[name] |= learnt_table  # its keys replace those of the scenario
+
+
+def _check_learnt_transition(
+    table: Mapping[str, Any], transition: Mapping[str, Any], path: Path
+) -> None:
+    """Refuse learnt probabilities that are not for the controls and the kind of a scenario."""
+    learnt_controls = transition.get("probability", {})
+    controls = sorted(control["name"] for control in table["control"])
+    kind = table["transition"]["kind"]
+    if sorted(learnt_controls) != controls or kind != "independent_worsening":
+        raise MissionInputError(
+            f"{path} has probabilities for {comma_list(learnt_controls)}, and the scenario has the "
+            f"controls {comma_list(controls)} and transitions of the kind {kind}."
+        )
+
+
+def _normal_calibration(
+    calibration: Mapping[str, Any], learnt_parameter: object, path: Path
+) -> Table:
+    """Return the table `calibration` of a normal distribution, still without its moments.
+
+    The file of what was learnt has parameter, mean and standard deviation.
+    """
+    if learnt_parameter != calibration["parameter"]:
+        raise MissionInputError(
+            f"{path} has learnt {learnt_parameter}, and the parameter of the scenario is "
+            f"{calibration['parameter']}."
+        )
+    return {"draws": calibration["draws"], "file": calibration["file"], "source": "normal"}

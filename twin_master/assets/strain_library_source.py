@@ -1,8 +1,8 @@
-"""The strain library of the authors of Kapteyn et al. 2021 as what is flown and what the twin believes.
+"""The strain library of the authors of Kapteyn et al. 2021, as an asset and as a model.
 
-`UAVconfig.json`, read from their repository as it is, holds the strains of their finite element model for a
-grid of damage states, two controls and thirty draws of Young's modulus. It serves as an observation model,
-and as an asset whose state may lie between the levels of the grid.
+`UAVconfig.json`, read from their repository as it is, contains the strains of their finite element
+model for a grid of damage states, two controls and thirty draws of Young's modulus. It serves as a
+model of the observations, and as an asset whose state may lie between the levels of the grid.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,25 +15,31 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.json_file import read_json
-from twin_master.assets.asset_source import LIBRARY_COPY, Asset, AssetReading, AssetSource, StatelessAsset
-from twin_master.assets.parameter import ParameterDraws
-from twin_master.errors import (
-    MissionInputError,
-    check_names,
-    said,
+from reporting.words import comma_list
+from twin_master.assets.asset_source import (
+    LIBRARY_COPY,
+    Asset,
+    AssetReading,
+    AssetSource,
+    StatelessAsset,
 )
+from twin_master.assets.parameter import ParameterDraws
+from twin_master.errors import MissionInputError, check_names
 from twin_master.network.graphical_model import Factor, GraphicalModel, StateSpace
+from twin_master.scenario.kinds import AssetSection, BeliefSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import AssetSection, BeliefSection
 
 FILE_NAME = "UAVconfig.json"
 """Name of the file in the authors' repository UAV-Digital-Twin."""
 REPOSITORY = "https://github.com/michaelkapteyn/UAV-Digital-Twin"
 """Where the authors of Kapteyn et al. 2021 published their strain library."""
-_TOLERANCE = 1e-9
+_LOAD_FACTOR_TOLERANCE = 1e-9
 
 REGION_NAMES = ("z1", "z2")
-PERCENT, MICROSTRAIN = 1e-2, 1e-6
+PERCENT = 1e-2
+MICROSTRAIN = 1e-6
+_MEAN_ENTRY = "mean"
+"""Key of the strains at the mean of Young's modulus, beside those of the draws."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +49,15 @@ class StrainLibrary:
     Attributes
     ----------
     states : StateSpace
-        Stiffness loss of the regions z1 and z2, fractions.
+        The stiffness losses of the regions z1 and z2, fractions.
     controls : tuple of str
-        For example "2g", "3g".
-    young_modulus_factor : (E,) dimensionless
-        The draws e.
-    strain_per_draw : (E, S, U, G) dimensionless
-        Strain of each draw, joint state, control and gauge.
-    strain : (S, U, G) dimensionless
-        The entry "mean": the solution at e = 1.0073, not the average of the draws.
+        The names of the controls: "2g", "3g".
+    young_modulus_factor : (E,) array
+        The draws of the factor e on Young's modulus [1].
+    strain_per_draw : (E, S, U, G) array
+        The strain of each draw, joint state, control and gauge [1].
+    strain : (S, U, G) array
+        The entry "mean": the solution at e = 1.0073, not the average of the draws [1].
     """
 
     states: StateSpace
@@ -62,88 +68,111 @@ class StrainLibrary:
 
     @property
     def gauge_count(self) -> int:
-        """Number G of gauges."""
+        """The number G of gauges."""
         return int(self.strain.shape[-1])
 
     def strain_at(self, stiffness_loss: Sequence[float], control_index: int) -> Float:
-        """Return the strain of a damage state between the levels, as an asset would have it.
+        """Return the strain in a damage state that may lie between the levels.
 
-        Multilinear in the stiffness losses, from the entry "mean".
+        It is interpolated in the stiffness losses, multilinearly, from the entry "mean".
 
         Parameters
         ----------
-        stiffness_loss : (regions,)
-            Fractions, inside the range of the levels.
+        stiffness_loss : (F,) sequence of float
+            The loss of each region as a fraction, inside the range of the levels.
         control_index : int
-            Of `controls`.
+            The index of the control among `controls`.
 
         Returns
         -------
-        (G,) dimensionless
+        (G,) array
+            The strain of each gauge [1].
 
         Raises
         ------
         MissionInputError
-            The state lies outside the levels.
+            If the state lies outside the levels.
         """
         strain = self.strain[:, control_index].reshape(*self.states.shape, -1)
-        for factor, value in zip(self.states.factors, stiffness_loss, strict=True):
-            known = factor.levels
-            if not known[0] <= value <= known[-1]:
-                why = said("assets.covers", factor=factor, ends=(known[0], known[-1]), value=value)
-                raise MissionInputError(why)
-            weights = [np.interp(value, known, level) for level in np.eye(len(known))]
+        # Each pass interpolates in one region, and so removes the first axis.
+        for factor, loss in zip(self.states.factors, stiffness_loss, strict=True):
+            levels = factor.levels
+            if not levels[0] <= loss <= levels[-1]:
+                raise MissionInputError(
+                    f"the strain library covers {factor.name} from {levels[0]:g} to "
+                    f"{levels[-1]:g}, got {loss:g}"
+                )
+            # The weight of a level is the piecewise linear function that is 1 there.
+            weights = [np.interp(loss, levels, unit) for unit in np.eye(len(levels))]
             strain = np.tensordot(weights, strain, axes=1)
         return strain
 
 
 def load_strain_library(path: str | Path) -> StrainLibrary:
-    """Read the authors' library.
+    """Read the authors' strain library.
 
     Parameters
     ----------
     path : str or Path
-        The file `UAVconfig.json`, or the folder (such as a clone of their repository) that holds it.
+        The file `UAVconfig.json`, or the folder that contains it, such as a clone of their
+        repository.
 
     Raises
     ------
     MissionInputError
-        If the file cannot be read, is no JSON, lacks an entry (it is named), or has values that are not in
-        the published format.
+        If the file cannot be read, is not JSON, lacks an entry (which the message names), or is not
+        in the published format.
     """
     path = Path(path)
     file = path / FILE_NAME if path.is_dir() else path
     content = read_json(file, MissionInputError, what="strain library")
     try:
-        return _arranged(content)
+        return _parse_library(content)
     except KeyError as error:
-        why = said("assets.lacks", file=file, error=error, file_name=FILE_NAME)
-        raise MissionInputError(why) from error
+        raise MissionInputError(
+            f"the strain library {file} lacks the entry {error}; is it the file {FILE_NAME} as "
+            "published?"
+        ) from error
     except (TypeError, ValueError, AttributeError, IndexError) as error:
-        raise MissionInputError(said("assets.unread", file=file, error=error)) from error
+        raise MissionInputError(
+            f"the strain library {file} is not in the published format: {error}"
+        ) from error
 
 
-def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
-    levels = content["states"]
-    if len(levels) != len(REGION_NAMES):
-        raise ValueError(said("assets.regions", regions=len(REGION_NAMES), came=len(levels)))
+def _parse_library(content: Mapping[str, Any]) -> StrainLibrary:
+    """Return the library that the authors' file contains.
+
+    Its entry `observations[z1][z2][control][draw]` has the strain of each gauge in microstrain; z1
+    and z2 are losses in percent, and the draw is a factor on Young's modulus, or "mean".
+    """
+    levels_by_region = content["states"]
+    if len(levels_by_region) != len(REGION_NAMES):
+        raise ValueError(
+            f"expected the levels of {len(REGION_NAMES)} regions under 'states', got "
+            f"{len(levels_by_region)}"
+        )
     controls = tuple(str(control) for control in content["controls"])
     observations = content["observations"]
-    first = observations[str(levels[0][0])][str(levels[1][0])][controls[0]]
-    draws = [key for key in first if key != "mean"]
-    gauges = len(first["mean"])
+    first_z1, first_z2 = (str(levels[0]) for levels in levels_by_region)
+    first_entry = observations[first_z1][first_z2][controls[0]]
+    draws = [key for key in first_entry if key != _MEAN_ENTRY]
+    gauge_count = len(first_entry[_MEAN_ENTRY])
     rows = []
-    for draw, z1, z2, control in product(("mean", *draws), *levels, controls):
+    for draw, z1, z2, control in product((_MEAN_ENTRY, *draws), *levels_by_region, controls):
         row = observations[str(z1)][str(z2)][control][draw]
-        if np.shape(row) != (gauges,) or not np.all(np.isfinite(np.asarray(row, dtype=np.float64))):
-            raise ValueError(f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauges} finite strains")
+        if not _is_finite_vector(row, gauge_count):
+            raise ValueError(
+                f"observations[{z1}][{z2}][{control}][{draw}] must hold {gauge_count} finite "
+                "strains"
+            )
         rows.append(row)
-    table = np.array(rows, dtype=np.float64).reshape(len(draws) + 1, -1, len(controls), gauges) * MICROSTRAIN
+    # The axes are the draw ("mean" first), the joint state of both regions, control and gauge.
+    shape = (len(draws) + 1, -1, len(controls), gauge_count)
+    table = np.array(rows, dtype=np.float64).reshape(shape) * MICROSTRAIN
     table.setflags(write=False)
-    factors = (
-        Factor(name, tuple(float(level) * PERCENT for level in given))
-        for name, given in zip(REGION_NAMES, levels, strict=True)
-    )
+    factors = []
+    for name, levels in zip(REGION_NAMES, levels_by_region, strict=True):
+        factors.append(Factor(name, tuple(float(level) * PERCENT for level in levels)))
     return StrainLibrary(
         states=StateSpace(tuple(factors)),
         controls=controls,
@@ -153,69 +182,104 @@ def _arranged(content: Mapping[str, Any]) -> StrainLibrary:
     )
 
 
+def _is_finite_vector(row: Any, length: int) -> bool:
+    """Return whether a row consists of a number of finite numbers."""
+    if np.shape(row) != (length,):
+        return False
+    return bool(np.all(np.isfinite(np.asarray(row, dtype=np.float64))))
+
+
 class StrainLibrarySection(AssetSection):
-    """A strain library in the authors' format."""
+    """A strain library in the authors' format flies."""
 
     kind: Literal["strain_library"] = "strain_library"
-    own_figures: ClassVar = True
+    has_unique_model: ClassVar = True
     file: str | None = None
 
-    kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     def source(self, scenario: Scenario) -> "StrainLibrarySource":
-        """Return the library, read.
+        """Return the source of the library, which is read.
 
         Raises
         ------
         MissionInputError
-            No file is named, or the library is missing, damaged or does not fit the scenario.
+            If no file is named, or the library is missing, damaged or does not fit the scenario.
         """
         if self.file is None:
-            where = REPOSITORY, FILE_NAME
-            raise MissionInputError(said("assets.authors", scenario=scenario, where=where))
-        return _read(scenario, Path(self.file))
+            raise MissionInputError(
+                f"the scenario {scenario.mission.name} flies the strain library of the paper's "
+                "authors, which does not come with this program: clone their public repository "
+                f"UAV-Digital-Twin ({REPOSITORY}) and name its file {FILE_NAME} by "
+                "`--strain-library FILE`, or as `asset.file` in a copy of the scenario."
+            )
+        return _source_of_file(scenario, Path(self.file))
 
 
 class StrainLibraryBelief(BeliefSection):
-    """A strain library in the authors' format as the twin's model of an FMU."""
+    """A strain library in the authors' format is the twin's model of an FMU."""
 
     kind: Literal["strain_library"] = "strain_library"
-    own_figures: ClassVar = True
+    has_unique_model: ClassVar = True
     file: str
 
-    kept: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"file": LIBRARY_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "StrainLibrarySource":
-        """Return the library, read.
+        """Return the source of the library, which is read.
 
         Raises
         ------
         MissionInputError
-            A strain library flies, or the library is missing, damaged or does not fit the scenario.
+            If a strain library flies, or the library is missing, damaged or does not fit the
+            scenario.
         """
         if not scenario.asset.is_fmu:
-            raise MissionInputError(said("assets.believed"))
-        return _read(scenario, Path(self.file))
+            raise MissionInputError(
+                "a strain library flies, and the twin is to believe one: set `belief.kind` to "
+                "`asset`."
+            )
+        return _source_of_file(scenario, Path(self.file))
 
 
 class StrainLibrarySource(AssetSource):
-    """A strain library in the format of the authors of Kapteyn et al. 2021, as model and as asset."""
+    """A strain library of the authors of Kapteyn et al. 2021, as model and as asset.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario.
+    library : StrainLibrary
+        The library.
+    path : Path, optional
+        Its file, of which a run folder gets a copy.
+    """
 
     label = "strain library"
 
-    def __init__(self, scenario: Scenario, library: StrainLibrary, path: Path | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, library: StrainLibrary, path: Path | None = None
+    ) -> None:
         super().__init__(scenario)
-        self.places = {} if path is None else {LIBRARY_COPY: path}
+        self.file_paths = {} if path is None else {LIBRARY_COPY: path}
         self._library = library
-        loads = {action.name: action.control for action in scenario.action}
-        names = [loads.get(name, name) for name in scenario.control_names]
-        check_names("the scenario has the", "the strain library", [("control", names, library.controls)])
-        self._control_index = [library.controls.index(name) for name in names]
-        if scenario.observation.count != library.gauge_count or scenario.state_names != library.states.names:
-            raise MissionInputError(said("assets.gauges", library=library, scenario=scenario))
+        # An action flies under the loads of its control.
+        control_of_action = {action.name: action.control for action in scenario.action}
+        names = [control_of_action.get(name, name) for name in scenario.control_names]
+        check_names(
+            "the scenario has the", "the strain library", [("control", names, library.controls)]
+        )
+        self._control_indices = [library.controls.index(name) for name in names]
+        has_same_gauges = scenario.observation.count == library.gauge_count
+        if not has_same_gauges or scenario.state_names != library.states.names:
+            raise MissionInputError(
+                f"the strain library has {library.gauge_count} gauges and the states "
+                f"{comma_list(library.states.names)}, and the scenario asks for "
+                f"{scenario.observation.count} and {comma_list(scenario.state_names)}."
+            )
 
-    def uncertain(self) -> tuple[str, int]:
-        """Return that it has samples of its own, and how many."""
+    def draw_summary(self) -> tuple[str, int]:
+        """Return where the draws come from, in words, and their number."""
         return "the samples of the strain library", len(self._library.young_modulus_factor)
 
     def draws(self, seed: int) -> ParameterDraws:
@@ -230,42 +294,54 @@ class StrainLibrarySource(AssetSource):
         )
 
     def observation_table(self, draws: ParameterDraws, model: GraphicalModel) -> Float:
-        """Return the library's strains (E, S, U, G) in the order of the scenario's states and controls.
+        """Return the library's strains (E, S, U, G) for the states and controls of the scenario.
 
         Raises
         ------
         InvalidModelError
-            A level of the scenario is none of the library.
+            If a level of the scenario is not a level of the library.
         """
-        rows = [self._library.states.index(tuple(state)) for state in model.states.coordinates]
-        return self._library.strain_per_draw[:, rows][:, :, self._control_index]
+        states = [tuple(state) for state in model.states.coordinates]
+        rows = [self._library.states.index(state) for state in states]
+        return self._library.strain_per_draw[:, rows][:, :, self._control_indices]
 
     def open(self) -> Asset:
-        """Return the library's solution at the mean parameter, interpolated between its damage levels."""
-        names, values = self._scenario.state_names, [control.values for control in self._scenario.control]
+        """Return an asset with the strains at the mean of the parameter.
+
+        They are interpolated between the damage levels.
+        """
+        names = self._scenario.state_names
+        control_values = [control.values for control in self._scenario.control]
 
         def observe(control: Mapping[str, float], health: Mapping[str, float]) -> AssetReading:
-            index = self._control_index[values.index(dict(control))]
-            return AssetReading(self._library.strain_at([health[name] for name in names], index))
+            control_index = self._control_indices[control_values.index(dict(control))]
+            losses = [health[name] for name in names]
+            return AssetReading(self._library.strain_at(losses, control_index))
 
         return StatelessAsset(observe)
 
 
-def _read(scenario: Scenario, path: Path) -> StrainLibrarySource:
-    """Return the library of a file; beside another model, a control such as `3g` must be that load factor.
+def _source_of_file(scenario: Scenario, path: Path) -> StrainLibrarySource:
+    """Return the source of a library that is read from a file.
+
+    Beside another model, a control such as `3g` must have that load factor in the scenario.
 
     Raises
     ------
     MissionInputError
-        It is another one: asset and model would fly different turns.
+        If it has another one: asset and model would fly different turns.
     """
-    for control in scenario.control if scenario.another_model else ():
-        named, given = control.name.removesuffix("g"), control.values.get("load_factor")
-        try:
-            expected = float(named)
-        except ValueError:
-            continue
-        if given is not None and abs(given - expected) > _TOLERANCE:
-            factors = expected, given
-            raise MissionInputError(said("assets.load_factor", control=control, factors=factors))
+    if scenario.models_differ:
+        for control in scenario.control:
+            try:
+                library_load_factor = float(control.name.removesuffix("g"))
+            except ValueError:
+                continue  # the name of the control contains no load factor
+            load_factor = control.values.get("load_factor", library_load_factor)
+            if abs(load_factor - library_load_factor) > _LOAD_FACTOR_TOLERANCE:
+                raise MissionInputError(
+                    f"the strain library flies the control {control.name} at load factor "
+                    f"{library_load_factor:g}, and the scenario gives the model of the design "
+                    f"{load_factor:g}: set `load_factor` to {library_load_factor:g}."
+                )
     return StrainLibrarySource(scenario, load_strain_library(path), path)

@@ -1,4 +1,4 @@
-"""A structure from a mesh or matrices: its file, reduced and packed as the asset, or believed as a model."""
+"""A structure from a mesh or matrices: reduced and packed as the asset, or believed as a model."""
 
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -15,54 +15,64 @@ from twin_master.assets.asset_source import (
     AssetSource,
 )
 from twin_master.assets.fmu_source import FMU_COPY, FmuSection, FmuSource
-from twin_master.assets.reduced_model import NamedStructure, RecordedStructure, ReducedModelSource
-from twin_master.errors import MissionInputError, said
+from twin_master.assets.recorded_structure import RecordedStructure
+from twin_master.assets.reduced_model import NamedStructure, ReducedModelSource
+from twin_master.errors import MissionInputError
+from twin_master.scenario.kinds import BeliefSection, FileSection
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import BeliefSection, FileSection
 
-FLOWN_COPY, MODEL_COPY = "asset/flown/structure.toml", "asset/model/structure.toml"
+FLOWN_COPY = "asset/flown/structure.toml"
+"""The file of the structure that flies, inside a run folder."""
+MODEL_COPY = "asset/model/structure.toml"
+"""The file of the structure that the twin believes, inside a run folder."""
 
 
 class StructureFiles(FileSection):
-    """A table that names a structure file, and with it the mesh or the matrices beside that."""
+    """A table that names a structure file, which names a mesh or matrices beside it."""
 
     def all_files(self) -> dict[str, Path]:
-        """Return all files by the places of their copies, those that the structure names among them.
+        """Return all files, those that the structure names too, by the paths of their copies.
 
         Raises
         ------
         InvalidDesignError
-            The structure file cannot be read or is wrong.
+            If the structure file cannot be read or is wrong.
         MissionInputError
-            One of its files does not lie beside it.
+            If one of its files is not beside it.
         """
         from fe.structure.design import load_structure
 
-        found = super().all_files()
+        files = super().all_files()
         copy = self.copies()["structure"]
-        file = found[copy]
-        design = load_structure(file)
-        for inner in map(PurePosixPath, design.files):
-            if inner.is_absolute() or ".." in inner.parts:
-                raise MissionInputError(said("assets.beside", what=design.what, inner=inner, file=file))
-            found[f"{PurePosixPath(copy).parent}/{inner}"] = file.parent / inner
-        return found
+        structure_file = files[copy]
+        design = load_structure(structure_file)
+        for name in design.files:
+            relative_path = PurePosixPath(name)
+            if relative_path.is_absolute() or ".." in relative_path.parts:
+                raise MissionInputError(
+                    f"the {design.what} {relative_path} of {structure_file} does not lie beside "
+                    f"it, and a run keeps copies of both: move the {design.what} into the folder "
+                    "of the structure file, and name it without its folder."
+                )
+            copy_of_file = PurePosixPath(copy).parent / relative_path
+            files[str(copy_of_file)] = structure_file.parent / relative_path
+        return files
 
 
 class StructureSection(StructureFiles, FmuSection):
-    """The FMU that is packed of a structure."""
+    """The FMU that is packed from a structure."""
 
     kind: Literal["structure"] = "structure"
     structure: str
     binding: str = ""
-    """A binding of one's own; without one it follows from the structure file."""
+    """A binding of the user; by default it follows from the structure file."""
     packed: Literal["python", "compiled"] = "python"
-    """What evaluates the FMU: Python, or C compiled here."""
+    """What evaluates the FMU: Python, or C that is compiled on this machine."""
 
-    kept: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "structure": FLOWN_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"binding": BINDING_COPY, "structure": FLOWN_COPY}
 
     def source(self, scenario: Scenario) -> "StructureFmuSource":
-        """Return the FMU of the structure."""
+        """Return the source of the FMU."""
         return StructureFmuSource(scenario, self)
 
 
@@ -72,66 +82,77 @@ class StructureBelief(StructureFiles, BeliefSection):
     kind: Literal["structure"] = "structure"
     structure: str
 
-    kept: ClassVar[Mapping[str, str]] = {"structure": MODEL_COPY}
+    copy_paths: ClassVar[Mapping[str, str]] = {"structure": MODEL_COPY}
 
     def source(self, scenario: Scenario, flown: AssetSource) -> "ReducedModelSource":
-        """Return the model of the structure."""
+        """Return the source of the model."""
         return ReducedModelSource(scenario, section=self)
 
 
 class StructureFmuSource(NamedStructure, FmuSource):
-    """The FMU that is packed of a structure."""
+    """The FMU that is packed from a structure."""
 
+    # Both base classes define it: an FMU flies with the parameters of the true asset.
     parameters = FmuSource.parameters
 
     def binding(self) -> Binding:
-        """Return the binding: one of its own, or that which follows from the structure."""
+        """Return the binding of the user, or that which follows from the structure."""
         if self._folder is not None or self.section.binding:
             return super().binding()
         from fmu_asset.structures import structure_binding
 
-        return structure_binding(self.design, self._frequencies())
+        return structure_binding(self.design, self._frequency_count())
 
-    def _check_calibration(self, binding: Binding) -> tuple[str, ...]:
+    def _check_calibration(self, binding: Binding) -> None:
+        """Refuse a form of FMU that cannot be packed here, and a calibration that does not fit."""
         from fmu_asset.packing.structure_fmu import check_form
 
         check_form(self.section.packed)
         self._check_parameter(believed=isinstance(self._scenario.belief, AssetBelief))
-        return ()
 
-    def _observed(self, binding: Binding, role: str = "") -> slice:
+    def _observation_slice(self, binding: Binding, role: str = "") -> slice:
+        """Return the positions of a role in the binding; none if features of modes are observed."""
         if self._scenario.observation.modes is None:
-            return super()._observed(binding, role)
+            return super()._observation_slice(binding, role)
         self._check_observed()
-        return slice(0)
+        return slice(0)  # the features are identified from accelerations
 
-    def _fitted(self, binding: Binding, folder: Path) -> Binding:
-        if "binding" not in self.section.own_files():  # whose names may be others
+    def _fit_to_fmu(self, binding: Binding, scratch: Path) -> Binding:
+        """Return the binding, after the structure is checked; it is not packed for a check."""
+        has_user_binding = "binding" in self.section.user_files()
+        if not has_user_binding:  # the parameters then have the names of the structure
             self._check_ranges(self.section.parameters)
         self.check_model()
         return binding
 
-    def _make(self, progress: Progress) -> dict[str, str]:
-        """Reduce the structure and pack the FMU."""
-        self.model = self.reduced(progress)
+    def _build(self, progress: Progress) -> dict[str, str]:
+        """Reduce the structure and pack the FMU; return the hashes of both."""
+        self.model = self.load_reduced_model(progress)
         if not self.path(BINDING_COPY).exists():
             from fmu_asset.structures import structure_binding_text
 
-            text = structure_binding_text(self.design, self._frequencies())
+            text = structure_binding_text(self.design, self._frequency_count())
             atomic_write_text(self.path(BINDING_COPY), text)
         with progress.stage("Packing the FMU"):
             self._pack(progress)
-        return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": hash_file(self.path(FMU_COPY))}
+        fmu_hash = hash_file(self.path(FMU_COPY))
+        return {FLOWN_DESIGN_HASH: self.model.design_hash, "fmu": fmu_hash}
 
     def _pack(self, progress: Progress) -> None:
+        """Pack the reduced model as the FMU in the run folder."""
         from fmu_asset.packing.structure_fmu import build_fmu
 
         assert self.model is not None
         build_fmu(self.model, self.path(FMU_COPY), kind=self.section.packed, replace=True)
 
     def open(self) -> Asset:
-        """Return the FMU at its start; where modes are observed, in motion with an identification behind."""
+        """Return the FMU in its initial state.
+
+        If modes are observed, each step of the asset records a motion and identifies its modes.
+        """
         if self._scenario.observation.modes is None:
             return super().open()
         assert self.model is not None
-        return RecordedStructure(self._scenario, self.model, self._session, self.binding(), self.parameters())
+        return RecordedStructure(
+            self._scenario, self.model, self._open_session, self.binding(), self.parameters()
+        )

@@ -1,4 +1,4 @@
-"""A scenario's asset, or a wing design, as an SSP file."""
+"""Writing the asset of a scenario, or a wing design, as an SSP file."""
 
 import re
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ from scenarios import binding_files
 from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.resolution import resolve_scenario
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario
 
 
@@ -38,7 +38,8 @@ def export_scenario(
 ) -> Path:
     """Write the asset of a scenario as an SSP file.
 
-    The parameters of the scenario, its seeds drawn, and its constant loads stand in the parameter set.
+    The parameter set of the file contains the parameters of the scenario, the values that are drawn
+    for its seeds, and its constant loads.
 
     Parameters
     ----------
@@ -47,102 +48,169 @@ def export_scenario(
     out : Path
         The file to write.
     seed : int, optional
-        Seed of the run, from which the seeds of the FMUs are drawn; that of the scenario by default.
+        The seed of the run, from which the seeds of the FMUs are drawn; by default that of the
+        scenario.
     replace_file : bool
         Whether an existing file may be replaced.
+
+    Returns
+    -------
+    Path
+        The file.
 
     Raises
     ------
     MissionInputError
-        The scenario flies no FMU.
+        If the scenario flies no FMU.
     FmuError
-        The FMUs do not fit.
+        If the FMUs do not fit.
     """
     scenario = resolve_scenario(loaded, {"seed": seed})
     source = scenario.asset.source(scenario)
     if not isinstance(source, FmuSource):
-        raise MissionInputError(said("assets.no_fmu", name=scenario.mission.name, kind=scenario.asset.kind))
+        raise MissionInputError(
+            f"the scenario {scenario.mission.name} flies no FMU (its kind is "
+            f"`{scenario.asset.kind}`); only FMUs can be exported."
+        )
     source.check()
     with scratch_folder() as scratch:
         source.prepare(scratch, reporter())
         binding = source.binding()
+        parameters = source.parameters()
         if isinstance(source, SeveralSource):
             wiring = source.wiring()
         else:
-            binding = _with_own_names(binding, source.path(FMU_COPY), source.parameters())
-            wiring = single_system(scenario.mission.name, source.path(FMU_COPY), binding)
-        wiring, names = _with_values(wiring, binding, source.parameters(), scenario.asset.constant_load)
-        stop = binding.binding.start_time + scenario.mission.steps * binding.interval
-        return write_ssp(wiring, out, parameter_names=names, stop_time=stop, replace=replace_file)
+            fmu = source.path(FMU_COPY)
+            binding = _with_unbound_parameters(binding, fmu, parameters)
+            wiring = system_of_one_fmu(scenario.mission.name, fmu, binding)
+        names = _parameter_names(wiring, binding)
+        wiring = _with_values(wiring, binding, parameters, scenario.asset.constant_load)
+        stop_time = binding.binding.start_time + scenario.mission.steps * binding.interval
+        return write_ssp(
+            wiring,
+            out,
+            parameter_names=names,
+            stop_time=stop_time,
+            replace=replace_file,
+        )
 
 
 def export_design(design: Path | None, out: Path, *, replace_file: bool) -> Path:
-    """Write the wing of a design, the shipped one if absent, as an SSP file with one component."""
+    """Write the wing of a design as an SSP file with one component.
+
+    Parameters
+    ----------
+    design : Path, optional
+        The file of the design; by default the shipped one.
+    out : Path
+        The file to write.
+    replace_file : bool
+        Whether an existing file may be replaced.
+
+    Returns
+    -------
+    Path
+        The file.
+    """
     wing = load_design(design)
     binding = load_binding(binding_files()["uav_wing"])
     with scratch_folder() as scratch:
         fmu = pack_wing(wing, scratch / "wing.fmu").path
-        wiring, names = _with_values(single_system(wing.name, fmu, binding), binding, {}, {})
+        wiring = system_of_one_fmu(wing.name, fmu, binding)
+        names = _parameter_names(wiring, binding)
+        wiring = _with_values(wiring, binding, {}, {})
         return write_ssp(wiring, out, parameter_names=names, replace=replace_file)
 
 
-def single_system(name: str, fmu: Path, binding: Binding) -> Wiring:
-    """Return a system of one FMU, named as its binding, whose connectors are the variables of the binding."""
-    own = re.sub(r"[^A-Za-z0-9_]", "_", binding.name)
-    inputs = [scalar.variable for role in INPUT_ROLES for scalar in binding.inputs(role).values()]
-    outputs = dict.fromkeys(
-        [*binding.observation_variables, *(scalar.variable for scalar in binding.monitor.values())]
-    )
+def system_of_one_fmu(name: str, fmu: Path, binding: Binding) -> Wiring:
+    """Return a system of one FMU, whose connectors are the variables of its binding.
+
+    Parameters
+    ----------
+    name : str
+        The name of the system.
+    fmu : Path
+        The FMU.
+    binding : Binding
+        Its binding, after which the component is named.
+    """
+    component_name = re.sub(r"[^A-Za-z0-9_]", "_", binding.name)
+    inputs = []
+    for role in INPUT_ROLES:
+        inputs += [scalar.variable for scalar in binding.inputs(role).values()]
+    monitors = [scalar.variable for scalar in binding.monitor.values()]
+    outputs = list(dict.fromkeys([*binding.observation_variables, *monitors]))  # each once
     parameters = [parameter.variable for parameter in binding.parameter.values()]
-    connectors = [
-        *(Connector(variable, "input") for variable in inputs),
-        *(Connector(variable, "output") for variable in outputs),
-        *(Connector(variable, "parameter") for variable in parameters),
-    ]
-    connections = [
-        *(Connection(Endpoint("", v), Endpoint(own, v)) for v in (*inputs, *parameters)),
-        *(Connection(Endpoint(own, v), Endpoint("", v)) for v in outputs),
-    ]
-    component = Component(own, fmu)
-    return Wiring(SystemStructure(name, (component,), tuple(connectors), tuple(connections)))
+
+    connectors = [Connector(variable, "input") for variable in inputs]
+    connectors += [Connector(variable, "output") for variable in outputs]
+    connectors += [Connector(variable, "parameter") for variable in parameters]
+    connections = []
+    for variable in (*inputs, *parameters):
+        system_end = Endpoint("", variable)
+        connections.append(Connection(system_end, Endpoint(component_name, variable)))
+    for variable in outputs:
+        system_end = Endpoint("", variable)
+        connections.append(Connection(Endpoint(component_name, variable), system_end))
+    components = (Component(component_name, fmu),)
+    return Wiring(SystemStructure(name, components, tuple(connectors), tuple(connections)))
 
 
-def _with_own_names(binding: Binding, fmu: Path, parameters: Mapping[str, float]) -> Binding:
-    """Return a binding that also has the parameters which go by their own names in the FMU."""
+def _with_unbound_parameters(
+    binding: Binding, fmu: Path, parameters: Mapping[str, float]
+) -> Binding:
+    """Return a binding that also has the parameters which it lacks and the FMU has.
+
+    Effects add such parameters, which a scenario calls by their names in the FMU.
+    """
     description = read_fmu(fmu)
-    added = {
-        name: ParameterBinding(variable=name, unit=variable.unit or "1")
-        for name in parameters
-        if name not in binding.parameter and (variable := description.variable(name)) is not None
-    }
-    return binding.model_copy(update={"parameter": {**binding.parameter, **added}})
+    bound_parameters = dict(binding.parameter)
+    for name in parameters:
+        if name in binding.parameter:
+            continue
+        variable = description.variable(name)
+        if variable is not None:
+            unit = variable.unit or "1"
+            bound_parameters[name] = ParameterBinding(variable=name, unit=unit)
+    return binding.model_copy(update={"parameter": bound_parameters})
 
 
 def _with_values(
     wiring: Wiring, binding: Binding, parameters: Mapping[str, float], load: Mapping[str, float]
-) -> tuple[Wiring, dict[Endpoint, str]]:
-    """Return the system with the values of a scenario, and the binding's names for its parameters."""
+) -> Wiring:
+    """Return the system with values of parameters and loads, which are in the binding's units."""
+    # The values of the system's connectors, in the units of the system.
     system = system_description(wiring)
     exchange = Exchange(system, binding)
-    settings = exchange.settings(parameters)
+    initial_values = exchange.settings(parameters)
     for name, value in load.items():
         slot = exchange.slot("load", name)
-        settings.append(
-            InitialValue(slot.variable.kind, slot.variable.reference, slot.numbers(value).tolist())
-        )
-    given: dict[str, dict[str, ComponentSetting]] = {
-        name: {key: ComponentSetting(number) for key, number in values.items()}
-        for name, values in system.settings_of_components(settings).items()
-    }
-    components = tuple(
-        replace(part, settings={**part.settings, **given.get(part.name, {})})
-        for part in wiring.structure.components
-    )
-    names = {
-        system.ends[item.variable][0].end: name
-        for table in (binding.parameter, binding.load)
-        for name, item in table.items()
-        if len(system.ends[item.variable]) == 1
-    }
-    span = binding.binding.start_time, None
-    return Wiring(replace(wiring.structure, components=components, span=span)), names
+        variable = slot.variable
+        numbers = slot.numbers(value).tolist()
+        initial_values.append(InitialValue(variable.kind, variable.reference, numbers))
+    # The same values at the components to which the connectors lead.
+    values_by_component = system.settings_of_components(initial_values)
+    components = []
+    for component in wiring.structure.components:
+        settings = dict(component.settings)
+        for variable_name, number in values_by_component.get(component.name, {}).items():
+            settings[variable_name] = ComponentSetting(number)
+        components.append(replace(component, settings=settings))
+    start_time = binding.binding.start_time
+    structure = replace(wiring.structure, components=tuple(components), span=(start_time, None))
+    return Wiring(structure)
+
+
+def _parameter_names(wiring: Wiring, binding: Binding) -> dict[Endpoint, str]:
+    """Return the binding's names of the parameters and loads by their ends.
+
+    A parameter that leads to several components has no end of its own, and is left out.
+    """
+    system = system_description(wiring)
+    names = {}
+    for bound_variables in (binding.parameter, binding.load):
+        for name, bound_variable in bound_variables.items():
+            ends = system.ends[bound_variable.variable]
+            if len(ends) == 1:
+                names[ends[0].end] = name
+    return names

@@ -1,4 +1,4 @@
-"""The wing FMU on the test bench: the laboratory experiments of the calibration, flown through FMI."""
+"""The laboratory experiments of the calibration, made with the wing FMU through FMI."""
 
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -24,18 +24,18 @@ BINDING = "uav_wing_laboratory"
 
 
 class FmuTestBench(ExitStack):
-    """The wing FMU as a `calibration.virtual_wing.TestBench`: it is loaded and let go through FMI alone.
+    """The wing FMU as a `calibration.virtual_wing.TestBench`, loaded and released through FMI.
 
-    A weight is a tip force in the quasi-static response, and the displacement of its point of application is
-    read. A release is the parameter `initial_tip_displacement` of the transient response; each sample of the
-    record is a communication step. The FMU runs in a worker process of its own.
+    A weight is a tip force in the quasi-static response; the displacement of the load point is
+    read. A release is the parameter `initial_tip_displacement` of the transient response; each
+    sample of the record is a communication step. The FMU runs in a worker process of its own.
 
     Parameters
     ----------
     fmu : Path
         The wing FMU.
     truth : DigitalState
-        Its true state; the geometry is that of the FMU's wing.
+        The true state of the wing; its geometry is that of the FMU's wing.
 
     Raises
     ------
@@ -48,33 +48,72 @@ class FmuTestBench(ExitStack):
     def __init__(self, fmu: Path, truth: DigitalState) -> None:
         super().__init__()
         self._fmu = Path(fmu)
-        declared = [item.name for item in read_fmu(fmu).variables]
-        regions = [name.removeprefix("health.") for name in declared if name.startswith("health.")]
+        regions = []
+        for variable in read_fmu(fmu).variables:
+            if variable.name.startswith("health."):
+                regions.append(variable.name.removeprefix("health."))
         self._binding = load_binding(binding_files()[BINDING]).with_regions(regions)
         check_recorded(len(self._binding.observation["strain"].variables))
-        self._parameters = {
-            name: value for name, value in asdict(truth).items() if name not in ("geometry", "stiffness_loss")
-        }
-        self._health = dict(zip(regions, losses_of(truth.stiffness_loss, tuple(regions)), strict=True))
-        self._static = self._session(self._binding, {"response": float(QUASI_STATIC)})
+        self._parameters = asdict(truth)
+        del self._parameters["geometry"]  # that of the FMU's wing
+        del self._parameters["stiffness_loss"]  # the FMU has an input for each region
+        losses = losses_of(truth.stiffness_loss, tuple(regions))
+        self._health = dict(zip(regions, losses, strict=True))
+        self._static = self._open_session(self._binding, {"response": float(QUASI_STATIC)})
         self.callback(self._static.close)
 
     def tip_displacement(self, load: float) -> float:
-        """Return the displacement [m] of the load point, 5 cm from the tip, under a load there [N]."""
-        seen = self._static.step({"load_factor": 0.0}, self._health, {"tip_force": load})
-        return seen.extra["load_point_displacement"]
+        """Return the displacement of the load point, 5 cm from the tip, under a load there.
+
+        Parameters
+        ----------
+        load : float
+            The load [N].
+
+        Returns
+        -------
+        float
+            The displacement [m].
+        """
+        observation = self._static.step({"load_factor": 0.0}, self._health, {"tip_force": load})
+        return observation.extra["load_point_displacement"]
 
     def ring_down(
         self, initial_tip_displacement: float, duration: float, sampling_rate: float
     ) -> RingDownSignal:
-        """Hold the tip aside [m], let it go, and record for `duration` [s] at `sampling_rate` [Hz]."""
+        """Return the record of a gauge after the displaced tip is released.
+
+        Parameters
+        ----------
+        initial_tip_displacement : float
+            The displacement of the tip before the release [m].
+        duration : float
+            The length of the record [s].
+        sampling_rate : float
+            The sampling rate [Hz].
+
+        Returns
+        -------
+        time : (N,) array
+            The time of each sample after the release [s].
+        signal : (N,) array
+            The signal of the recorded gauge [V].
+        """
         time = sampling_times(duration, sampling_rate)
         binding = self._binding.with_header(step_size=1.0 / sampling_rate)
-        release = {"response": float(TRANSIENT), "initial_tip_displacement": initial_tip_displacement}
-        with self._session(binding, release) as session:
-            session.reset(control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0})
-            recorded = simulate_from_now(session, time.size - 1, {})
-        return time, SENSITIVITY * recorded.values[:, RECORDED_GAUGE - 1]
+        release = {
+            "response": float(TRANSIENT),
+            "initial_tip_displacement": initial_tip_displacement,
+        }
+        with self._open_session(binding, release) as session:
+            session.reset(
+                control={"load_factor": 0.0}, health=self._health, load={"tip_force": 0.0}
+            )
+            # The first sample is the initial state, and each step gives a further one.
+            step_count = time.size - 1
+            history = simulate_from_now(session, step_count, {})
+        return time, SENSITIVITY * history.values[:, RECORDED_GAUGE - 1]
 
-    def _session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
+    def _open_session(self, binding: Binding, parameters: dict[str, float]) -> FmiAsset:
+        """Return the FMU with a binding, the true parameters and further ones."""
         return FmiAsset(self._fmu, binding, parameters=self._parameters | parameters)

@@ -1,41 +1,70 @@
 """The log evidence of each twin's observations, as a function of what a fleet can learn.
 
-Twins are independent given what they share, so that the log evidence of a fleet is the sum of theirs: exact,
-in any order, shard by shard. What the twins decided takes no part, for they decided by what they had seen.
+Twins are independent given the quantities that they share. The log evidence of a fleet is therefore
+the sum of theirs: exact, in any order, shard by shard. The controls that the twins chose take no
+part, because they were chosen from past observations alone.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from fe.compilation import compiled
 from reporting.arrays import Float, Index
-from twin_master.fleet.posterior import POINTS
+from twin_master.fleet.posterior import GRID_POINTS
 from twin_master.network.kernels import Lists, apply_blocks
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.network.transition import predecessor_lists
 from twin_master.network.twin import build_graphical_model, factor_tables
 from twin_master.scenario.schema import Scenario
 
+_LEARNABLE_KIND = "independent_worsening"
+
 
 @compiled
-def _on_points(
-    prior: Float, lists: Lists, probability: Float, control: Index, likelihood: Float, result: Float
+def _evidence_at_points(
+    prior: Float,
+    lists: Lists,
+    probability: Float,
+    control: Index,
+    likelihood: Float,
+    result: Float,
 ) -> None:
-    """Fill result (B, P) with the log evidence of B twins for probabilities (P, non-zeros) of P points.
+    """Fill `result` with the log evidence of B twins for the transitions at each of P points.
 
-    The likelihood (B, T, S) is scaled so that the largest of a row is 1.
+    This is the normalised forward pass of a hidden Markov model: each step predicts the belief,
+    weighs it with the likelihood, adds the logarithm of its sum, and normalises it.
+
+    Parameters
+    ----------
+    prior : (S,) array
+        The belief before the first step.
+    lists : Lists
+        The predecessors of the levels of each factor; their probabilities are not used.
+    probability : (P, non-zeros) array
+        The probabilities of the transitions in the lists at each point.
+    control : (B, T) array
+        The control in force in each step.
+    likelihood : (B, T, S) array
+        The likelihood of the states, scaled so that the largest of each step is 1.
+    result : (B, P) array
+        The log evidence; -inf if the observations are impossible.
     """
     twins, steps, size = likelihood.shape
     levels, first_row, start, source, _, _ = lists
-    belief, work = np.empty(size), np.empty(size)
+    belief = np.empty(size)
+    work = np.empty(size)
     for twin in range(twins):
         for point in range(len(probability)):
-            own = levels, first_row, start, source, probability[point], probability[point]
-            belief[:], result[twin, point] = prior, 0.0
+            # The loop takes no logarithms, so that the place of theirs can hold anything.
+            point_lists = levels, first_row, start, source, probability[point], probability[point]
+            belief[:] = prior
+            result[twin, point] = 0.0
             for t in range(steps):
                 if t > 0:
-                    apply_blocks(own, control[twin, t - 1], belief, belief, work)
+                    apply_blocks(point_lists, control[twin, t - 1], belief, belief, work)
                 total = 0.0
                 for state in range(size):
                     belief[state] *= likelihood[twin, t, state]
@@ -48,156 +77,266 @@ def _on_points(
                     belief[state] /= total
 
 
-def why_transitions_are_kept(scenario: Scenario) -> str:
-    """Return why a fleet cannot learn the transitions of a scenario, in words; empty where it can."""
-    if scenario.transition.kind != "independent_worsening":
+def reason_transitions_are_fixed(scenario: Scenario) -> str:
+    """Return why a fleet cannot learn the transitions of a scenario; empty if it can."""
+    if scenario.transition.kind != _LEARNABLE_KIND:
         return f"transitions of the kind `{scenario.transition.kind}` have no probability to worsen"
-    entries = scenario.transition.probability.values()
-    count = sum(len(entry) if isinstance(entry, dict) else 1 for entry in entries)
-    if count > max(POINTS):
-        return f"they have {count} probabilities to worsen, and {max(POINTS)} are learnt together at most"
+    count = len(_assumed_probabilities(scenario))
+    most = max(GRID_POINTS)
+    if count > most:
+        return f"they have {count} probabilities to worsen, and {most} are learnt together at most"
     return ""
+
+
+class _Cause(NamedTuple):
+    """The control and the factor of the state to which a probability to worsen belongs.
+
+    The factor is empty if the probability holds for all factors.
+    """
+
+    control: str
+    factor: str
+
+    @property
+    def name(self) -> str:
+        """The name of the probability in records and files."""
+        return f"{self.control}, {self.factor}" if self.factor else self.control
+
+
+def _assumed_probabilities(scenario: Scenario) -> dict[_Cause, float]:
+    """Return the probabilities to worsen of a scenario, in the order of its controls."""
+    probabilities = {}
+    for control in scenario.control_names:
+        entry = scenario.transition.probability[control]
+        if isinstance(entry, Mapping):
+            for factor, probability in entry.items():
+                probabilities[_Cause(control, factor)] = probability
+        else:
+            probabilities[_Cause(control, "")] = entry
+    return probabilities
 
 
 def _predecessors(scenario: Scenario) -> Lists:
     """Return the predecessors of the levels of each factor of the state of a scenario."""
-    tables = factor_tables(scenario).values()
-    return predecessor_lists([np.stack([rows[name] for rows in tables]) for name in scenario.state_names])
+    tables_of_controls = factor_tables(scenario).values()
+    blocks = []
+    for name in scenario.state_names:
+        blocks.append(np.stack([tables[name] for tables in tables_of_controls]))
+    return predecessor_lists(blocks)
+
+
+def _entry_probabilities(lists: Lists) -> Float:
+    """Return the probabilities in lists of predecessors, a (non-zeros,) array."""
+    _, _, _, _, probability, _ = lists
+    return probability
 
 
 @dataclass(frozen=True)
-class Worsening:
-    """The K probabilities to worsen that are learnt of a scenario, and what its transitions make of them.
+class TransitionFamily:
+    """The transitions of a scenario as a linear function of K probabilities to worsen.
 
-    K is 0 where its transitions stay as they are assumed; `kept_because` says why.
+    Each entry of the lists of predecessors depends on one of the probabilities. K is 0 if the
+    transitions stay as the scenario assumes them.
 
     Attributes
     ----------
     names : tuple of str
-        One for each probability: the control, and the factor where each has its own.
-    assumed : (K,)
-        What the scenario assumes.
+        The names of the probabilities: the control, and the factor if each has its own.
+    assumed : (K,) array
+        The probabilities that the scenario assumes.
     lists : Lists
-        Predecessors of the levels of each factor of the state.
-    place : (non-zeros,)
-        Number of the probability of each entry of the lists, which is linear in it.
-    ends : (2, non-zeros)
-        The entry where its probability is 0, and 1.
-    prior : (S,)
-        p(D_0).
-    kept_because : str
-        Why the transitions are not learnt, in words; empty where they are.
+        The predecessors of the levels of each factor of the state.
+    parameter_index : (non-zeros,) array
+        The index of the probability on which each entry of the lists depends.
+    entries_at_zero, entries_at_one : (non-zeros,) array
+        The entries of the lists if their probability to worsen is 0, and if it is 1.
+    prior : (S,) array
+        The belief p(D_0) before the first step.
+    reason_fixed : str
+        Why the transitions are not learnt; empty if they are.
     """
 
     names: tuple[str, ...]
     assumed: Float
     lists: Lists
-    place: Index
-    ends: Float
+    parameter_index: Index
+    entries_at_zero: Float
+    entries_at_one: Float
     prior: Float
-    kept_because: str = ""
+    reason_fixed: str = ""
 
     @classmethod
-    def kept(cls, scenario: Scenario, reason: str) -> "Worsening":
-        """Return none for a scenario whose transitions stay as assumed, for a reason."""
+    def fixed(cls, scenario: Scenario, reason: str) -> "TransitionFamily":
+        """Return the transitions of a scenario that are not learnt, for a reason."""
         lists = _predecessors(scenario)
-        ends = np.stack([lists[4], lists[4]])
-        place = np.zeros(len(lists[4]), dtype=np.int64)
-        return cls((), np.empty(0), lists, place, ends, build_graphical_model(scenario).prior, reason)
+        entries = _entry_probabilities(lists)
+        return cls(
+            names=(),
+            assumed=np.empty(0),
+            lists=lists,
+            parameter_index=np.zeros(len(entries), dtype=np.int64),
+            entries_at_zero=entries,
+            entries_at_one=entries,
+            prior=build_graphical_model(scenario).prior,
+            reason_fixed=reason,
+        )
 
     @classmethod
-    def of(cls, scenario: Scenario) -> "Worsening":
-        """Return those of a scenario whose transitions are of the kind `independent_worsening`."""
-        given = scenario.transition.probability
-        each = {c: entry if isinstance(entry, dict) else {"": entry} for c, entry in given.items()}
-        assumed = {(c, name): value for c in scenario.control_names for name, value in each[c].items()}
-
-        def lists_at(probability: float) -> Lists:
-            same = {"probability": dict.fromkeys(scenario.control_names, probability)}
-            transition = scenario.transition.model_copy(update=same)
-            return _predecessors(scenario.model_copy(update={"transition": transition}))
-
-        lists, other, keys = lists_at(0.25), lists_at(0.75), [*assumed]
-        rows = np.array(
-            [
-                keys.index((control, name if name in each[control] else ""))
-                for name, levels in zip(scenario.state_names, lists[0].tolist(), strict=True)
-                for control in scenario.control_names
-                for _ in range(levels)
-            ]
-        )
-        count = (lists[2][1:] - lists[2][:-1]).astype(np.int64)
-        slope = 2.0 * (other[4] - lists[4])
+    def learnable(cls, scenario: Scenario) -> "TransitionFamily":
+        """Return the transitions of a scenario of the kind `independent_worsening`."""
+        probabilities = _assumed_probabilities(scenario)
+        # Entries are linear in their probability, so that two values of it give all others. At
+        # 0 and 1 themselves some entries would vanish from the lists.
+        lists = _predecessors_at(scenario, 0.25)
+        entries = _entry_probabilities(lists)
+        slope = 2.0 * (_entry_probabilities(_predecessors_at(scenario, 0.75)) - entries)
         return cls(
-            tuple(f"{control}, {name}" if name else control for control, name in keys),
-            np.array([*assumed.values()]), lists, np.repeat(rows, count),
-            lists[4] + slope * [[-0.25], [0.75]], build_graphical_model(scenario).prior,
-        )  # fmt: skip
+            names=tuple(cause.name for cause in probabilities),
+            assumed=np.array(list(probabilities.values())),
+            lists=lists,
+            parameter_index=_parameter_index(scenario, list(probabilities), lists),
+            entries_at_zero=entries + slope * -0.25,
+            entries_at_one=entries + slope * 0.75,
+            prior=build_graphical_model(scenario).prior,
+        )
 
-    def probability(self, points: Float) -> Float:
-        """Return the entries of the lists (P, non-zeros) for probabilities (P, K) between 0 and 1."""
+    def entries(self, points: Float) -> Float:
+        """Return the entries of the lists at points (P, K), a (P, non-zeros) array."""
         if not self.names:
-            return np.tile(self.ends[0], (len(points), 1))
-        share = points.take(self.place, axis=1)
-        return np.asarray((1.0 - share) * self.ends[0] + share * self.ends[1])
+            return np.tile(self.entries_at_zero, (len(points), 1))
+        probability = points.take(self.parameter_index, axis=1)
+        return np.asarray(
+            (1.0 - probability) * self.entries_at_zero + probability * self.entries_at_one
+        )
 
 
-def scaled_likelihood(model: GaussianSensorModel, observed: Float, control: Index) -> tuple[Float, Float]:
-    """Return p(o_t | D_t, u_t) of B twins over the largest of each step (B, T, S), and the logs of that (B,).
+def _predecessors_at(scenario: Scenario, probability: float) -> Lists:
+    """Return the predecessors of a scenario in which all probabilities to worsen are equal."""
+    equal = {"probability": dict.fromkeys(scenario.control_names, probability)}
+    transition = scenario.transition.model_copy(update=equal)
+    return _predecessors(scenario.model_copy(update={"transition": transition}))
+
+
+def _parameter_index(scenario: Scenario, causes: list[_Cause], lists: Lists) -> Index:
+    """Return the index of the probability on which each entry of lists depends, (non-zeros,).
+
+    Rows of the lists are ordered by factor, then by control, then by level.
+    """
+    levels_of_factors, _, start, _, _, _ = lists
+    index_of_rows = []
+    for factor, level_count in zip(scenario.state_names, levels_of_factors.tolist(), strict=True):
+        for control in scenario.control_names:
+            cause = _Cause(control, factor)
+            if cause not in causes:  # the control has one probability for all factors
+                cause = _Cause(control, "")
+            index_of_rows += [causes.index(cause)] * level_count
+    entries_of_rows = (start[1:] - start[:-1]).astype(np.int64)
+    return np.repeat(np.array(index_of_rows), entries_of_rows)
+
+
+class ScaledLikelihood(NamedTuple):
+    """The likelihood of the states given the observations of B twins in T steps.
+
+    Attributes
+    ----------
+    values : (B, T, S) array
+        p(o_t | D_t, u_t), scaled so that the largest of each step is 1.
+    log_scale : (B,) array
+        The logarithm of the product of the scales of all steps.
+    """
+
+    values: Float
+    log_scale: Float
+
+
+def scaled_likelihood(
+    model: GaussianSensorModel, observed: Float, control: Index
+) -> ScaledLikelihood:
+    """Return the likelihood of the states given the observations of B twins.
 
     Parameters
     ----------
     model : GaussianSensorModel
-    observed, control
-        (B, T, G), SI, NaN where lost, and (B, T).
+        The model of the G sensors.
+    observed : (B, T, G) array
+        The observations in SI units; NaN where one was lost.
+    control : (B, T) array
+        The control in force in each step.
     """
-    rows = model.log_likelihood_sequence(observed.reshape(-1, observed.shape[-1]), control.ravel())
-    return _scaled(rows.reshape(*control.shape, -1))
+    twin_count, step_count = control.shape
+    all_steps = observed.reshape(-1, observed.shape[-1])
+    log_likelihood = model.log_likelihood_sequence(all_steps, control.ravel())
+    return _scaled(log_likelihood.reshape(twin_count, step_count, -1))
 
 
-def _scaled(log_likelihood: Float) -> tuple[Float, Float]:
-    best = log_likelihood.max(axis=2, keepdims=True)
-    return np.exp(log_likelihood - best), best.sum(axis=(1, 2))
+def _scaled(log_likelihood: Float) -> ScaledLikelihood:
+    """Return a likelihood scaled by its largest value in each step, from logarithms (B, T, S)."""
+    largest = log_likelihood.max(axis=2, keepdims=True)
+    return ScaledLikelihood(np.exp(log_likelihood - largest), largest.sum(axis=(1, 2)))
 
 
-def transition_evidence(worsening: Worsening, points: Float, likelihood: Float, control: Index) -> Float:
-    """Return the log evidence of B twins at P points (P, K): (B, P), up to a constant of each twin.
+def transition_evidence(
+    family: TransitionFamily, points: Float, likelihood: Float, control: Index
+) -> Float:
+    """Return the log evidence of B twins at P points, up to a constant of each twin.
 
     Parameters
     ----------
-    worsening : Worsening
-    points : (P, K)
-        Probabilities, between 0 and 1.
-    likelihood : (B, T, S)
-        Of `scaled_likelihood`.
-    control : (B, T)
-        Controls in force.
+    family : TransitionFamily
+        The transitions as a function of K probabilities.
+    points : (P, K) array
+        The probabilities, between 0 and 1.
+    likelihood : (B, T, S) array
+        The values of `scaled_likelihood`.
+    control : (B, T) array
+        The control in force in each step.
+
+    Returns
+    -------
+    (B, P) array
+        The log evidence; -inf if the observations of a twin are impossible.
     """
     result = np.empty((len(control), len(points)))
-    _on_points(worsening.prior, worsening.lists, worsening.probability(points), control, likelihood, result)
+    entries = family.entries(points)
+    _evidence_at_points(family.prior, family.lists, entries, control, likelihood, result)
     return result
 
 
-def node_evidence(
-    worsening: Worsening, probability: Float, model: GaussianSensorModel, observed: Float, control: Index
+def parameter_evidence(
+    family: TransitionFamily,
+    probability: Float,
+    model: GaussianSensorModel,
+    observed: Float,
+    control: Index,
 ) -> Float:
-    """Return the log evidence of B twins at E values of a parameter that does not change in time: (B, E).
+    """Return the log evidence of B twins at E values of a parameter that is constant in time.
 
     Parameters
     ----------
-    worsening : Worsening
-    probability : (K,)
-        To worsen.
+    family : TransitionFamily
+        The transitions as a function of K probabilities.
+    probability : (K,) array
+        The probabilities to worsen.
     model : GaussianSensorModel
-        Its draws are the values of the parameter.
-    observed, control
-        (B, T, G), SI, NaN where lost, and (B, T).
+        The model of the G sensors; its E draws are the values of the parameter.
+    observed : (B, T, G) array
+        The observations in SI units; NaN where one was lost.
+    control : (B, T) array
+        The control in force in each step.
+
+    Returns
+    -------
+    (B, E) array
+        The log evidence; -inf if the observations of a twin are impossible.
     """
     result = np.empty((len(control), model.draw_count))
-    for twin, (seen, in_force) in enumerate(zip(observed, control, strict=True)):
-        scaled, common = _scaled(
-            np.ascontiguousarray(np.moveaxis(model.log_density_of_draws(seen, in_force), 2, 0))
+    for twin in range(len(control)):
+        log_density = model.log_density_of_draws(observed[twin], control[twin])  # (T, S, E)
+        draws_first = np.ascontiguousarray(np.moveaxis(log_density, 2, 0))  # (E, T, S)
+        likelihood = _scaled(draws_first)
+        control_of_draws = np.tile(control[twin], (model.draw_count, 1))
+        evidence = transition_evidence(
+            family, probability[None], likelihood.values, control_of_draws
         )
-        alike = np.tile(in_force, (model.draw_count, 1))
-        result[twin] = transition_evidence(worsening, probability[None], scaled, alike)[:, 0] + common
+        result[twin] = evidence[:, 0] + likelihood.log_scale
     return result

@@ -1,208 +1,423 @@
 """What a fleet teaches: how fast damage grows, how noisy the sensors are, how the assets differ.
 
-For people, and as `learnt.toml`, with which a scenario is flown.
+The result is written for people, and as `learnt.toml`, with which a scenario is flown.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text, hash_record
 from reporting.progress import Progress, SilentProgress
-from reporting.toml_file import toml_text
-from reporting.words import counted
 from twin_master.assets.parameter import ParameterDraws
-from twin_master.errors import FleetError, said
+from twin_master.errors import FleetError
+from twin_master.fleet.checks import source_of
+from twin_master.fleet.configuration import fleet_config
 from twin_master.fleet.evidence import (
-    Worsening,
-    node_evidence,
+    TransitionFamily,
+    parameter_evidence,
+    reason_transitions_are_fixed,
     scaled_likelihood,
     transition_evidence,
-    why_transitions_are_kept,
 )
-from twin_master.fleet.flight import fleet_config, source_of
-from twin_master.fleet.posterior import Grid, Line, masses, narrowed, population, refined, shared
-from twin_master.fleet.reading import Known, known_twins, noticed
+from twin_master.fleet.lessons import LESSONS_NAME, write_learnt
+from twin_master.fleet.posterior import (
+    Axes,
+    Distribution,
+    LikelihoodGrid,
+    cell_probabilities,
+    likelihood_grid,
+    population_posterior,
+    resolve_density,
+    shared_posterior,
+)
+from twin_master.fleet.reading import TwinsOfScenario, flown_twins, notice_counts
 from twin_master.fleet.store import open_group
 from twin_master.mission.preparation import Knowledge
 from twin_master.network.sensor_model import GaussianSensorModel
 from twin_master.run_folder import to_json
+from twin_master.scenario.schema import Scenario
 
 if TYPE_CHECKING:
     import xarray as xr
 
 NOISE_TWINS = 100
-"""Twins of a group from which the noise is learnt: they know it to one part in a few hundred."""
+"""Twins of a group from which the noise is learnt, to one part in a few hundred."""
 LARGEST_NOISE = 3.0
-"""Factor on the assumed noise, and one over it, up to which is looked."""
+"""Largest factor on the assumed noise that is considered; the smallest is its inverse."""
 NOISE_POINTS = 13
-NODES, NODE_DEVIATIONS = 61, 6.0
-"""Values of the parameter, and how many deviations of its calibration they reach to either side."""
+"""Points of the grid of that factor."""
+NODES = 61
+"""Number of values of the calibrated parameter at which the evidence is computed."""
+NODE_DEVIATIONS = 6.0
+"""Standard deviations of the calibration that these values reach to either side."""
+_MOST_SHARED = 2
+"""Largest number of probabilities of which groups share a distribution."""
 
 
-@dataclass(frozen=True)
-class _Lessons:
-    """What the twins of one group teach, as far as no other group takes part.
+def learn_from_fleet(
+    folder: Path | str, out: Path | str = "learnt.toml", *, progress: Progress | None = None
+) -> dict[str, Any]:
+    """Learn from all twins of a fleet: growth of damage, noise of sensors, differences of assets.
 
-    Attributes
+    Parameters
     ----------
-    worsening : Worsening
-        The probabilities and what was assumed of them.
-    grid : Grid or None
-        Their likelihood; None where the transitions are not learnt.
-    flown : set of str
-        The controls under which a step was followed by another.
-    record : dict
-        Of the group, but for the probabilities.
-    """
+    folder : Path or str
+        The folder of the fleet, which may still fly.
+    out : Path or str
+        The file to write, for the override ``learnt`` of a mission or the key of that name of a
+        group.
+    progress : Progress, optional
+        Shows how far the work has come.
 
-    worsening: Worsening
-    grid: Grid | None
-    flown: set[str]
-    record: dict[str, Any]
-
-    @property
-    def marginals(self) -> tuple[Line, ...]:
-        """Posterior of each probability under a uniform prior."""
-        return () if self.grid is None else self.grid.marginals
-
-    def told(self, lines: Sequence[Line], flown: set[str]) -> dict[str, Any]:
-        """Return the record, with the posteriors of the probabilities, and the controls that have flown."""
-        told = zip(self.worsening.names, self.worsening.assumed.tolist(), lines, strict=True)
-        return self.record | {
-            "probability": {
-                name: {"assumed": assumed, "flown": name.partition(", ")[0] in flown, **line.figures}
-                for name, assumed, line in told
-            }
-        }
-
-
-def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Return the record of what the store of a fleet teaches, see `learn_from_fleet`; it may still grow.
-
-    The prior of each probability is uniform; that of several groups is a Beta distribution which they share.
+    Returns
+    -------
+    dict
+        What was learnt beside what was assumed. `groups` holds for each group by name
+        `probability` (by control; else `transitions_kept_because`), `noise_factor` and
+        `population`; `shared` what several groups share; `source` where it comes from.
 
     Raises
     ------
     RunFolderError, FleetError
-        There is no fleet, nothing has flown, or no state of its twins explains what was observed.
+        If there is no fleet, if nothing has flown, or if no state of its twins explains what was
+        observed.
     """
-    folder, progress = Path(folder), progress or SilentProgress()
+    record = learn_fleet(folder, progress=progress)
+    write_learnt(Path(out), Path(folder), record)
+    atomic_write_text(Path(folder) / LESSONS_NAME, to_json(record))
+    return record
+
+
+def learn_fleet(folder: Path | str, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Return the record of what the store of a fleet teaches; see `learn_from_fleet`.
+
+    The prior of each probability is uniform; if there are several groups, it is a Beta
+    distribution that they share.
+
+    Parameters
+    ----------
+    folder : Path or str
+        The folder of the fleet, which may still fly.
+    progress : Progress, optional
+        Shows how far the work has come.
+
+    Raises
+    ------
+    RunFolderError, FleetError
+        If there is no fleet, if nothing has flown, or if no state of its twins explains what was
+        observed.
+    """
+    folder = Path(folder)
     config = fleet_config(folder)
-    records, found = config["fleet"]["groups"], dict[str, _Lessons]()
-    with progress.stage("Learning", total=len(records), unit="groups") as stage:
-        for record in records:
-            group = open_group(folder, record["name"])
-            if parts := list(known_twins(folder, record, group)):
-                found[record["name"]] = _lessons(record, group, parts)
-            stage.advance()
-    if not found:
+    lessons = _lessons_of_groups(folder, config["fleet"]["groups"], progress or SilentProgress())
+    if not lessons:
         raise FleetError(f"{folder} holds no twin that has flown to its end: fly the fleet first.")
-    names, told = next(iter(found.values())).worsening.names, dict[str, Any]()
-    lines, everywhere = [lessons.marginals for lessons in found.values()], set[str]()
-    grids = [lessons.grid for lessons in found.values() if lessons.grid is not None]
-    are_alike = {each.worsening.names for each in found.values()} == {names}
-    if len(grids) > 1 and len(names) <= 2 and are_alike:
-        figures, lines = shared(grids)
-        everywhere = set().union(*(lessons.flown for lessons in found.values()))
-        told = {"shared": dict(zip(names, figures, strict=True))}
-    groups = {
-        name: lessons.told(own, lessons.flown | everywhere)
-        for (name, lessons), own in zip(found.items(), lines, strict=True)
-    }
+    record = _records(lessons)
     source = {
         "fleet": config["fleet"]["name"],
         "seed": config["fleet"]["seed"],
-        "twins": sum(group["twins"] for group in groups.values()),
+        "twins": sum(group["twins"] for group in record["groups"].values()),
         "config": hash_record({key: config[key] for key in ("kind", "format", "fleet")}),
         "program": config["provenance"]["versions"].get("uav-twin", ""),
     }
-    return {"source": source, "groups": groups} | told
-
-
-Seen = tuple[Knowledge, Float, Index]
-"""What twins know, what they saw (B, T, G + I), and the control in force (B, T)."""
-
-
-def _lessons(record: dict[str, Any], group: "xr.Dataset", parts: Sequence[Known]) -> _Lessons:
-    """Learn the noise first, for what else is learnt rests on it, then the rates, then the population."""
-    _, home, known = parts[0]
-    reason = why_transitions_are_kept(known.scenario)
-    worsening = Worsening.kept(known.scenario, reason) if reason else Worsening.of(known.scenario)
-    controls = known.scenario.control_names
-    given = group["control_index"].values.astype(np.int64)
-    # Behind the end of a recording nothing is observed, so that any control says the same.
-    observed, control = group["observed"].values.astype(np.float64), np.maximum(given, 0)
-    seen: list[Seen] = [(knowledge, observed[rows], control[rows]) for rows, _, knowledge in parts]
-    nodes = _nodes(home, known, real="recordings" in record) if len(parts) == 1 else None
-    noise = _noise(seen, worsening, nodes)
-    likely = []
-    for knowledge, shown, in_force in seen:
-        likelihood = scaled_likelihood(_noisier(knowledge.sensor_model, noise.mean), shown, in_force)[0]
-        evidence = transition_evidence(worsening, _possible(worsening)[None], likelihood, in_force)
-        explained = np.isfinite(evidence[:, 0])
-        likely.append((likelihood[explained], in_force[explained]))
-    twins = sum(len(in_force) for _, in_force in likely)
-    if not twins:
-        raise FleetError(said("fleet.unexplained", group=record["name"]))
-
-    def log_likelihood(points: Float) -> Float:
-        return np.asarray(sum(transition_evidence(worsening, points, *some).sum(axis=0) for some in likely))
-
-    grid = refined(log_likelihood, len(worsening.names)) if worsening.names else None
-    rows = np.concatenate([rows for rows, *_ in parts])
-    alarmed = int(np.sum(noticed(group, "alarm")[rows] > 0))
-    told = {"twins": twins, "left_out": len(rows) - twins, "alarmed": alarmed, "noise_factor": noise.figures}
-    if worsening.kept_because:
-        told["transitions_kept_because"] = worsening.kept_because
-    if nodes is not None:
-        learnt = np.array([marginal.mean for marginal in grid.marginals]) if grid else worsening.assumed
-        each = node_evidence(worsening, learnt, _noisier(known.sensor_model, noise.mean, nodes), *seen[0][1:])
-        mean, spread = population(nodes.values, each, known.draws.standard_deviation)
-        told["population"] = {"parameter": known.draws.name, "mean": mean.figures, "spread": spread.figures}
-    followed = np.unique(given[rows, :-1][given[rows, 1:] >= 0])
-    return _Lessons(worsening, grid, {controls[index] for index in followed}, told)
-
-
-def _possible(worsening: Worsening) -> Float:
-    """Return what is assumed, so that any worsening may happen."""
-    return worsening.assumed.clip(1e-3, 0.9)
+    return {"source": source, **record}
 
 
 @dataclass(frozen=True)
-class _Nodes:
-    """Values of the calibrated parameter (E,), their prior (E,), and what the sensors show there."""
+class _GroupLessons:
+    """What the twins of one group teach, as long as no other group takes part.
+
+    Attributes
+    ----------
+    family : TransitionFamily
+        The transitions as a function of the probabilities to worsen.
+    grid : LikelihoodGrid or None
+        The likelihood of the probabilities; None if the transitions are not learnt.
+    flown_controls : set of str
+        The controls under which a step was followed by another.
+    record : dict
+        The record of the group without its probabilities.
+    """
+
+    family: TransitionFamily
+    grid: LikelihoodGrid | None
+    flown_controls: set[str]
+    record: dict[str, Any]
+
+    @property
+    def marginals(self) -> tuple[Distribution, ...]:
+        """The posterior of each probability under a uniform prior."""
+        return () if self.grid is None else self.grid.marginals
+
+    def with_probabilities(
+        self, posteriors: Sequence[Distribution], flown_controls: set[str]
+    ) -> dict[str, Any]:
+        """Return the record of the group with its probabilities.
+
+        Parameters
+        ----------
+        posteriors : sequence of Distribution
+            The posterior of each probability.
+        flown_controls : set of str
+            The controls of which something was learnt.
+        """
+        probabilities = {}
+        for name, assumed, posterior in zip(
+            self.family.names, self.family.assumed.tolist(), posteriors, strict=True
+        ):
+            control = name.partition(", ")[0]
+            probabilities[name] = {
+                "assumed": assumed,
+                "flown": control in flown_controls,
+                **posterior.summary,
+            }
+        return {**self.record, "probability": probabilities}
+
+
+def _lessons_of_groups(
+    folder: Path, records: Sequence[dict[str, Any]], progress: Progress
+) -> dict[str, _GroupLessons]:
+    """Return what each group teaches, by name; groups of which nothing has flown are left out."""
+    lessons = {}
+    with progress.stage("Learning", total=len(records), unit="groups") as stage:
+        for record in records:
+            group = open_group(folder, record["name"])
+            flown = list(flown_twins(folder, record, group))
+            if flown:
+                lessons[record["name"]] = _learn_group(record, group, flown)
+            stage.advance()
+    return lessons
+
+
+def _records(lessons: dict[str, _GroupLessons]) -> dict[str, Any]:
+    """Return the records of all groups, and of what they share."""
+    grids = [lesson.grid for lesson in lessons.values() if lesson.grid is not None]
+    names = next(iter(lessons.values())).family.names
+    have_same_probabilities = {lesson.family.names for lesson in lessons.values()} == {names}
+    if len(grids) > 1 and len(names) <= _MOST_SHARED and have_same_probabilities:
+        return _records_with_shared_distribution(lessons, grids, names)
+    records = {}
+    for name, lesson in lessons.items():
+        records[name] = lesson.with_probabilities(lesson.marginals, lesson.flown_controls)
+    return {"groups": records}
+
+
+def _records_with_shared_distribution(
+    lessons: dict[str, _GroupLessons], grids: Sequence[LikelihoodGrid], names: Sequence[str]
+) -> dict[str, Any]:
+    """Return the records of groups whose probabilities share a distribution.
+
+    A control that flew in any group teaches something of it to all groups.
+    """
+    posterior = shared_posterior(grids)
+    flown_controls: set[str] = set()
+    for lesson in lessons.values():
+        flown_controls |= lesson.flown_controls
+    records = {}
+    for (name, lesson), probabilities in zip(lessons.items(), posterior.groups, strict=True):
+        records[name] = lesson.with_probabilities(probabilities, flown_controls)
+    shared = dict(zip(names, posterior.hyperparameters, strict=True))
+    return {"groups": records, "shared": shared}
+
+
+class _Observations(NamedTuple):
+    """The observations of B twins that share what they know, in T steps.
+
+    Attributes
+    ----------
+    knowledge : Knowledge
+        What the twins know.
+    observed : (B, T, G + I) array
+        The readings of sensors and inspections in SI units; NaN where there is none.
+    control : (B, T) array
+        The control in force in each step.
+    """
+
+    knowledge: Knowledge
+    observed: Float
+    control: Index
+
+    def first_twins(self, count: int) -> "_Observations":
+        """Return the observations of the first twins."""
+        return _Observations(self.knowledge, self.observed[:count], self.control[:count])
+
+
+class _WeighedSteps(NamedTuple):
+    """The scaled likelihood (B, T, S) of the states of B twins, and their controls (B, T)."""
+
+    likelihood: Float
+    control: Index
+
+
+def _learn_group(
+    record: dict[str, Any], group: "xr.Dataset", flown: Sequence[TwinsOfScenario]
+) -> _GroupLessons:
+    """Learn from the twins of one group.
+
+    The noise comes first, because everything else rests on it; then the probabilities to worsen,
+    then the population of the calibrated parameter.
+
+    Parameters
+    ----------
+    record : dict
+        The group in `config.json`.
+    group : Dataset
+        The group in the store.
+    flown : sequence of TwinsOfScenario
+        The twins that have flown, by scenario.
+    """
+    scenario = flown[0].knowledge.scenario
+    family = _transition_family(scenario)
+    observations = _observations(group, flown)
+    # With several scenarios, each twin has a calibration of its own, and there is no population.
+    nodes = None
+    if len(flown) == 1:
+        nodes = _parameter_nodes(flown[0], is_real="recordings" in record)
+    noise = _noise_factor(observations, family, nodes)
+    steps = _explained_steps(observations, family, noise.mean)
+    twin_count = sum(len(part.control) for part in steps)
+    if not twin_count:
+        raise FleetError(
+            "no state of the twins explains what was observed in group "
+            f"{record['name']}: nothing can be learnt of it; look at its model and its noise."
+        )
+    grid = _probability_grid(family, steps) if family.names else None
+    rows = np.concatenate([twins.rows for twins in flown])
+    lessons: dict[str, Any] = {
+        "twins": twin_count,
+        "left_out": len(rows) - twin_count,
+        "alarmed": int(np.sum(notice_counts(group, "alarm")[rows] > 0)),
+        "noise_factor": noise.summary,
+    }
+    if family.reason_fixed:
+        lessons["transitions_kept_because"] = family.reason_fixed
+    if nodes is not None:
+        lessons["population"] = _population(observations[0], family, grid, nodes, noise.mean)
+    flown_controls = _followed_controls(group, rows, scenario.control_names)
+    return _GroupLessons(family, grid, flown_controls, lessons)
+
+
+def _transition_family(scenario: Scenario) -> TransitionFamily:
+    """Return the transitions of a scenario, as a function of the probabilities that are learnt."""
+    reason = reason_transitions_are_fixed(scenario)
+    if reason:
+        return TransitionFamily.fixed(scenario, reason)
+    return TransitionFamily.learnable(scenario)
+
+
+def _observations(group: "xr.Dataset", flown: Sequence[TwinsOfScenario]) -> list[_Observations]:
+    """Return the observations of the twins of a group that have flown, by scenario."""
+    observed = group["observed"].values.astype(np.float64)
+    control = group["control_index"].values.astype(np.int64)
+    # After the end of a recording the store has control -1. Nothing is observed there, so that
+    # the evidence is the same for any control: take the first.
+    control = np.maximum(control, 0)
+    return [
+        _Observations(twins.knowledge, observed[twins.rows], control[twins.rows]) for twins in flown
+    ]
+
+
+def _followed_controls(group: "xr.Dataset", rows: Index, control_names: Sequence[str]) -> set[str]:
+    """Return the controls under which a step of some twin in the rows was followed by another."""
+    control = group["control_index"].values.astype(np.int64)[rows]
+    is_followed = control[:, 1:] >= 0
+    return {control_names[index] for index in np.unique(control[:, :-1][is_followed])}
+
+
+def _explained_steps(
+    observations: Sequence[_Observations], family: TransitionFamily, noise_factor: float
+) -> list[_WeighedSteps]:
+    """Return the likelihoods of the twins whose observations some course of states explains."""
+    point = _with_all_transitions_possible(family.assumed)[None]
+    parts = []
+    for knowledge, observed, control in observations:
+        sensor_model = with_noise_factor(knowledge.sensor_model, noise_factor)
+        likelihood = scaled_likelihood(sensor_model, observed, control).values
+        evidence = transition_evidence(family, point, likelihood, control)
+        is_explained = np.isfinite(evidence[:, 0])
+        parts.append(_WeighedSteps(likelihood[is_explained], control[is_explained]))
+    return parts
+
+
+def _with_all_transitions_possible(probability: Float) -> Float:
+    """Return assumed probabilities, moved away from 0 and 1 so that any damage may occur."""
+    return probability.clip(1e-3, 0.9)
+
+
+def _probability_grid(family: TransitionFamily, steps: Sequence[_WeighedSteps]) -> LikelihoodGrid:
+    """Return the likelihood of the probabilities to worsen, given all twins of a group."""
+
+    def log_likelihood(points: Float) -> Float:
+        evidence = [
+            transition_evidence(family, points, part.likelihood, part.control).sum(axis=0)
+            for part in steps
+        ]
+        return np.asarray(sum(evidence))
+
+    return likelihood_grid(log_likelihood, len(family.names))
+
+
+@dataclass(frozen=True)
+class _ParameterNodes:
+    """Values of the calibrated parameter at which the evidence of twins is computed.
+
+    Attributes
+    ----------
+    values : (E,) array
+        The equally spaced values.
+    prior : (E,) array
+        Their probabilities after the calibration.
+    predicted : (E, S, U, G) array
+        The noise-free readings of the sensors for each value, state and control, in SI units.
+    """
 
     values: Float
     prior: Float
     predicted: Float
 
 
-def _nodes(folder: Path, known: Knowledge, *, real: bool) -> _Nodes | None:
-    """Return values of the parameter about its calibration; None where it is fixed, or no model tells."""
-    draws = known.draws
+def _parameter_nodes(twins: TwinsOfScenario, *, is_real: bool) -> _ParameterNodes | None:
+    """Return values of the parameter about its calibration.
+
+    None if the parameter is fixed, or if no model predicts readings at any value of it.
+    """
+    knowledge = twins.knowledge
+    draws = knowledge.draws
     if draws.standard_deviation <= 0.0:
         return None
     deviations = np.linspace(-NODE_DEVIATIONS, NODE_DEVIATIONS, NODES)
     values = draws.mean + draws.standard_deviation * deviations
     prior = np.exp(-0.5 * deviations**2)
-    source = source_of(known.scenario, real=real)
-    source.prepare(folder, SilentProgress())
-    given = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
-    predicted = source.observation_table(given, known.model)
-    if len(predicted) != NODES:  # a library has draws of its own
+    source = source_of(knowledge.scenario, is_real=is_real)
+    source.prepare(twins.folder, SilentProgress())
+    nodes = ParameterDraws(draws.name, values, draws.mean, draws.standard_deviation, "nodes")
+    predicted = source.observation_table(nodes, knowledge.model)
+    if len(predicted) != NODES:  # an observation library has draws of its own
         return None
-    return _Nodes(values, prior / prior.sum(), predicted)
+    return _ParameterNodes(values, prior / prior.sum(), predicted)
 
 
-def _noisier(model: GaussianSensorModel, factor: float, nodes: _Nodes | None = None) -> GaussianSensorModel:
-    """Return a sensor model with a factor on its noise, and nodes in the place of its draws."""
+def with_noise_factor(
+    model: GaussianSensorModel, factor: float, predicted: Float | None = None
+) -> GaussianSensorModel:
+    """Return a sensor model with a factor on its noise.
+
+    Parameters
+    ----------
+    model : GaussianSensorModel
+        The model.
+    factor : float
+        The factor.
+    predicted : (E, S, U, G) array, optional
+        The noise-free readings at other values of the parameter; by default those of the model.
+    """
     return type(model)(
-        model.value_per_draw if nodes is None else nodes.predicted,
+        model.value_per_draw if predicted is None else predicted,
         model.standard_deviation * factor,
         average="inside" if model.averages_inside else "outside",
         model_error=model.model_error,
@@ -211,143 +426,90 @@ def _noisier(model: GaussianSensorModel, factor: float, nodes: _Nodes | None = N
     )
 
 
-def _noise(seen: Sequence[Seen], worsening: Worsening, nodes: _Nodes | None) -> Line:
-    """Return the posterior of the factor on the assumed noise, uniform in its logarithm before the data.
+def _noise_factor(
+    observations: Sequence[_Observations], family: TransitionFamily, nodes: _ParameterNodes | None
+) -> Distribution:
+    """Return the posterior of the factor on the assumed noise, uniform in its logarithm a priori.
 
-    The parameter of an asset is the same in all its steps: a twin that draws it anew in each takes a part of
-    the noise for it.
+    The parameter of an asset is the same in all its steps: a twin that averages over it in each
+    step anew would mistake a part of the noise for it. The nodes of the parameter avoid this.
     """
-    assumed = _possible(worsening)
-    some = [(one, shown[:NOISE_TWINS], control[:NOISE_TWINS]) for one, shown, control in seen[:NOISE_TWINS]]
+    some_twins = [part.first_twins(NOISE_TWINS) for part in observations[:NOISE_TWINS]]
 
-    def log_likelihood(factor: float) -> float:
-        total = 0.0
-        for knowledge, observed, control in some:
-            model = _noisier(knowledge.sensor_model, factor, nodes)
-            if nodes is None:
-                scaled, common = scaled_likelihood(model, observed, control)
-                evidence = transition_evidence(worsening, assumed[None], scaled, control)[:, 0] + common
-            else:
-                each = node_evidence(worsening, assumed, model, observed, control)
-                best = each.max(axis=1, keepdims=True)
-                evidence = best[:, 0] + np.log(np.exp(each - best) @ nodes.prior)
-            total += float(evidence[np.isfinite(evidence)].sum())
-        return total
+    def log_likelihood(axes: Axes) -> Float:
+        factors = np.exp(axes[0])
+        return np.array(
+            [_evidence_of_noise(some_twins, family, nodes, float(factor)) for factor in factors]
+        )
 
     bound = np.log(LARGEST_NOISE)
-    (axis,), found = narrowed(
-        lambda axes: np.array([log_likelihood(float(factor)) for factor in np.exp(axes[0])]),
-        (np.linspace(-bound, bound, NOISE_POINTS),),
-    )
-    return Line(axis, masses(found), np.exp)
+    widest_axis = np.linspace(-bound, bound, NOISE_POINTS)
+    (axis,), values = resolve_density(log_likelihood, (widest_axis,))
+    return Distribution(axis, cell_probabilities(values), np.exp)
 
 
-_Told = Mapping[str, Any]
-LESSONS_NAME = "learnt.json"
-"""In the folder of a fleet: what was learnt from it, for its report."""
-HEADING = """\
-# Learnt by `uav-twin fleet learn`. Fly with it: `uav-twin run SCENARIO --learnt THIS_FILE`, or
-# `learnt = "THIS_FILE"` in a group of a fleet.
-"""
+def _evidence_of_noise(
+    observations: Sequence[_Observations],
+    family: TransitionFamily,
+    nodes: _ParameterNodes | None,
+    factor: float,
+) -> float:
+    """Return the log evidence of twins for a factor on the noise; impossible twins are left out."""
+    probability = _with_all_transitions_possible(family.assumed)
+    total = 0.0
+    for knowledge, observed, control in observations:
+        if nodes is None:
+            model = with_noise_factor(knowledge.sensor_model, factor)
+            likelihood = scaled_likelihood(model, observed, control)
+            evidence = transition_evidence(family, probability[None], likelihood.values, control)
+            log_evidence = evidence[:, 0] + likelihood.log_scale
+        else:
+            model = with_noise_factor(knowledge.sensor_model, factor, nodes.predicted)
+            at_nodes = parameter_evidence(family, probability, model, observed, control)
+            log_evidence = _average_over_nodes(at_nodes, nodes.prior)
+        total += float(log_evidence[np.isfinite(log_evidence)].sum())
+    return total
 
 
-def learn_from_fleet(
-    folder: Path | str, out: Path | str = "learnt.toml", *, progress: Progress | None = None
+def _average_over_nodes(log_evidence: Float, prior: Float) -> Float:
+    """Return the log evidence (B,) averaged over nodes with a prior (E,), from (B, E) at nodes."""
+    largest = log_evidence.max(axis=1, keepdims=True)  # keeps the exponential from underflowing
+    return np.asarray(largest[:, 0] + np.log(np.exp(log_evidence - largest) @ prior))
+
+
+def _population(
+    observations: _Observations,
+    family: TransitionFamily,
+    grid: LikelihoodGrid | None,
+    nodes: _ParameterNodes,
+    noise_factor: float,
 ) -> dict[str, Any]:
-    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ.
+    """Return the record of the population of the calibrated parameter in a group.
 
     Parameters
     ----------
-    folder : Path
-        Of the fleet, which may still fly.
-    out : Path
-        The file to write, for the override ``learnt`` of a mission or the key of that name of a group.
-    progress : Progress, optional
-
-    Returns
-    -------
-    record : dict
-        What was learnt beside what was assumed: `groups`, by the name of each, with `probability` (by
-        control; else `transitions_kept_because`), `noise_factor` and `population`; `shared` over several
-        groups; `source`.
-
-    Raises
-    ------
-    RunFolderError, FleetError
-        There is no fleet, nothing has flown, or no state of its twins explains what was observed.
+    observations : _Observations
+        The observations of the group.
+    family : TransitionFamily
+        The transitions.
+    grid : LikelihoodGrid or None
+        The likelihood of the probabilities to worsen, whose posterior means are used; the assumed
+        ones if it is None.
+    nodes : _ParameterNodes
+        The values of the parameter.
+    noise_factor : float
+        The factor on the assumed noise.
     """
-    record = learn_fleet(folder, progress=progress)
-    write_learnt(Path(out), Path(folder), record)
-    atomic_write_text(Path(folder) / LESSONS_NAME, to_json(record))
-    return record
-
-
-def write_learnt(path: Path, folder: Path, record: Mapping[str, Any]) -> Path:
-    """Write what takes the place of the tables of a scenario, whole: for a new asset, and for each group.
-
-    A new asset has the means that the groups share, and the population of the parameter over the largest
-    group. Figures are in SI; what was assumed of the sensors stands in the folder of the fleet.
-    """
-    groups = record["groups"]
-    scenarios = {told["name"]: told["scenarios"][0] for told in fleet_config(folder)["fleet"]["groups"]}
-    tables = {name: _tables(group, group["probability"], scenarios[name]) for name, group in groups.items()}
-    largest = max(groups, key=lambda name: groups[name]["twins"])
-    means = record.get("shared", groups[largest]["probability"])
-    new = _tables(groups[largest], means, scenarios[largest])
-    content: dict[str, Any] = {"format": 1, "source": record["source"]} | new
-    if len(groups) > 1:
-        content["group"] = tables
-    return atomic_write_text(path, HEADING + toml_text(content))
-
-
-def _tables(
-    group: Mapping[str, Any], means: Mapping[str, Any], scenario: Mapping[str, Any]
-) -> dict[str, Any]:
-    probability: dict[str, Any] = {}
-    for name, told in group["probability"].items():
-        # of a control that never flew nothing was learnt
-        mean = means[name]["mean"] if told["flown"] else told["assumed"]
-        control, _, factor = name.partition(", ")
-        if factor:
-            probability.setdefault(control, {})[factor] = mean
-        else:
-            probability[control] = mean
-    noise = np.asarray(scenario["observation"]["standard_deviation"]) * group["noise_factor"]["mean"]
-    tables: dict[str, Any] = {"transition": {"probability": probability}} if probability else {}
-    tables["observation"] = {"standard_deviation": noise.tolist()}
-    if learnt := group.get("population"):
-        middle, spread = learnt["mean"], learnt["spread"]
-        total = np.linalg.norm([spread["mean"], spread["standard_deviation"], middle["standard_deviation"]])
-        tables["calibration"] = {
-            "parameter": learnt["parameter"], "mean": middle["mean"], "standard_deviation": float(total)
-        }  # fmt: skip
-    return tables
-
-
-def lesson_rows(record: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Return what was learnt as rows of a table: group, what, assumed, mean, 95 % interval."""
-    rows: list[tuple[str, ...]] = []
-    for name, group in record["groups"].items():
-        heading = f"{name}, {counted(group['twins'], 'twin')}"
-        heading += f", {group['alarmed']} with an alarm" if group["alarmed"] else ""
-        for control, rate in group["probability"].items():
-            mean, interval, off = "", "not flown", ""
-            if rate["flown"]:
-                low, high = rate["lower_95"], rate["upper_95"]
-                mean, interval = f"{rate['mean']:.4f}", f"{low:.4f} to {high:.4f}"
-                off = "" if low <= rate["assumed"] <= high else " (outside)"
-            title = f"probability to worsen, {control}"
-            rows.append((heading, title, f"{rate['assumed']:.4f}{off}", mean, interval))
-            heading = ""
-        if "transitions_kept_because" in group:
-            rows.append((heading, "transitions", "as assumed", "not learnt", ""))
-        lines = [("noise over the assumed", "1", group["noise_factor"])]
-        if told := group.get("population"):
-            lines += [(f"{told['parameter']}, {moment}", "", told[moment]) for moment in ("mean", "spread")]
-        for title, assumed, line in lines:
-            interval = f"{line['lower_95']:.4g} to {line['upper_95']:.4g}"
-            rows.append(("", title, assumed, f"{line['mean']:.4g}", interval))
-    for control, told in record.get("shared", {}).items():
-        mean = f"{told['mean']:.4f} ± {told['standard_deviation']:.2g}"
-        rows.append(("all groups", f"mean over groups, {control}", "", mean, ""))
-    return rows
+    probability = family.assumed
+    if grid is not None:
+        probability = np.array([marginal.mean for marginal in grid.marginals])
+    knowledge, observed, control = observations
+    model = with_noise_factor(knowledge.sensor_model, noise_factor, nodes.predicted)
+    log_evidence = parameter_evidence(family, probability, model, observed, control)
+    draws = knowledge.draws
+    population = population_posterior(nodes.values, log_evidence, draws.standard_deviation)
+    return {
+        "parameter": draws.name,
+        "mean": population.mean.summary,
+        "spread": population.deviation.summary,
+    }

@@ -13,39 +13,45 @@ from reporting.files import hash_file
 from reporting.former_names import with_present_names
 from reporting.toml_file import Fault, NotNegative, Number, read_toml, validate
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import FleetError, TwinMasterError, said
+from twin_master.errors import FleetError, TwinMasterError
 from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.scenario.reading import load_scenario, parse_scenario
+from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import Count, Flag, Name, Probability, Section, Seed, named_once
+from twin_master.scenario.section import (
+    Count,
+    Flag,
+    Name,
+    Probability,
+    Section,
+    Seed,
+    repeated_name_fault,
+)
 from twin_master.seeds import generator
 from twin_master.watch.feeds import is_broker
 from twin_master.watch.message import Fed
 
 SHARD = 256
-"""Twins that are flown in one piece, unless the file says otherwise."""
-
-
+"""Twins that are flown in one piece, unless the fleet file says otherwise."""
 LARGEST = 1_000_000
-"""Twins of a group, or of an ensemble."""
+"""Largest number of twins of a group, or of an ensemble."""
 
 
 Text = Annotated[str, Field(min_length=1)]
 
 
 class Spread(Section):
-    """A parameter of the true assets: normally distributed over the group."""
+    """A parameter of the true assets that is normally distributed over the group."""
 
     mean: Number
     standard_deviation: NotNegative = 0.0
 
 
 PRESENT_NAMES = {"group.inspections_a_turn": "inspections_per_step"}
-"""The present name of each key of a fleet file, by the location that it had before."""
+"""The present name of each key of a fleet file, by its former location."""
 
 
 class GroupSection(Section):
-    """Assets that share a scenario."""
+    """Assets that share a scenario, as a fleet file names them."""
 
     name: Name
     scenario: Text
@@ -55,30 +61,44 @@ class GroupSection(Section):
     calibrations: Text | None = None
     """A pattern of files: one asset for each calibration."""
     observations: Text | None = None
-    """A pattern of recordings, or `mqtt://HOST/TOPIC/+`: one real asset for each file, or for each topic."""
+    """A pattern of recordings, or `mqtt://HOST/TOPIC/+`: one real asset for each file or topic."""
     fmu: str | None = None
     binding: str | None = None
     calibration: str | None = None
     in_process: Flag = False
-    """FMUs run in the process that flies the shard, without a worker of their own: faster, and a crash ends
-    that process."""
+    """Whether FMUs run in the process that flies the shard, without a worker of their own.
+
+    This is faster, but a crash ends that process.
+    """
     learnt: str | None = None
     """A file of `uav-twin fleet learn`."""
     steps: Count | None = None
     parameters: dict[str, Spread] = Field(default_factory=dict)
     inspections_per_step: Count | None = None
-    """What `planner.inspections_per_step` is in this group, which then flies in one shard."""
+    """The value of `planner.inspections_per_step` in this group, which then flies in one shard."""
     true_probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
-    """What `truth.probability` is in this group."""
+    """The value of `truth.probability` in this group."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield other than one kind of members."""
-        kinds = self.count, self.fmus, self.calibrations, self.observations
-        yield sum(given is not None for given in kinds) != 1, said("fleet.members", name=self.name)
+        """Yield the fault that the group has no kind of members, or several."""
+        kinds = (self.count, self.fmus, self.calibrations, self.observations)
+        given_kinds = [kind for kind in kinds if kind is not None]
+        yield (
+            len(given_kinds) != 1,
+            f"the group `{self.name}` needs one of `count`, `fmus`, `calibrations` and "
+            "`observations`, which say how many assets it has",
+        )
+
+    @property
+    def pattern_key(self) -> str:
+        """The override that differs from asset to asset: "fmu", "calibration" or empty."""
+        if self.fmus:
+            return "fmu"
+        return "calibration" if self.calibrations else ""
 
 
 class FleetSection(Section):
-    """The fleet as a whole."""
+    """The fleet as a whole, as a fleet file describes it."""
 
     name: Name
     title: str = ""
@@ -94,36 +114,37 @@ class FleetFile(Section):
     group: Annotated[tuple[GroupSection, ...], Field(min_length=1)]
 
     def faults(self) -> Iterator[Fault]:
-        """Yield names that come twice."""
-        yield named_once("group", [group.name for group in self.group])
+        """Yield the fault that two groups have one name."""
+        yield repeated_name_fault("group", [group.name for group in self.group])
 
 
 @dataclass(frozen=True)
 class Member:
-    """One asset with its twin.
+    """One asset of a group with its twin.
 
     Attributes
     ----------
     row : int
-        Its number in the group.
+        Its number in the group, and its row in the store.
     name : str
+        The name of the asset.
     seed : int
-        What happens to it; the same mission flies with ``uav-twin run --seed``.
+        The seed of its mission; ``uav-twin run --seed`` flies the same mission.
     parameters : dict of str to float
-        Its true parameters, where the group spreads them, SI.
-    place : int
-        Of its scenario in the group.
+        Its true parameters in SI units, if they differ from asset to asset.
+    scenario_number : int
+        The number of its scenario in the group.
     file : Path or None
-        That sets it apart: its FMU, its calibration, or the recording of a real asset.
-    recording : tuple or None
-        What was observed of a real asset, as it goes to a worker.
+        The file that sets it apart: its FMU, its calibration, or the recording of a real asset.
+    recording : tuple of Fed or None
+        The observations of a real asset, as they are sent to a worker.
     """
 
     row: int
     name: str
     seed: int
     parameters: Mapping[str, float]
-    place: int = 0
+    scenario_number: int = 0
     file: Path | None = None
     recording: tuple[Fed, ...] | None = None
 
@@ -135,49 +156,68 @@ class Group:
     Attributes
     ----------
     name : str
+        The name of the group.
     scenarios : tuple of Scenario
-        Resolved; one for all assets, or one for each.
-    spreads : dict of str to Spread
-        Parameters that differ from asset to asset.
+        The resolved scenarios: one for all assets, or one for each.
+    parameter_spreads : dict of str to Spread
+        The parameters that differ from asset to asset.
     members : tuple of Member
+        The assets; empty if a broker will tell which there are.
     observations : str
-        Where those of real assets come from, a pattern of files or an address; empty where assets are flown.
-    file : dict of str to str
-        Name and hash of the file of the scenario of real assets.
+        Where the observations of real assets come from, a pattern of files or an address; empty if
+        assets are flown.
+    scenario_file : dict of str to str
+        The name and the hash of the file of the scenario.
     """
 
     name: str
     scenarios: tuple[Scenario, ...]
-    spreads: Mapping[str, Spread]
+    parameter_spreads: Mapping[str, Spread]
     members: tuple[Member, ...]
     observations: str = ""
-    file: Mapping[str, str] = field(default_factory=dict)
+    scenario_file: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """Return the group for `config.json`."""
-        found = {
+        record: dict[str, Any] = {
             "name": self.name,
             "scenarios": [scenario.portable().to_dict() for scenario in self.scenarios],
-            "parameters": {name: spread.model_dump() for name, spread in self.spreads.items()},
-            "members": [[member.name, member.seed, member.place] for member in self.members],
+            "parameters": {
+                name: spread.model_dump() for name, spread in self.parameter_spreads.items()
+            },
+            "members": [
+                [member.name, member.seed, member.scenario_number] for member in self.members
+            ],
         }
         if self.observations:
-            files = (member.file for member in self.members if member.file is not None)
-            whole = (path / JOURNAL_NAME if path.is_dir() else path for path in files)
-            found["recordings"] = [hash_file(path) for path in whole]
-        return found
+            files = [member.file for member in self.members if member.file is not None]
+            record["recordings"] = [_hash_recording(file) for file in files]
+        return record
+
+
+def _hash_recording(path: Path) -> str:
+    """Return the hash of a recording: of a file, or of the journal of a run folder."""
+    return hash_file(path / JOURNAL_NAME if path.is_dir() else path)
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """What is to be flown."""
+    """The plan of a fleet.
+
+    Attributes
+    ----------
+    head : FleetSection
+        Name, title, seed and size of shards.
+    groups : tuple of Group
+        The groups.
+    """
 
     head: FleetSection
     groups: tuple[Group, ...]
 
     @property
     def size(self) -> int:
-        """Number of twins."""
+        """The number of twins."""
         return sum(len(group.members) for group in self.groups)
 
     def record(self) -> dict[str, Any]:
@@ -186,117 +226,197 @@ class Fleet:
 
 
 def load_fleet(path: Path | str, seed: int | None = None) -> Fleet:
-    """Read a fleet file; relative paths start at its folder.
+    """Read a fleet file; relative paths in it start at its folder.
 
     Parameters
     ----------
     path : Path or str
-        TOML.
+        The TOML file.
     seed : int, optional
-        In the place of that of the file.
+        A seed that replaces the one of the file.
 
     Raises
     ------
     FleetError
-        The file cannot be read or breaks the schema, or a scenario of it does; all groups that are wrong are
-        in one list.
+        If the file cannot be read or breaks the schema, or if groups are wrong: the sentence lists
+        all of them.
     """
     path = Path(path)
     table = read_toml(path, FleetError, what="fleet")
     table = with_present_names(table, PRESENT_NAMES, str(path), FleetError)
-    found = validate(FleetFile, table, str(path), FleetError, what="a fleet")
-    head = found.fleet if seed is None else found.fleet.model_copy(update={"seed": seed})
-    groups, wrong = [], []
-    for section in found.group:
+    fleet_file = validate(FleetFile, table, str(path), FleetError, what="a fleet")
+    head = fleet_file.fleet
+    if seed is not None:
+        head = head.model_copy(update={"seed": seed})
+    groups = []
+    objections = []
+    for section in fleet_file.group:
         try:
-            groups.append(_group(section, path.resolve().parent, head.seed))
-            rationed = groups[-1].scenarios[0].planner.inspections_per_step is not None
-            if rationed and (len(groups[-1].members) > head.shard or len(groups[-1].scenarios) > 1):
-                raise FleetError(said("fleet.shared", members=len(groups[-1].members)))
+            group = _group(section, path.resolve().parent, head.seed)
+            _check_shared_inspections(group, head)
+            groups.append(group)
         except TwinMasterError as error:
-            wrong.append(f"group {section.name}: {error}")
-    if wrong:
-        raise FleetError("\n".join([f"{path}: nothing was begun, for", *wrong]))
+            objections.append(f"group {section.name}: {error}")
+    if objections:
+        raise FleetError("\n".join([f"{path}: nothing was begun, for", *objections]))
     return Fleet(head, tuple(groups))
 
 
-def ensemble(scenario: str, seeds: range, overrides: Overrides | None = None, *, shard: int = SHARD) -> Fleet:
+def _check_shared_inspections(group: Group, head: FleetSection) -> None:
+    """Check that the assets of a group that share inspections fly in one shard.
+
+    Raises
+    ------
+    FleetError
+        If they do not.
+    """
+    shares_inspections = group.scenarios[0].planner.inspections_per_step is not None
+    flies_in_one_shard = len(group.members) <= head.shard and len(group.scenarios) == 1
+    if shares_inspections and not flies_in_one_shard:
+        raise FleetError(
+            "`inspections_per_step` is shared by assets of one scenario in one shard: "
+            f"let `shard` be {len(group.members)} or more, and give no pattern of files"
+        )
+
+
+def ensemble(
+    scenario: str, seeds: range, overrides: Overrides | None = None, *, shard: int = SHARD
+) -> Fleet:
     """Return one asset under many seeds, as a fleet of one group.
 
-    The calibration is drawn once, under the seed of the scenario or of the overrides, for all of them.
+    The calibration is drawn once for all seeds, under the seed of the scenario or the overrides.
+
+    Parameters
+    ----------
+    scenario : str
+        The name of a shipped scenario, or a file.
+    seeds : range
+        The seeds.
+    overrides : Overrides, optional
+        Values that replace those of the scenario.
+    shard : int
+        The number of twins that are flown in one piece.
     """
     resolved = resolve_scenario(load_scenario(scenario), overrides)
-    members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
-    group = Group(resolved.mission.name, (resolved,), {}, members)
     mission = resolved.mission
+    members = tuple(Member(row, f"seed-{seed}", seed, {}) for row, seed in enumerate(seeds))
+    group = Group(mission.name, (resolved,), {}, members)
     head = FleetSection(name=mission.name, title=mission.title, seed=mission.seed, shard=shard)
     return Fleet(head, (group,))
 
 
 def seed_range(text: str) -> range:
-    """Return the seeds that ``FIRST:END`` stands for, END left out.
+    """Return the seeds that the text ``FIRST:END`` stands for; END is left out.
 
     Raises
     ------
     FleetError
-        It is none.
+        If the text is not a range of seeds, or if it has too many.
     """
     first, colon, end = text.partition(":")
     if not (colon and first.isdecimal() and end.isdecimal() and int(first) < int(end)):
-        raise FleetError(f"--seeds is FIRST:END, as in 0:1000 for the seeds 0 to 999, and `{text}` came.")
-    found = range(int(first), int(end))
-    if len(found) > LARGEST:
-        raise FleetError(f"--seeds has {len(found)} seeds, and a fleet {LARGEST} twins at most: fly several.")
-    return found
+        raise FleetError(
+            f"--seeds is FIRST:END, as in 0:1000 for the seeds 0 to 999, and `{text}` came."
+        )
+    seeds = range(int(first), int(end))
+    if len(seeds) > LARGEST:
+        raise FleetError(
+            f"--seeds has {len(seeds)} seeds, and a fleet {LARGEST} twins at most: fly several."
+        )
+    return seeds
 
 
 def _group(section: GroupSection, folder: Path, seed: int) -> Group:
-    local = folder / section.scenario
-    loaded = load_scenario(local if local.is_file() else section.scenario)
-    given = {key: getattr(section, key) for key in ("fmu", "binding", "calibration", "learnt")}
-    files: dict[str, Any] = {key: folder / name for key, name in given.items() if name is not None}
-    common = replace(Overrides(seed=seed, in_process=section.in_process, learnt_group=section.name), **files)
-    observed = section.observations or ""
-    where = str(folder / observed) if observed and not is_broker(observed) else observed
-    key, pattern = ("fmu", section.fmus) if section.fmus else ("calibration", section.calibrations)
-    found = sorted(folder.glob(pattern)) if pattern else []
-    if pattern and not found:
-        raise FleetError(f'no file fits `{key}s = "{pattern}"` in {folder}.')
-    scenarios, wrong = [], []
-    own: list[dict[str, Any]] = [{key: file} for file in found] or [{}]
-    for files in own:
+    """Return a group of a fleet file.
+
+    Parameters
+    ----------
+    section : GroupSection
+        The group in the file.
+    folder : Path
+        The folder of the file.
+    seed : int
+        The seed of the fleet.
+
+    Raises
+    ------
+    TwinMasterError
+        If the group cannot be flown.
+    """
+    local_file = folder / section.scenario
+    loaded = load_scenario(local_file if local_file.is_file() else section.scenario)
+    observations = section.observations or ""
+    if observations and not is_broker(observations):
+        observations = str(folder / observations)
+    files = _files_of_assets(section, folder)
+    return Group(
+        name=section.name,
+        scenarios=_scenarios(section, folder, seed, loaded, files),
+        parameter_spreads={} if observations else section.parameters,
+        members=_members(section, seed, observations, files),
+        observations=observations,
+        scenario_file=loaded.file,
+    )
+
+
+def _files_of_assets(section: GroupSection, folder: Path) -> list[Path]:
+    """Return the files that set the assets of a group apart; empty if no pattern is given.
+
+    Raises
+    ------
+    FleetError
+        If no file fits the pattern.
+    """
+    pattern = section.fmus or section.calibrations
+    if not pattern:
+        return []
+    files = sorted(folder.glob(pattern))
+    if not files:
+        raise FleetError(f'no file fits `{section.pattern_key}s = "{pattern}"` in {folder}.')
+    return files
+
+
+def _scenarios(
+    section: GroupSection, folder: Path, seed: int, loaded: LoadedScenario, files: list[Path]
+) -> tuple[Scenario, ...]:
+    """Return the scenario of a group, or one for each of the files of its assets.
+
+    Raises
+    ------
+    TwinMasterError
+        If a scenario cannot be resolved; for files, the sentence lists all that are wrong.
+    """
+    common = _common_overrides(section, folder, seed)
+    if not files:
+        return (_with_values_of_group(section, resolve_scenario(loaded, common)),)
+    scenarios = []
+    objections = []
+    for file in files:
+        file_override: dict[str, Any] = {section.pattern_key: file}
         try:
-            resolved = resolve_scenario(loaded, replace(common, **files))
+            resolved = resolve_scenario(loaded, replace(common, **file_override))
         except TwinMasterError as error:
-            if not found:
-                raise
-            wrong.append(f"{files[key].name}: {error}")
+            objections.append(f"{file.name}: {error}")
         else:
-            scenarios.append(_of_group(section, resolved))
-    if wrong:
-        raise FleetError("\n".join(["assets that cannot fly:", *wrong]))
-    members = [_member(section, seed, row, file) for row, file in enumerate(found)]
-    members += [_member(section, seed, row) for row in range(section.count or 0)]
-    if where and not is_broker(where):
-        paths = enumerate(recordings(where))
-        members = [Member(row, asset_name(path), seed, {}, file=path) for row, path in paths]
-    spreads = {} if where else section.parameters
-    return Group(section.name, tuple(scenarios), spreads, tuple(members), where, loaded.file)
+            scenarios.append(_with_values_of_group(section, resolved))
+    if objections:
+        raise FleetError("\n".join(["assets that cannot fly:", *objections]))
+    return tuple(scenarios)
 
 
-def recordings(pattern: str) -> list[Path]:
-    """Return the files of real assets that fit a pattern, in their order."""
-    found = sorted(Path(pattern).parent.glob(Path(pattern).name))
-    return [path for path in found if not path.name.startswith(".")]
+def _common_overrides(section: GroupSection, folder: Path, seed: int) -> Overrides:
+    """Return the values of a group that replace those of its scenario, for all its assets."""
+    overrides = Overrides(seed=seed, in_process=section.in_process, learnt_group=section.name)
+    files: dict[str, Any] = {}
+    for key in ("fmu", "binding", "calibration", "learnt"):
+        name = getattr(section, key)
+        if name is not None:
+            files[key] = folder / name
+    return replace(overrides, **files)
 
 
-def asset_name(path: Path) -> str:
-    """Return the name of the asset of a recording."""
-    return path.name if path.is_dir() else path.stem
-
-
-def _of_group(section: GroupSection, scenario: Scenario) -> Scenario:
-    """Return a scenario with what the group says otherwise."""
+def _with_values_of_group(section: GroupSection, scenario: Scenario) -> Scenario:
+    """Return a scenario with the values that its group gives instead."""
     table = scenario.to_dict()
     if section.steps is not None:
         table["mission"]["steps"] = section.steps
@@ -307,14 +427,60 @@ def _of_group(section: GroupSection, scenario: Scenario) -> Scenario:
     return parse_scenario(table, f"group {section.name}")
 
 
+def _members(
+    section: GroupSection, seed: int, observations: str, files: list[Path]
+) -> tuple[Member, ...]:
+    """Return the assets of a group.
+
+    Parameters
+    ----------
+    section : GroupSection
+        The group in the fleet file.
+    seed : int
+        The seed of the fleet.
+    observations : str
+        The pattern of the recordings of real assets, or an address; empty if assets are flown.
+    files : list of Path
+        The files that set the assets apart; empty if they are counted.
+    """
+    if observations:
+        if is_broker(observations):
+            return ()
+        return tuple(
+            Member(row, asset_name(path), seed, {}, file=path)
+            for row, path in enumerate(recording_files(observations))
+        )
+    if files:
+        return tuple(_member(section, seed, row, file) for row, file in enumerate(files))
+    return tuple(_member(section, seed, row) for row in range(section.count or 0))
+
+
 def _member(section: GroupSection, seed: int, row: int, file: Path | None = None) -> Member:
-    # Keyed by group and number: a twin meets the same fate whatever else flies.
-    sequence = np.random.SeedSequence(seed, spawn_key=(zlib.crc32(section.name.encode()), row))
-    own = int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
-    normal = generator(own, "population").standard_normal(len(section.parameters))
-    drawn = {
-        key: spread.mean + spread.standard_deviation * float(value)
-        for (key, spread), value in zip(sorted(section.parameters.items()), normal, strict=True)
-    }
-    name, place = (f"{section.name}-{row}", 0) if file is None else (file.stem, row)
-    return Member(row, name, own, drawn, place, file)
+    """Return an asset of a group with its own seed and parameters.
+
+    The seed follows from the seed of the fleet, the name of the group and the row of the asset
+    alone: the mission of a twin is the same whatever else flies.
+    """
+    key = (zlib.crc32(section.name.encode()), row)
+    sequence = np.random.SeedSequence(seed, spawn_key=key)
+    # One bit less than a word, so that the seed fits into a signed integer of the store.
+    own_seed = int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(1))
+    deviates = generator(own_seed, "population").standard_normal(len(section.parameters))
+    parameters = {}
+    for name, deviate in zip(sorted(section.parameters), deviates, strict=True):
+        spread = section.parameters[name]
+        parameters[name] = spread.mean + spread.standard_deviation * float(deviate)
+    if file is None:
+        return Member(row, f"{section.name}-{row}", own_seed, parameters)
+    return Member(row, file.stem, own_seed, parameters, scenario_number=row, file=file)
+
+
+def recording_files(pattern: str) -> list[Path]:
+    """Return the files of real assets that fit a pattern, sorted; hidden files are left out."""
+    paths = sorted(Path(pattern).parent.glob(Path(pattern).name))
+    return [path for path in paths if not path.name.startswith(".")]
+
+
+def asset_name(path: Path) -> str:
+    """Return the name of the asset of a recording, which is a file or a run folder."""
+    return path.name if path.is_dir() else path.stem

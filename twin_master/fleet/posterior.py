@@ -1,294 +1,534 @@
-"""Posteriors on grids, narrowed until they are resolved: of probabilities, and of populations."""
+"""Posteriors of probabilities and populations, on grids that are narrowed until they suffice."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import cycle, product
+from itertools import product
 
 import numpy as np
 
-from reporting.arrays import Float
+from reporting.arrays import Float, Index
 
 Axes = tuple[Float, ...]
+"""The axes of a tensor grid, an array of equally spaced values for each."""
+LogDensity = Callable[[Axes], Float]
+"""Returns the logarithm of a density at all points of a tensor grid, up to a constant."""
+Transform = Callable[[Float], Float]
+"""Returns a quantity for the values of a grid, such as a probability for its log odds."""
 
-POINTS = {1: 17, 2: 13, 3: 9, 4: 7}
+GRID_POINTS = {1: 17, 2: 13, 3: 9, 4: 7}
 """Points of each axis of the grid of probabilities, by the number of axes."""
 LOWEST, HIGHEST = 1e-4, 0.9
-"""Probabilities between which is looked."""
-BELOW = 13.0
-"""A point counts whose log density is lower than the largest by no more: five deviations of a normal."""
-RESOLVED = 1.2
-"""Spacing of a grid as a share of the standard deviation at which its sums are exact to 1e-6."""
-NOTHING = 1e-9
-"""Share of the largest weight below which the tails of an interval are cut."""
-FINE = 121
+"""Bounds of a probability to worsen."""
+RELEVANT_DROP = 13.0
+"""Largest distance of a relevant log density below its maximum: five deviations of a normal."""
+RESOLVED_SPACING = 1.2
+"""Spacing over the standard deviation up to which the sums of a grid are exact to 1e-6."""
+LEAST_SHRINKAGE = 0.95
+"""Fraction of its length to which an axis must shrink to be worth another grid."""
+NEGLIGIBLE_WEIGHT = 1e-9
+"""Fraction of the largest weight below which the tails of a distribution are cut."""
+FINE_POINTS = 2001
+"""Points on which a distribution is interpolated."""
+SHARED_POINTS = 121
 """Points of each axis of a group, and of the mean of the distribution that groups share."""
+CONCENTRATION_POINTS = 13
+"""Points of the concentration of the distribution that groups share."""
+LOWEST_CONCENTRATION, HIGHEST_CONCENTRATION = 3.0, 3000.0
+LEAST_LOG_LIKELIHOOD = -60.0
+"""Log likelihood, relative to its maximum, to which a group's grid is cut before interpolation."""
 POPULATION_POINTS = 41
-"""Of mean and spread of a population."""
-FREEDOM = 4.0
-"""Of the prior of a spread: twice the scale, or none of it, are nothing unusual."""
-BETWEEN_NODES = 4
-"""Values between two nodes of a member's evidence."""
+"""Points of the mean and of the standard deviation of a population."""
+PRIOR_FREEDOM = 4.0
+"""Degrees of freedom of a deviation's prior: twice the scale is as usual as nearly none of it."""
+POINTS_BETWEEN_NODES = 4
+"""Points between two nodes of a member's evidence."""
+LEAST_LOG_EVIDENCE = -700.0
+"""Log evidence, relative to its maximum, below which the exponential function would underflow."""
+_TINY = 1e-300
+"""Smallest number whose logarithm is taken."""
 
 
-def logit(p: Float) -> Float:
-    """Return log p / (1 - p)."""
-    return np.asarray(np.log(p) - np.log1p(-p))
+def logit(probability: Float) -> Float:
+    """Return the log odds of probabilities."""
+    return np.asarray(np.log(probability) - np.log1p(-probability))
 
 
-def logistic(x: Float) -> Float:
-    """Return the probability of a log odds."""
-    return np.asarray(1.0 / (1.0 + np.exp(-x)))
+def logistic(log_odds: Float) -> Float:
+    """Return the probabilities of log odds."""
+    return np.asarray(1.0 / (1.0 + np.exp(-log_odds)))
 
 
 @dataclass(frozen=True)
-class Line:
-    """Distribution of one figure.
+class Distribution:
+    """The distribution of a quantity on a grid.
 
     Attributes
     ----------
-    x : (N,)
-        Equally spaced.
-    weight : (N,)
-        Probability of each, of `masses`.
-    of : callable
-        Returns the figure for x: a probability for its log odds.
+    x : (N,) array
+        The equally spaced values of the grid.
+    weight : (N,) array
+        The probability of each value; those at both ends stand for half an interval.
+    transform : callable
+        Returns the quantity for values of x, such as a probability for its log odds.
     """
 
     x: Float
     weight: Float
-    of: Callable[[Float], Float] = np.asarray
+    transform: Transform = np.asarray
 
     @cached_property
-    def _fine(self) -> tuple[Float, Float]:
-        """Return many values of x and their shares: the cubic through the log density, between the bounds.
+    def _interpolated(self) -> tuple[Float, Float]:
+        """Values of x and their probabilities, as two arrays, from a spline of the log density.
 
-        Where the spacing is as wide as the distribution, or a bound cuts it off, sums over x alone are wrong.
+        The sums over the grid itself would be wrong if its spacing is as wide as the distribution,
+        or if a bound cuts the distribution off.
         """
         from scipy.interpolate import CubicSpline
 
-        # Where there is nothing, the logarithm would make the spline swing.
-        inside = np.flatnonzero(self.weight > NOTHING * self.weight.max())
-        part = slice(max(0, min(inside[0], len(self.x) - 4)), max(4, inside[-1] + 1))
-        fine = np.linspace(self.x[part][0], self.x[part][-1], 2001)
+        # Leave out the tails, whose logarithms would make the spline swing, but keep the four
+        # points that a cubic spline needs.
+        relevant = np.flatnonzero(self.weight > NEGLIGIBLE_WEIGHT * self.weight.max())
+        first = max(0, min(relevant[0], len(self.x) - 4))
+        end = max(4, relevant[-1] + 1)
+        x = self.x[first:end]
+        fine_x = np.linspace(x[0], x[-1], FINE_POINTS)
+        # The weights at both ends are those of half an interval: double them for the density.
         density = self.weight.copy()
         density[[0, -1]] *= 2.0
-        log_weight = np.log(np.maximum(density[part], NOTHING * density.max()))
-        density = np.exp(CubicSpline(self.x[part], log_weight)(fine) - log_weight.max())
-        density[[0, -1]] *= 0.5
-        return fine, density / density.sum()
+        log_density = np.log(np.maximum(density[first:end], NEGLIGIBLE_WEIGHT * density.max()))
+        fine_density = np.exp(CubicSpline(x, log_density)(fine_x) - log_density.max())
+        fine_density[[0, -1]] *= 0.5  # the ends of the fine grid have half an interval, too
+        return fine_x, fine_density / fine_density.sum()
 
     @property
     def mean(self) -> float:
-        """Mean of the figure."""
-        fine, share = self._fine
-        return float(share @ self.of(fine))
+        """The mean of the quantity."""
+        x, probability = self._interpolated
+        return float(probability @ self.transform(x))
 
     @property
     def standard_deviation(self) -> float:
-        """Standard deviation of the figure."""
-        fine, share = self._fine
-        return float(np.sqrt(share @ (self.of(fine) - self.mean) ** 2))
+        """The standard deviation of the quantity."""
+        x, probability = self._interpolated
+        return float(np.sqrt(probability @ (self.transform(x) - self.mean) ** 2))
 
     @property
-    def figures(self) -> dict[str, float]:
-        """Mean, standard deviation and central 95 % interval."""
+    def summary(self) -> dict[str, float]:
+        """Mean, standard deviation and central 95 % interval, as records keep them."""
         low, high = self.interval()
-        moments = {"mean": self.mean, "standard_deviation": self.standard_deviation}
-        return moments | {"lower_95": low, "upper_95": high}
+        return {
+            "mean": self.mean,
+            "standard_deviation": self.standard_deviation,
+            "lower_95": low,
+            "upper_95": high,
+        }
 
     def interval(self, probability: float = 0.95) -> tuple[float, float]:
-        """Return the bounds of the central interval."""
-        fine, share = self._fine
-        reached = np.cumsum(share) - 0.5 * share
-        bounds = np.interp([0.5 - probability / 2.0, 0.5 + probability / 2.0], reached, fine)
-        low, high = self.of(bounds).tolist()
+        """Return the ends of the central interval with a probability."""
+        x, probability_of_x = self._interpolated
+        # Half of the probability of a value lies below it.
+        cumulative = np.cumsum(probability_of_x) - 0.5 * probability_of_x
+        levels = [0.5 - probability / 2.0, 0.5 + probability / 2.0]
+        low, high = self.transform(np.interp(levels, cumulative, x)).tolist()
         return low, high
 
 
-def narrowed(log_density: Callable[[Axes], Float], axes: Axes) -> tuple[Axes, Float]:
-    """Return axes that resolve a density within the ones that are given, and its logarithm on them."""
-    limits, numbers = [(axis[0], axis[-1]) for axis in axes], range(len(axes))
+def resolve_density(log_density: LogDensity, axes: Axes) -> tuple[Axes, Float]:
+    """Narrow the axes of a grid until it resolves a density.
+
+    Parameters
+    ----------
+    log_density : callable
+        Returns the logarithm of the density at all points of a grid.
+    axes : tuple of (N,) array
+        The widest axes.
+
+    Returns
+    -------
+    axes : tuple of (N,) array
+        Axes with as many points, within the given ones.
+    values : (N, ..., N) array
+        The logarithm of the density at their points.
+    """
+    bounds = [(axis[0], axis[-1]) for axis in axes]
     while True:
-        found = log_density(axes)
-        weight, bounds, resolved = masses(found), [], True
-        for k, (axis, (low, high)) in enumerate(zip(axes, limits, strict=True)):
-            others = tuple(other for other in numbers if other != k)
-            inside, step = np.flatnonzero(found.max(axis=others) > found.max() - BELOW), axis[1] - axis[0]
-            # With a whole step more grids of few points would stay too wide.
-            bounds.append(
-                (max(low, axis[inside[0]] - 0.75 * step), min(high, axis[inside[-1]] + 0.75 * step))
-            )
-            marginal = weight.sum(axis=others)
-            spread = np.sqrt(marginal @ (axis - marginal @ axis) ** 2)
-            resolved &= bool(step <= RESOLVED * spread) and len(inside) >= len(axis) // 3
-        # Where the next grid would be no finer, this is what can be had (a posterior at the bounds).
-        if resolved or all(b - a > 0.95 * (x[-1] - x[0]) for (a, b), x in zip(bounds, axes, strict=True)):
-            return axes, found
-        axes = tuple(np.linspace(a, b, len(x)) for (a, b), x in zip(bounds, axes, strict=True))
+        values = log_density(axes)
+        weight = cell_probabilities(values)
+        ranges = []
+        is_resolved = True
+        for number, axis in enumerate(axes):
+            other_axes = tuple(other for other in range(len(axes)) if other != number)
+            highest = values.max(axis=other_axes)
+            relevant = np.flatnonzero(highest > values.max() - RELEVANT_DROP)
+            ranges.append(_relevant_range(axis, relevant, bounds[number]))
+            is_fine = _is_fine(axis, weight.sum(axis=other_axes))
+            is_resolved &= is_fine and len(relevant) >= len(axis) // 3
+        if is_resolved or not _would_shrink(axes, ranges):
+            return axes, values
+        axes = tuple(
+            np.linspace(low, high, len(axis))
+            for (low, high), axis in zip(ranges, axes, strict=True)
+        )
+
+
+def _relevant_range(
+    axis: Float, relevant: Index, bounds: tuple[float, float]
+) -> tuple[float, float]:
+    """Return the range of the relevant points of an axis, a little widened, within its bounds.
+
+    Three quarters of a step are added: with a whole step, grids of few points would stay too wide.
+    """
+    lowest, highest = bounds
+    step = axis[1] - axis[0]
+    low = max(lowest, axis[relevant[0]] - 0.75 * step)
+    high = min(highest, axis[relevant[-1]] + 0.75 * step)
+    return low, high
+
+
+def _is_fine(axis: Float, marginal: Float) -> bool:
+    """Return whether an axis is fine enough for its marginal distribution, an (N,) array."""
+    step = axis[1] - axis[0]
+    mean = marginal @ axis
+    deviation = np.sqrt(marginal @ (axis - mean) ** 2)
+    return bool(step <= RESOLVED_SPACING * deviation)
+
+
+def _would_shrink(axes: Axes, ranges: Sequence[tuple[float, float]]) -> bool:
+    """Return whether any axis would get notably shorter; not so for a posterior at its bounds."""
+    return not all(
+        high - low > LEAST_SHRINKAGE * (axis[-1] - axis[0])
+        for (low, high), axis in zip(ranges, axes, strict=True)
+    )
 
 
 @dataclass(frozen=True)
-class Grid:
-    """Log likelihood of K probabilities on a tensor grid of their log odds.
+class LikelihoodGrid:
+    """The log likelihood of K probabilities on a tensor grid of their log odds.
 
     Attributes
     ----------
-    axes : tuple of (N,)
-        Log odds of each probability.
-    log_likelihood : (N, ..., N)
-        At each point.
+    axes : tuple of (N,) array
+        The log odds of each probability.
+    log_likelihood : (N, ..., N) array
+        The log likelihood at each point.
     """
 
     axes: Axes
     log_likelihood: Float
 
     @property
-    def marginals(self) -> tuple[Line, ...]:
-        """Posterior of each probability under a uniform prior."""
-        log_density = self.log_likelihood + _uniform(self.axes)
-        return lines(masses(log_density), self.axes, logistic)
+    def marginals(self) -> tuple[Distribution, ...]:
+        """The posterior of each probability under a uniform prior."""
+        log_density = self.log_likelihood + _log_uniform_prior(self.axes)
+        return marginal_distributions(
+            cell_probabilities(log_density), self.axes, [logistic] * len(self.axes)
+        )
 
 
-def _uniform(axes: Axes) -> Float:
-    """Return the log density of uniform probabilities in their log odds."""
-    meshed = np.meshgrid(*axes, indexing="ij")
-    return np.asarray(sum(np.log(logistic(x) * logistic(-x)) for x in meshed))
+def _log_uniform_prior(axes: Axes) -> Float:
+    """Return the log density of uniform probabilities, as a density of their log odds."""
+    log_odds = np.meshgrid(*axes, indexing="ij")
+    return np.asarray(sum(np.log(logistic(x) * logistic(-x)) for x in log_odds))
 
 
-def masses(log_density: Float) -> Float:
-    """Return the probability of each point of a grid; those at bounds have half an interval."""
+def cell_probabilities(log_density: Float) -> Float:
+    """Return the probability of each point of a grid; points at bounds have half an interval."""
     weight = np.exp(log_density - log_density.max())
     for axis in range(weight.ndim):
         np.moveaxis(weight, axis, 0)[[0, -1]] *= 0.5
     return np.asarray(weight / weight.sum())
 
 
-def lines(weight: Float, axes: Axes, *of: Callable[[Float], Float]) -> tuple[Line, ...]:
-    """Return the marginals of weights on a grid, of figures that the functions give in turn."""
-    others = (tuple(i for i in range(weight.ndim) if i != k) for k in range(weight.ndim))
-    sums = zip(axes, others, cycle(of), strict=False)
-    return tuple(Line(axis, weight.sum(axis=other), own) for axis, other, own in sums)
+def marginal_distributions(
+    weight: Float, axes: Axes, transforms: Sequence[Transform]
+) -> tuple[Distribution, ...]:
+    """Return the marginal distribution of each axis of a grid.
+
+    Parameters
+    ----------
+    weight : (N, ..., N) array
+        The probability of each point.
+    axes : tuple of (N,) array
+        The axes.
+    transforms : sequence of callable
+        For each axis, the function that returns the quantity for its values.
+    """
+    marginals = []
+    for number, (axis, transform) in enumerate(zip(axes, transforms, strict=True)):
+        other_axes = tuple(other for other in range(weight.ndim) if other != number)
+        marginals.append(Distribution(axis, weight.sum(axis=other_axes), transform))
+    return tuple(marginals)
 
 
-def refined(log_likelihood: Callable[[Float], Float], count: int) -> Grid:
-    """Return a grid that resolves the posterior of K probabilities.
+def likelihood_grid(log_likelihood: Callable[[Float], Float], count: int) -> LikelihoodGrid:
+    """Return a grid that resolves the posterior of K probabilities under a uniform prior.
 
     Parameters
     ----------
     log_likelihood : callable
-        Returns it at points (P, K): (P,).
+        Returns the log likelihood (P,) at points (P, K).
     count : int
-        K, from 1 to 4.
+        The number K of probabilities, from 1 to 4.
     """
-    shape = (POINTS[count],) * count
+    shape = (GRID_POINTS[count],) * count
 
-    def density(axes: Axes) -> Float:
+    def log_density(axes: Axes) -> Float:
         points = np.array(list(product(*axes)))
-        return log_likelihood(logistic(points)).reshape(shape) + _uniform(axes)
+        return log_likelihood(logistic(points)).reshape(shape) + _log_uniform_prior(axes)
 
-    axis = np.linspace(logit(np.array(LOWEST)), logit(np.array(HIGHEST)), POINTS[count])
-    axes, found = narrowed(density, (axis,) * count)
-    return Grid(axes, found - _uniform(axes))
+    axis = np.linspace(logit(np.array(LOWEST)), logit(np.array(HIGHEST)), GRID_POINTS[count])
+    axes, values = resolve_density(log_density, (axis,) * count)
+    return LikelihoodGrid(axes, values - _log_uniform_prior(axes))
 
 
-def shared(grids: Sequence[Grid]) -> tuple[list[dict[str, float]], list[tuple[Line, ...]]]:
-    """Infer Beta(m kappa, (1 - m) kappa) of one or two probabilities over groups, and each group under it.
+@dataclass(frozen=True)
+class SharedPosterior:
+    """The posterior of K probabilities that differ between groups and share a distribution.
 
-    m is uniform in its log odds between the bounds of a probability, and kappa in its logarithm, from 3 to
-    3000, before the data. Each group is summed over axes of its own: one that is known well is a thousand
-    times narrower than one of few twins.
+    Attributes
+    ----------
+    hyperparameters : list of dict
+        For each probability, mean and standard deviation of the mean over groups, and of the
+        decimal logarithm of the concentration.
+    groups : list of tuple of Distribution
+        For each group, the posterior of its K probabilities.
+    """
+
+    hyperparameters: list[dict[str, float]]
+    groups: list[tuple[Distribution, ...]]
+
+
+def shared_posterior(grids: Sequence[LikelihoodGrid]) -> SharedPosterior:
+    """Infer the Beta distribution that the probabilities of several groups share.
+
+    A probability of a group has the distribution Beta(m kappa, (1 - m) kappa). Before the data, m
+    is uniform in its log odds between the bounds of a probability, and kappa in its logarithm. Each
+    group is summed over axes of its own: a group that is known well is a thousand times narrower
+    than one of few twins.
 
     Parameters
     ----------
-    grids : sequence of Grid
-        Log likelihood of each group, of the same K = 1 or 2 probabilities.
+    grids : sequence of LikelihoodGrid
+        The log likelihood of each group, of the same K = 1 or 2 probabilities.
+    """
+    count = len(grids[0].axes)
+    mean_axis = np.linspace(
+        float(logit(np.array(LOWEST))), float(logit(np.array(HIGHEST))), SHARED_POINTS
+    )
+    concentration_axis = np.linspace(
+        np.log10(LOWEST_CONCENTRATION), np.log10(HIGHEST_CONCENTRATION), CONCENTRATION_POINTS
+    )
+    groups = [_group_on_axes(grid, mean_axis, concentration_axis) for grid in grids]
+    # Evidence of all groups at each pair of hyperparameters (H, H), or (H, 1) for one probability.
+    log_evidence = np.sum([np.log(np.maximum(group.evidence, _TINY)) for group in groups], axis=0)
+    shape = (len(mean_axis), len(concentration_axis)) * count
+    hyper_weight = cell_probabilities(log_evidence.reshape(shape))
+    weight = hyper_weight.reshape(log_evidence.shape)
+    marginals = marginal_distributions(
+        hyper_weight, (mean_axis, concentration_axis) * count, (logistic, np.asarray) * count
+    )
+    return SharedPosterior(
+        hyperparameters=_hyperparameter_records(marginals),
+        groups=[group.posterior(weight) for group in groups],
+    )
 
-    Returns
-    -------
-    tuple of two lists
-        Figures of m and of log10 kappa for each of the K probabilities; the probabilities of each group.
+
+@dataclass(frozen=True)
+class _GroupOnAxes:
+    """A group under all values of the hyperparameters; P = `SHARED_POINTS`, H hyperparameters.
+
+    One probability is treated as two, of which the second has one value and says nothing.
+
+    Attributes
+    ----------
+    axes : tuple of (P,) array
+        The log odds of its K probabilities.
+    likelihood : (P, P) or (P, 1) array
+        The likelihood at the points of the axes, times their intervals.
+    prior_of_first : (H, P) array
+        The density of the first probability for each pair of hyperparameters.
+    prior_of_second : (H, P) or (1, 1) array
+        The same for the second probability.
+    """
+
+    axes: Axes
+    likelihood: Float
+    prior_of_first: Float
+    prior_of_second: Float
+
+    @cached_property
+    def evidence(self) -> Float:
+        """The evidence of the group for hyperparameters of both probabilities, (H, H) or (H, 1)."""
+        return self.prior_of_first @ self.likelihood @ self.prior_of_second.T
+
+    def posterior(self, hyper_weight: Float) -> tuple[Distribution, ...]:
+        """Return the posterior of the probabilities, given weights of the hyperparameters.
+
+        Parameters
+        ----------
+        hyper_weight : (H, H) or (H, 1) array
+            The posterior of the hyperparameters given all groups.
+        """
+        # Each pair of hyperparameters counts by its weight over the evidence of this group.
+        hyper_ratio = hyper_weight / np.maximum(self.evidence, _TINY)
+        mixed_prior = self.prior_of_first.T @ hyper_ratio @ self.prior_of_second
+        joint = self.likelihood * mixed_prior
+        joint /= joint.sum()
+        count = len(self.axes)
+        shape = (SHARED_POINTS,) * count
+        return marginal_distributions(joint.reshape(shape), self.axes, [logistic] * count)
+
+
+def _group_on_axes(
+    grid: LikelihoodGrid, mean_axis: Float, concentration_axis: Float
+) -> _GroupOnAxes:
+    """Return a group on fine axes, under all pairs of mean and concentration.
+
+    Parameters
+    ----------
+    grid : LikelihoodGrid
+        The log likelihood of the group.
+    mean_axis : (M,) array
+        The log odds of the mean over groups.
+    concentration_axis : (C,) array
+        The decimal logarithms of the concentration; there are H = M C pairs.
+    """
+    axes = tuple(np.linspace(axis[0], axis[-1], SHARED_POINTS) for axis in grid.axes)
+    mean, concentration = np.meshgrid(logistic(mean_axis), 10.0**concentration_axis, indexing="ij")
+    a = mean.ravel() * concentration.ravel()
+    b = (1.0 - mean.ravel()) * concentration.ravel()
+    is_single = len(axes) == 1
+    return _GroupOnAxes(
+        axes=axes,
+        likelihood=_interpolated_likelihood(grid, axes),
+        prior_of_first=_beta_density(axes[0], a, b),
+        prior_of_second=np.ones((1, 1)) if is_single else _beta_density(axes[1], a, b),
+    )
+
+
+def _beta_density(log_odds: Float, a: Float, b: Float) -> Float:
+    """Return the densities Beta(a, b) as densities of log odds, an (H, P) array.
+
+    A density of log odds is that of p times p (1 - p), so that no exponent is reduced by 1.
+
+    Parameters
+    ----------
+    log_odds : (P,) array
+        The log odds.
+    a, b : (H,) array
+        The parameters of the distributions.
     """
     from scipy.special import betaln
 
-    count = len(grids[0].axes)
-    axes = [tuple(np.linspace(axis[0], axis[-1], FINE) for axis in grid.axes) for grid in grids]
-    likelihoods = [_resampled(grid, own) for grid, own in zip(grids, axes, strict=True)]
-    low, high = (float(logit(np.array(bound))) for bound in (LOWEST, HIGHEST))
-    odds, digits = np.linspace(low, high, FINE), np.linspace(np.log10(3.0), np.log10(3000.0), 13)
-    means, sizes = (array.ravel() for array in np.meshgrid(logistic(odds), 10.0**digits, indexing="ij"))
-    a, b = means * sizes, (1.0 - means) * sizes
-
-    def density(x: Float) -> Float:
-        """In the log odds: that in p times p (1 - p). (hyperparameters, points)."""
-        p = logistic(x)
-        return np.asarray(np.exp(a[:, None] * np.log(p) + b[:, None] * np.log1p(-p) - betaln(a, b)[:, None]))
-
-    # One probability is two, of which the second says nothing.
-    priors = [[*(density(x) for x in own), np.ones((1, 1))][:2] for own in axes]
-    evidence = [first @ seen @ second.T for (first, second), seen in zip(priors, likelihoods, strict=True)]
-    total = np.sum([np.log(np.maximum(one, 1e-300)) for one in evidence], axis=0)
-    hyper = masses(total.reshape((len(odds), len(digits)) * count))
-    weight = hyper.reshape(total.shape)
-    groups = []
-    for own, (first, second), seen, told in zip(axes, priors, likelihoods, evidence, strict=True):
-        joint = seen * (first.T @ (weight / np.maximum(told, 1e-300)) @ second)
-        joint /= joint.sum()
-        groups.append(lines(joint.reshape((FINE,) * count), own, logistic))
-    found = lines(hyper, (odds, digits) * count, logistic, np.asarray)
-    figures = [
-        {
-            "mean": mean.mean,
-            "standard_deviation": mean.standard_deviation,
-            "log10_concentration": size.mean,
-            "log10_concentration_standard_deviation": size.standard_deviation,
-        }
-        for mean, size in zip(found[::2], found[1::2], strict=True)
-    ]
-    return figures, groups
+    p = logistic(log_odds)
+    log_density = a[:, None] * np.log(p) + b[:, None] * np.log1p(-p) - betaln(a, b)[:, None]
+    return np.asarray(np.exp(log_density))
 
 
-def _resampled(grid: Grid, axes: tuple[Float, ...]) -> Float:
-    """Return the likelihood of a grid, times intervals, on finer axes of the same range, FINE points each."""
+def _hyperparameter_records(marginals: Sequence[Distribution]) -> list[dict[str, float]]:
+    """Return what is recorded of mean and concentration, which alternate in the marginals."""
+    records = []
+    for mean, concentration in zip(marginals[::2], marginals[1::2], strict=True):
+        records.append(
+            {
+                "mean": mean.mean,
+                "standard_deviation": mean.standard_deviation,
+                "log10_concentration": concentration.mean,
+                "log10_concentration_standard_deviation": concentration.standard_deviation,
+            }
+        )
+    return records
+
+
+def _interpolated_likelihood(grid: LikelihoodGrid, axes: Axes) -> Float:
+    """Return the likelihood of a grid on finer axes, times intervals, a (P, P) or (P, 1) array."""
     from scipy.interpolate import RegularGridInterpolator
 
-    # Far below the largest there is nothing but what would make the spline swing.
-    log_likelihood = np.maximum(grid.log_likelihood - grid.log_likelihood.max(), -60.0)
-    fine = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    return masses(RegularGridInterpolator(grid.axes, log_likelihood, method="cubic")(fine)).reshape(FINE, -1)
+    # Far below the maximum there is nothing, but its logarithm would make the spline swing.
+    log_likelihood = grid.log_likelihood - grid.log_likelihood.max()
+    log_likelihood = np.maximum(log_likelihood, LEAST_LOG_LIKELIHOOD)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    interpolate = RegularGridInterpolator(grid.axes, log_likelihood, method="cubic")
+    return cell_probabilities(interpolate(points)).reshape(SHARED_POINTS, -1)
 
 
-def population(nodes: Float, log_evidence: Float, scale: float) -> tuple[Line, Line]:
-    """Return the posterior of mean m and spread s of a normal population of which B members were seen.
+@dataclass(frozen=True)
+class PopulationPosterior:
+    """The posterior of the mean and of the standard deviation of a normal population."""
+
+    mean: Distribution
+    deviation: Distribution
+
+
+def population_posterior(nodes: Float, log_evidence: Float, scale: float) -> PopulationPosterior:
+    """Infer a normal population of which B members were observed.
+
+    The prior of the mean is uniform over the nodes. That of the standard deviation is half a
+    Student's t distribution of `PRIOR_FREEDOM` degrees of freedom.
 
     Parameters
     ----------
-    nodes : (E,)
+    nodes : (E,) array
         Equally spaced values of the parameter.
-    log_evidence : (B, E)
-        Of what was observed of each member, if its parameter is a node.
+    log_evidence : (B, E) array
+        The log evidence of each member's observations if its parameter is a node.
     scale : float
-        Of the prior of s, half a Student's t of four degrees of freedom; that of m is uniform.
+        The scale of the prior of the standard deviation.
     """
-    from scipy.interpolate import CubicSpline
     from scipy.special import ndtr
 
-    fine = np.linspace(nodes[0], nodes[-1], BETWEEN_NODES * (len(nodes) - 1) + 1)
-    step = fine[1] - fine[0]
-    known = log_evidence[np.isfinite(log_evidence).all(axis=1)]
-    known = np.maximum(known - known.max(axis=1, keepdims=True), -700.0)
-    likelihood = np.exp(CubicSpline(nodes, known, axis=1)(fine))
+    count = POINTS_BETWEEN_NODES * (len(nodes) - 1) + 1
+    values = np.linspace(nodes[0], nodes[-1], count)
+    step = values[1] - values[0]
+    likelihood = _member_likelihood(nodes, log_evidence, values)
+    edges = np.append(values, values[-1] + step) - 0.5 * step
+
+    def log_density(axes: Axes) -> Float:
+        means, deviations = axes
+        log_evidence_of_all = np.empty((POPULATION_POINTS, POPULATION_POINTS))
+        for column, deviation in enumerate(deviations):
+            # The probability of each value in populations of all means, (values, means).
+            probability = np.diff(ndtr((edges[:, None] - means) / deviation), axis=0)
+            evidence_of_members = np.maximum(likelihood @ probability, _TINY)
+            log_evidence_of_all[:, column] = np.log(evidence_of_members).sum(axis=0)
+        log_prior = (
+            0.5 * (PRIOR_FREEDOM + 1.0) * np.log1p((deviations / scale) ** 2 / PRIOR_FREEDOM)
+        )
+        return log_evidence_of_all - log_prior
+
+    mean_axis = np.linspace(nodes[0], nodes[-1], POPULATION_POINTS)
+    deviation_axis = np.linspace(0.25 * step, 0.5 * (nodes[-1] - nodes[0]), POPULATION_POINTS)
+    axes, log_values = resolve_density(log_density, (mean_axis, deviation_axis))
+    weight = cell_probabilities(log_values)
+    mean, deviation = marginal_distributions(weight, axes, (np.asarray, np.asarray))
+    return PopulationPosterior(mean, deviation)
+
+
+def _member_likelihood(nodes: Float, log_evidence: Float, values: Float) -> Float:
+    """Return the normalised likelihood of each member at finer values of its parameter.
+
+    Members whose observations are impossible at a node are left out.
+
+    Parameters
+    ----------
+    nodes : (E,) array
+        The nodes of the evidence.
+    log_evidence : (B, E) array
+        The log evidence of each member at the nodes.
+    values : (V,) array
+        The finer values, between the nodes.
+
+    Returns
+    -------
+    (at most B, V) array
+        The likelihood; its sum over the values is 1.
+    """
+    from scipy.interpolate import CubicSpline
+
+    possible = log_evidence[np.isfinite(log_evidence).all(axis=1)]
+    relative = possible - possible.max(axis=1, keepdims=True)
+    relative = np.maximum(relative, LEAST_LOG_EVIDENCE)
+    likelihood = np.exp(CubicSpline(nodes, relative, axis=1)(values))
     likelihood /= likelihood.sum(axis=1, keepdims=True)
-    edges = np.append(fine, fine[-1] + step) - 0.5 * step
-
-    def density(axes: Axes) -> Float:
-        found = np.empty((POPULATION_POINTS, POPULATION_POINTS))
-        for column, spread in enumerate(axes[1]):
-            share = np.diff(ndtr((edges[:, None] - axes[0]) / spread), axis=0)
-            found[:, column] = np.log(np.maximum(likelihood @ share, 1e-300)).sum(axis=0)
-        return found - 0.5 * (FREEDOM + 1.0) * np.log1p((axes[1] / scale) ** 2 / FREEDOM)
-
-    limits = (nodes[0], nodes[-1]), (0.25 * step, 0.5 * (nodes[-1] - nodes[0]))
-    axes, found = narrowed(density, tuple(np.linspace(*limit, POPULATION_POINTS) for limit in limits))
-    mean, spread = lines(masses(found), axes, np.asarray)
-    return mean, spread
+    return np.asarray(likelihood)

@@ -1,16 +1,24 @@
-"""What stands in the store of a fleet, as figures with their errors."""
+"""What the store of a fleet says, as figures with their standard errors."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from reporting.arrays import Float
-from twin_master.fleet.flight import GROUPS, fleet_config
-from twin_master.fleet.store import ENDED, FAILED, FLOWN, NOTICE_KINDS, WITHIN, has_flown, open_group
+from reporting.arrays import Float, Index
+from twin_master.fleet.configuration import GROUPS, fleet_config
+from twin_master.fleet.store import (
+    ENDED,
+    FAILED,
+    FLOWN,
+    NOTICE_KINDS,
+    WITHIN,
+    flown_rows,
+    open_group,
+)
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.network.belief_planning import leaving_probability
 from twin_master.network.estimator import BELIEVED
@@ -31,224 +39,344 @@ class Estimated:
 
 @dataclass(frozen=True)
 class Outcomes:
-    """What became of N missions, of F factors of the state.
+    """The outcomes of N missions, for a state of F factors.
 
     Attributes
     ----------
-    within : Estimated
-        Share of the called-for fallbacks that came within `WITHIN` steps, as far as these were flown; NaN
-        without any.
-    early : Estimated
-        Share of missions with a fallback before the damage that calls for it; NaN where none does.
-    rms, bias : tuple of Estimated
-        Of each factor, SI: root of the mean squared error of its filtered mean over all steps of all
-        missions, and the mean error.
-    evidence : Estimated
-        Mean log evidence of a step.
-    credible : Estimated
-        Share of the steps in which the true state lies in the smallest set of states that the filtered
-        belief holds for `CREDIBILITY` probable.
+    prompt_fallbacks : Estimated
+        The fraction of the fallbacks that were called for and came within `WITHIN` steps; NaN if
+        none was called for. A fallback counts if so many steps were flown after the call.
+    early_fallbacks : Estimated
+        The fraction of missions with a fallback before the damage that calls for it; NaN if no
+        damage calls for one.
+    rms : tuple of Estimated
+        For each factor, the root mean square error of its filtered mean over all steps of all
+        missions, in SI units.
+    bias : tuple of Estimated
+        For each factor, the mean error of its filtered mean, in SI units.
+    log_evidence : Estimated
+        The mean log evidence of a step.
+    credible_coverage : Estimated
+        The fraction of the steps in which the true state lies in the smallest set of states that
+        has a probability of `CREDIBILITY` under the filtered belief.
     """
 
-    within: Estimated
-    early: Estimated
+    prompt_fallbacks: Estimated
+    early_fallbacks: Estimated
     rms: tuple[Estimated, ...]
     bias: tuple[Estimated, ...]
-    evidence: Estimated
-    credible: Estimated
+    log_evidence: Estimated
+    credible_coverage: Estimated
 
     @classmethod
-    def of(cls, stored: Mapping[Any, Any]) -> "Outcomes":
-        """Return those of the twins that have flown, some until their assets ended, of the store."""
-        flown = has_flown(np.asarray(stored["status"]))
-        kept = {
-            name: np.asarray(stored[name])[flown].astype(np.float64)
-            for name in ("delay", "early", "credible", "mean", "state", "log_evidence")
-        }
-        error = np.ma.masked_invalid(kept["mean"] - kept["state"])  # (N, T, F), some steps were not flown
-        squared, bias = ((error**power).mean(axis=1).filled(np.nan).T for power in (2, 1))
+    def from_store(cls, stored: Mapping[Any, Any]) -> "Outcomes":
+        """Return the outcomes of all twins in a group of the store that have flown.
+
+        Twins whose assets ended their simulations early count with what they have flown.
+        """
+        flown = flown_rows(np.asarray(stored["status"]))
+
+        def values(name: str) -> Float:
+            return np.asarray(stored[name])[flown].astype(np.float64)
+
+        delay = values("delay")
+        called_for = delay[~np.isnan(delay)]
+        early = values("early")
+        error = np.ma.masked_invalid(values("mean") - values("state"))  # masked: steps not flown
+        # Means over the steps of each mission, (F, N).
+        mean_square = (error**2).mean(axis=1).filled(np.nan).T
+        mean_error = error.mean(axis=1).filled(np.nan).T
         return cls(
-            within=_share(kept["delay"][~np.isnan(kept["delay"])] <= WITHIN),
-            early=_share(kept["early"][kept["early"] >= 0.0] > 0.0),
-            rms=tuple(_root(_mean(own)) for own in squared),
-            bias=tuple(_mean(own) for own in bias),
-            evidence=_mean(np.nanmean(kept["log_evidence"], axis=1)),
-            credible=_mean(kept["credible"]),
+            prompt_fallbacks=_fraction(called_for <= WITHIN),
+            early_fallbacks=_fraction(early[early >= 0.0] > 0.0),
+            rms=tuple(_root(_mean(factor)) for factor in mean_square),
+            bias=tuple(_mean(factor) for factor in mean_error),
+            log_evidence=_mean(np.nanmean(values("log_evidence"), axis=1)),
+            credible_coverage=_mean(values("credible")),
         )
 
 
-def _share(hits: NDArray[np.bool_]) -> Estimated:
-    """Return a share; its error is that of its posterior under a uniform prior: 0 of 20 is not 0 ± 0."""
+def _fraction(hits: NDArray[np.bool_]) -> Estimated:
+    """Return the fraction of hits; NaN if there is no trial.
+
+    Its error is the standard deviation of its posterior under a uniform prior, a Beta
+    distribution: 0 of 20 is not 0 ± 0.
+    """
     if not len(hits):
         return Estimated(float("nan"), float("nan"))
-    yes, no = np.sum(hits) + 1.0, np.sum(~hits) + 1.0  # of the Beta distribution
-    error = np.sqrt(yes * no / (yes + no + 1.0)) / (yes + no)
+    a = np.sum(hits) + 1.0
+    b = np.sum(~hits) + 1.0
+    error = np.sqrt(a * b / (a + b + 1.0)) / (a + b)
     return Estimated(float(np.mean(hits)), float(error))
 
 
 def _mean(values: Float) -> Estimated:
-    """Return the mean over missions; the steps of a mission are not independent, the missions are."""
+    """Return the mean over missions, which are independent; the steps of a mission are not."""
     count = len(values)
     error = float(np.std(values, ddof=1) / np.sqrt(count)) if count > 1 else float("nan")
     return Estimated(float(np.mean(values)), error)
 
 
-def _root(mean: Estimated) -> Estimated:
-    root = float(np.sqrt(mean.value))
-    return Estimated(root, mean.error / (2.0 * root) if root > 0.0 else 0.0)
+def _root(mean_square: Estimated) -> Estimated:
+    """Return the root of a mean square, with its error to first order."""
+    root = float(np.sqrt(mean_square.value))
+    return Estimated(root, mean_square.error / (2.0 * root) if root > 0.0 else 0.0)
 
 
 def open_fleet(folder: Path | str) -> "dict[str, xr.Dataset]":
-    """Return the groups of a fleet by their names.
+    """Return the groups in the store of a fleet, by their names.
+
+    Parameters
+    ----------
+    folder : Path or str
+        The folder of the fleet.
 
     Raises
     ------
     RunFolderError, FleetError
-        The folder holds no fleet.
+        If the folder does not hold a fleet, or if its store cannot be read.
     """
-    names = [group["name"] for group in fleet_config(Path(folder))["fleet"]["groups"]]
-    return {name: open_group(Path(folder), name) for name in names}
+    groups = fleet_config(Path(folder))["fleet"]["groups"]
+    return {group["name"]: open_group(Path(folder), group["name"]) for group in groups}
 
 
-def noticed(group: "xr.Dataset", kind: str) -> NDArray[np.int64]:
-    """Return how many notices of a kind each twin gave."""
+def notice_counts(group: "xr.Dataset", kind: str) -> Index:
+    """Return how many notices of a kind each twin of a group gave, a (B,) array."""
     return np.asarray(group["notices"].values[:, NOTICE_KINDS.index(kind)], dtype=np.int64)
 
 
 def believed_means(group: "xr.Dataset") -> Float:
-    """Return the means of the states of B twins in T steps (B, T, F), SI; NaN where no state is believed."""
-    unexplained = group["unexplained"].values > BELIEVED
-    return np.where(unexplained[..., np.newaxis], np.nan, group["mean"].values)
+    """Return the mean states of B twins in T steps, a (B, T, F) array in SI units.
+
+    They are NaN in steps in which no state is believed, because none explains the observations.
+    """
+    is_unexplained = group["unexplained"].values > BELIEVED
+    return np.where(is_unexplained[..., np.newaxis], np.nan, group["mean"].values)
 
 
-def last_steps(group: "xr.Dataset") -> NDArray[np.int64]:
-    """Return the last step of each twin: that of a recording may come early."""
-    last: NDArray[np.int64] = np.maximum((group["control_index"].values >= 0).sum(axis=1) - 1, 0)
+def last_steps(group: "xr.Dataset") -> Index:
+    """Return the last step of each twin, a (B,) array; recordings and simulations may end early."""
+    flown_steps = (group["control_index"].values >= 0).sum(axis=1)
+    last: Index = np.maximum(flown_steps - 1, 0)
     return last
 
 
-def severity(scenario: Scenario, mean: Float) -> Float:
-    """Return how badly off assets are by the means of their states (..., F): the sum of shares of ranges."""
-    low, high = np.array([(factor.levels[0], factor.levels[-1]) for factor in scenario.state]).T
-    return np.asarray(((mean - low) / np.where(high > low, high - low, 1.0)).sum(axis=-1))
+def severity(scenario: Scenario, mean: ArrayLike) -> Float:
+    """Return how severely assets are damaged, so that they can be ranked.
+
+    Each factor of the state counts by its position between its lowest level (0) and its highest
+    level (1); the severity is the sum over the factors.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario with F factors of the state.
+    mean : (..., F) array
+        The mean states, in SI units.
+
+    Returns
+    -------
+    (...) array
+        The severities.
+    """
+    lowest = np.array([factor.levels[0] for factor in scenario.state])
+    highest = np.array([factor.levels[-1] for factor in scenario.state])
+    has_one_level = highest == lowest
+    length = np.where(has_one_level, 1.0, highest - lowest)
+    position = (np.asarray(mean) - lowest) / length
+    return np.asarray(position.sum(axis=-1))
 
 
-def attention(knowledge: Knowledge, belief: Float, control: int) -> Float:
-    """Return the probability that twins leave a control within the steps that are predicted: (B,).
+def probability_of_leaving(knowledge: Knowledge, belief: Float, control: int) -> Float:
+    """Return the probability that twins leave a control within the predicted steps.
 
-    Of a policy by states it is that of the state of each step, or of the step behind it where that decides;
-    where the belief decides it is of lives that are drawn.
+    If the policy decides by states, this is the probability that some state on the way calls for
+    another control. If the policy decides by beliefs, it is estimated from drawn lives.
 
     Parameters
     ----------
     knowledge : Knowledge
-        Of the twins.
-    belief : (B, S)
-        After the last step.
+        The knowledge that the twins share.
+    belief : (B, S) array
+        Their beliefs after the last step.
     control : int
-        In force then; it stays so until it is left.
+        The index of the control in force; it stays so until it is left.
+
+    Returns
+    -------
+    (B,) array
+        The probabilities.
     """
-    scenario, transition = knowledge.scenario, knowledge.model.transition
+    scenario = knowledge.scenario
+    transition = knowledge.model.transition
     steps = scenario.mission.prediction_steps
     if knowledge.plan.on_belief is not None:
-        ahead = transition.forward(control, belief)
-        chance = generator(scenario.mission.seed, "planning")
-        return leaving_probability(knowledge.problem, knowledge.plan.on_belief, ahead, control, steps, chance)
-    keeps = (knowledge.plan.control_index == control).astype(np.float64)
-    stays = keeps.copy()
+        return leaving_probability(
+            knowledge.problem,
+            knowledge.plan.on_belief,
+            transition.forward(control, belief),
+            control,
+            steps,
+            generator(scenario.mission.seed, "planning"),
+        )
+    # Backwards: the probability that the control is kept from a state on, for more and more steps.
+    keeps_control = (knowledge.plan.control_index == control).astype(np.float64)
+    probability_kept = keeps_control.copy()
     for _ in range(steps - 1):
-        stays = keeps * transition.expected(control, stays)
-    if scenario.planner.decide_on == "predicted":
-        stays = transition.expected(control, stays)
-    return np.asarray(np.maximum(1.0 - belief @ stays, 0.0))
+        probability_kept = keeps_control * transition.expected(control, probability_kept)
+    if scenario.planner.decide_on == "predicted":  # the state after the next transition decides
+        probability_kept = transition.expected(control, probability_kept)
+    return np.asarray(np.maximum(1.0 - belief @ probability_kept, 0.0))
 
 
-Known = tuple[NDArray[np.int64], Path, Knowledge]
-"""The rows of twins in the store, the folder of what they know, and that."""
+class TwinsOfScenario(NamedTuple):
+    """Twins of a group that share a scenario, and thus what they know.
+
+    Attributes
+    ----------
+    rows : (B,) array
+        Their rows in the store.
+    folder : Path
+        The folder of what they know.
+    knowledge : Knowledge
+        What they know.
+    """
+
+    rows: Index
+    folder: Path
+    knowledge: Knowledge
 
 
-def known_twins(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Iterator[Known]:
-    """Yield the twins of a group that have flown, those together that share what they know.
+def flown_twins(
+    folder: Path, record: Mapping[str, Any], group: "xr.Dataset"
+) -> Iterator[TwinsOfScenario]:
+    """Yield the twins of a group that have flown, scenario by scenario.
 
     Parameters
     ----------
     folder : Path
-        Of the fleet.
+        The folder of the fleet.
     record : mapping
-        Of the group, as `config.json` has it.
+        The group in `config.json`.
     group : Dataset
-        Of the store.
+        The group in the store.
 
     Raises
     ------
     RunFolderError
-        What the twins know is missing or damaged.
+        If what the twins know is missing or damaged.
     """
-    flown = has_flown(group["status"].values)
-    places = np.array([place for *_, place in record["members"]])[flown]
-    for place in np.unique(places).tolist():
-        rows, table = flown[places == place], record["scenarios"][place]
-        home = folder / GROUPS / record["name"] / str(place)
-        yield rows, home, load_knowledge(home, Scenario.model_validate(table).moved(home))
+    flown = flown_rows(group["status"].values)
+    scenario_numbers = np.array([number for _name, _seed, number in record["members"]])[flown]
+    for number in np.unique(scenario_numbers).tolist():
+        home = folder / GROUPS / record["name"] / str(number)
+        scenario = Scenario.model_validate(record["scenarios"][number]).with_paths_from(home)
+        rows = flown[scenario_numbers == number]
+        yield TwinsOfScenario(rows, home, load_knowledge(home, scenario))
 
 
-def leaving(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
-    """Return the probability that each twin of a group leaves its control soon, see `attention`: (B,).
+def leaving_probabilities(folder: Path, record: Mapping[str, Any], group: "xr.Dataset") -> Float:
+    """Return the probability that each twin of a group leaves its control soon.
 
-    It is NaN of twins that have not flown, and where no state is believed. Parameters and errors are those of
-    `known_twins`.
+    Parameters
+    ----------
+    folder : Path
+        The folder of the fleet.
+    record : mapping
+        The group in `config.json`.
+    group : Dataset
+        The group in the store.
+
+    Returns
+    -------
+    (B,) array
+        The probabilities of `probability_of_leaving`; NaN for twins that have not flown, and for
+        twins that believe no state.
+
+    Raises
+    ------
+    RunFolderError
+        If what the twins know is missing or damaged.
     """
-    chance, belief = np.full(group.sizes["twin"], np.nan), group["belief"].values.astype(np.float64)
-    control = group["control_index"].values[np.arange(len(chance)), last_steps(group)]
-    for rows, _, knowledge in known_twins(folder, record, group):
-        for index in np.unique(control[rows]).tolist():
-            mine = rows[control[rows] == index]
-            chance[mine] = attention(knowledge, belief[mine], index)
-    last = np.arange(len(chance)), last_steps(group)
-    chance[group["unexplained"].values[last] > BELIEVED] = np.nan
-    return chance
+    count = group.sizes["twin"]
+    at_last_step = (np.arange(count), last_steps(group))
+    belief = group["belief"].values.astype(np.float64)
+    control = group["control_index"].values[at_last_step]
+    probability = np.full(count, np.nan)
+    for twins in flown_twins(folder, record, group):
+        for index in np.unique(control[twins.rows]).tolist():
+            rows = twins.rows[control[twins.rows] == index]
+            probability[rows] = probability_of_leaving(twins.knowledge, belief[rows], index)
+    probability[group["unexplained"].values[at_last_step] > BELIEVED] = np.nan
+    return probability
 
 
 def group_figures(group: "xr.Dataset") -> dict[str, Estimated | int]:
-    """Return the figures of a group by their titles; a mean has its standard error over the twins."""
+    """Return the figures of a group by their titles.
+
+    A mean has its standard error over the twins.
+    """
     status = group["status"].values
-    found: dict[str, Estimated | int] = {
+    figures = _counts_of_twins(group)
+    if not len(flown_rows(status)):
+        return figures
+    outcomes = Outcomes.from_store(group)
+    is_truth_known = not np.isnan(outcomes.bias[0].value)  # of real assets nobody knows it
+    if is_truth_known:
+        if not np.isnan(outcomes.prompt_fallbacks.value):
+            steps = f"{group.attrs['step_name']}s"
+            figures[f"fallback within {WITHIN} {steps}, of those called for"] = (
+                outcomes.prompt_fallbacks
+            )
+        if not np.isnan(outcomes.early_fallbacks.value):
+            figures["early fallback"] = outcomes.early_fallbacks
+        for name, rms, bias in zip(
+            group.attrs["factors"], outcomes.rms, outcomes.bias, strict=True
+        ):
+            figures[f"filtered rms error of {name}"] = rms
+            figures[f"bias of {name}"] = bias
+    figures["log evidence of a step"] = outcomes.log_evidence
+    if is_truth_known:
+        figures["true state in the 90 % set"] = outcomes.credible_coverage
+    return figures
+
+
+def _counts_of_twins(group: "xr.Dataset") -> dict[str, Estimated | int]:
+    """Return how many twins flew, failed, ended early, and gave which notices."""
+    status = group["status"].values
+    figures: dict[str, Estimated | int] = {
         "twins": len(status),
         "flown": int(np.sum(status == FLOWN)),
         "failed in flight": int(np.sum(status == FAILED)),
-        **({"ended early": short} if (short := int(np.sum(status == ENDED))) else {}),
     }
-    alarmed, left_out = (int(np.sum(noticed(group, kind) > 0)) for kind in NOTICE_KINDS)
-    found |= {"raised an alarm": alarmed} if group.attrs.get("gives_notice") else {}
-    found |= {"left a gauge out": left_out} if left_out else {}
-    if not len(has_flown(status)):
-        return found
-    study = Outcomes.of(group)
-    if not np.isnan(study.bias[0].value):  # of real assets nobody knows the truth
-        if not np.isnan(study.within.value):
-            step = f"{group.attrs['step_name']}s"
-            found[f"fallback within {WITHIN} {step}, of those called for"] = study.within
-        if not np.isnan(study.early.value):
-            found["early fallback"] = study.early
-        for name, rms, bias in zip(group.attrs["factors"], study.rms, study.bias, strict=True):
-            found[f"filtered rms error of {name}"], found[f"bias of {name}"] = rms, bias
-        found["log evidence of a step"] = study.evidence
-        found["true state in the 90 % set"] = study.credible
-        return found
-    return found | {"log evidence of a step": study.evidence}
+    ended_early = int(np.sum(status == ENDED))
+    if ended_early:
+        figures["ended early"] = ended_early
+    if group.attrs.get("gives_notice"):
+        figures["raised an alarm"] = int(np.sum(notice_counts(group, "alarm") > 0))
+    left_gauge_out = int(np.sum(notice_counts(group, "gauge_left_out") > 0))
+    if left_gauge_out:
+        figures["left a gauge out"] = left_gauge_out
+    return figures
 
 
 def figure_rows(groups: Mapping[str, Mapping[str, Estimated | int]]) -> list[list[str]]:
-    """Return the figures of groups as rows of a table: the title, and what each group has."""
-    titles = dict.fromkeys(title for figures in groups.values() for title in figures)
-    return [[title, *(_shown(figures.get(title)) for figures in groups.values())] for title in titles]
+    """Return the figures of groups as rows of a table: a title, and a cell for each group."""
+    titles: dict[str, None] = {}  # each once, in order
+    for figures in groups.values():
+        titles |= dict.fromkeys(figures)
+    rows = []
+    for title in titles:
+        rows.append([title, *[_figure_text(figures.get(title)) for figures in groups.values()]])
+    return rows
 
 
-def _shown(figure: Estimated | int | None) -> str:
-    """Return a figure for people."""
+def _figure_text(figure: Estimated | int | None) -> str:
+    """Return a figure with its standard error as text; empty if there is none."""
     if figure is None:
         return ""
     if isinstance(figure, int):
         return str(figure)
-    error = f" ± {figure.error:.2g}" if np.isfinite(figure.error) else ""  # one twin has none
-    return f"{figure.value:.4g}{error}"
+    if not np.isfinite(figure.error):  # one twin has no standard error
+        return f"{figure.value:.4g}"
+    return f"{figure.value:.4g} ± {figure.error:.2g}"

@@ -1,359 +1,377 @@
-"""The page of a fleet: its assets by health, who needs attention next, what was learnt, what failed.
+"""The page of a fleet: health of its assets, who needs attention next, what was learnt, failures.
 
-From nothing but the folder of the fleet, which may still be growing. What it shows does not grow with the
-number of assets: a cell of a map for each, and tables of the few that matter. The same page follows a fleet
-in the browser: while it flies, while it is watched, or afterwards.
+The page is made from the folder of the fleet alone, which may still be growing. Its size does not
+grow with the number of assets: it has a cell of a map for each, and tables of the few that matter.
 """
 
 import json
 from collections import Counter
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from reporting import figures as style
-from reporting.arrays import Float
-from reporting.errors import ReportingError
+from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text
 from reporting.page import Page, PageColumn, Words, number_column
+from reporting.templates import in_one_line
+from reporting.words import counted
 from twin_master.errors import FleetError, TwinMasterError
-from twin_master.fleet.flight import KIND, WATCHED_KIND, fleet_config, told_of
-from twin_master.fleet.learn import LESSONS_NAME, lesson_rows
+from twin_master.fleet.configuration import KIND, WATCHED_KIND, fleet_config
+from twin_master.fleet.flight import endings_of
+from twin_master.fleet.lessons import LESSONS_NAME, lesson_rows
+from twin_master.fleet.page_figures import course_figure, map_figure
 from twin_master.fleet.reading import (
     believed_means,
     figure_rows,
     group_figures,
-    last_steps,
-    leaving,
-    noticed,
-    severity,
+    leaving_probabilities,
 )
-from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, has_flown, open_group
-from twin_master.fleet.watching import STATE_NAME, counts_of, read_standing
-from twin_master.mission.journal import JOURNAL_NAME
-from twin_master.report.reading import printed_factors
-from twin_master.run_folder import find_config
-from twin_master.scenario.schema import Scenario
-from twin_master.viewer.server import serve_page, text_of
+from twin_master.fleet.standing import Standing, standing_of_flown, standing_of_watched
+from twin_master.fleet.store import ENDED, FAILED, NOTICE_KINDS, WITHIN, flown_rows, open_group
+from twin_master.fleet.watched_asset import counts_of, read_standing
+from twin_master.report.reading import PrintedFactor, printed_factors
 
 if TYPE_CHECKING:
     import xarray as xr
 
 
 WORDS = Words("twin_master.fleet")
+"""The texts of the page."""
 REPORT_NAME = "report.html"
-NEXT, FAILURES = 15, 10
-"""Rows of the tables of who needs attention next, and of failures."""
-
-
-@dataclass(frozen=True)
-class Standing:
-    """How B assets of a group stand: steps and alarms (B,), moments of the state (B, F), SI, controls.
-
-    Moments are NaN where no state is believed. `leaving` (B,) is the probability that a control is left soon;
-    NaN where it is not known.
-    """
-
-    group: str
-    scenario: Scenario
-    names: list[str]
-    step: NDArray[np.int64]
-    mean: Float
-    deviation: Float
-    control: list[str]
-    alarms: NDArray[np.int64]
-    leaving: Float
-
-    @property
-    def severity(self) -> Float:
-        """How badly off each is (B,)."""
-        return severity(self.scenario, self.mean)
-
-    @property
-    def worst(self) -> int | None:
-        """The row of the asset that is worst off; None where no state is believed of any."""
-        if np.isnan(self.severity).all():
-            return None
-        return int(np.nanargmax(self.severity))
+ATTENTION_ROWS = 15
+"""Rows of the table of assets that need attention next, in the report."""
+_FAILURE_ROWS = 10
+"""Rows of the table of failures, the most frequent first."""
+_FAILURE_EXAMPLES = 3
+"""Assets that are named for each failure."""
 
 
 def write_fleet_report(folder: Path | str) -> Path:
     """Write the page of a fleet.
 
+    Parameters
+    ----------
+    folder : Path or str
+        The folder of the fleet.
+
+    Returns
+    -------
+    Path
+        The path of the page.
+
     Raises
     ------
     RunFolderError
-        The folder holds no fleet.
+        If the folder does not hold a fleet.
     FileNotWrittenError
-        The disk is full or the folder cannot be written.
+        If the disk is full or the folder cannot be written.
     """
-    return atomic_write_text(Path(folder) / REPORT_NAME, fleet_page(Path(folder), NEXT))
+    folder = Path(folder)
+    return atomic_write_text(folder / REPORT_NAME, fleet_page(folder, ATTENTION_ROWS))
 
 
-def fleet_page(folder: Path, most: int) -> str:
-    """Return the page of a fleet as it stands, with so many assets in the table of who needs attention next.
+def fleet_page(folder: Path, most_assets: int) -> str:
+    """Return the page of a fleet as it stands.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the fleet.
+    most_assets : int
+        The largest number of rows in the table of assets that need attention next.
 
     Raises
     ------
     RunFolderError
-        The folder holds no fleet.
+        If the folder does not hold a fleet.
     FleetError
-        It is damaged.
+        If it is damaged.
     """
     config = fleet_config(folder, KIND, WATCHED_KIND)
-    watched, fleet = config["kind"] == WATCHED_KIND, config["fleet"]
-    members = sum(len(group.get("members", ())) for group in fleet["groups"])  # of a watch they are not known
-    groups = len(fleet["groups"])
-    page = Page(
-        fleet["title"] or fleet["name"],
-        WORDS.say("subtitle", assets=members, groups=groups, seed=fleet["seed"], watched=watched),
-    )
+    is_watched = config["kind"] == WATCHED_KIND
+    fleet = config["fleet"]
+    groups = fleet["groups"]
+    page = Page(fleet["title"] or fleet["name"], _subtitle(fleet, is_watched=is_watched))
     page.add_section("The fleet")
     before = f"{folder} is damaged or of another version ("
     with FleetError.instead_of(KeyError, TypeError, AttributeError, before=before, after=")."):
-        (_add_watched if watched else _add_flown)(page, folder, fleet["groups"], most)
+        if is_watched:
+            _add_watched_fleet(page, folder, groups, most_assets)
+        else:
+            _add_flown_fleet(page, folder, groups, most_assets)
     return page.render()
 
 
-def _add_flown(page: Page, folder: Path, records: list[dict[str, Any]], most: int) -> None:
+def _subtitle(fleet: Mapping[str, Any], *, is_watched: bool) -> str:
+    """Return the size of a fleet, its seed, and whether it is watched or flown."""
+    group_count = counted(len(fleet["groups"]), "group")
+    if is_watched:  # the configuration does not know which assets there are
+        return f"{group_count}, seed {fleet['seed']}, watched"
+    asset_count = sum(len(group.get("members", ())) for group in fleet["groups"])
+    return f"{counted(asset_count, 'asset')} in {group_count}, seed {fleet['seed']}, flown"
+
+
+def _add_flown_fleet(
+    page: Page, folder: Path, records: Sequence[dict[str, Any]], most_assets: int
+) -> None:
+    """Add the sections of a fleet that is flown; records are its groups in `config.json`."""
     groups = {record["name"]: open_group(folder, record["name"]) for record in records}
-    found = [_flown(record, groups[record["name"]]) for record in records]
-    page.add_paragraph(_opening(found, [*groups.values()]))
+    standings = [standing_of_flown(record, groups[record["name"]]) for record in records]
+    page.add_paragraph(_opening(standings, list(groups.values())))
     figures = {name: group_figures(group) for name, group in groups.items()}
     WORDS.add_table(page, "fared", figure_rows(figures), more=list(figures))
     status = np.concatenate([group["status"].values for group in groups.values()])
-    _add_failures(page, told_of(folder)["failures"], "lost", assets=len(status))
-    if ended := int(np.sum(status == ENDED)):
-        page.add_notice(WORDS.say("short", ended=ended, assets=len(status)))
-    _add_lessons(page, folder)
-    for record, standing in zip(records, found, strict=True):
-        group = groups[record["name"]]
-        flown = has_flown(group["status"].values)
-        page.add_section(f"Group {record['name']}")
-        try:
-            standing = replace(standing, leaving=leaving(folder, record, group)[flown])
-        except TwinMasterError as error:
-            page.add_paragraph(WORDS.say("unknown", error=error))
-        failed = int(np.sum(group["status"].values == FAILED))
-        courses = believed_means(group)[flown], group["state"].values[flown]
-        _add_group(page, standing, most, failed, courses)
-
-
-def _flown(record: dict[str, Any], group: "xr.Dataset") -> Standing:
-    """Return how the twins of a group stood after their last step, but for what they would do next."""
-    scenario, flown = Scenario.model_validate(record["scenarios"][0]), has_flown(group["status"].values)
-    at = flown, last_steps(group)[flown]
-    return Standing(
-        record["name"], scenario, [record["members"][row][0] for row in flown], at[1],
-        believed_means(group)[at], group["standard_deviation"].values[at],
-        [scenario.control_names[u] for u in group["control_index"].values[at]],
-        noticed(group, "alarm")[flown], np.full(len(flown), np.nan),
-    )  # fmt: skip
-
-
-def _opening(found: list[Standing], groups: "list[xr.Dataset]") -> str:
-    """Return what a reader wants to know first: how many flew, how the control went, who is worst off."""
-    delay = np.concatenate([group["delay"].values for group in groups])
-    first = np.concatenate([group["first_notice"].values[:, NOTICE_KINDS.index("alarm")] for group in groups])
-    alarmed = first[first >= 0]
-    called = delay[~np.isnan(delay)]
-    known = [one for one in found if one.worst is not None]
-    worst = max(known, key=lambda one: np.nanmax(one.severity), default=None)
-    row = None if worst is None else worst.worst
-    return WORDS.say(
-        "opening", flown=sum(len(one.names) for one in found), assets=len(delay),
-        alarmed=len(alarmed), first=min(alarmed, default=0),
-        called=len(called), share=float(np.mean(called <= WITHIN)) if len(called) else 0.0, within=WITHIN,
-        step=found[0].scenario.mission.step_name, worst=worst, row=row,
-        states=[] if worst is None else zip(printed_factors(worst.scenario), worst.mean[row], strict=True),
-    )  # fmt: skip
-
-
-def _add_watched(page: Page, folder: Path, groups: list[dict[str, Any]], most: int) -> None:
-    record = read_standing(folder)
-    known, failures = record["assets"], record["failures"]
-    told = {name: asset for name, asset in known.items() if asset["last"] is not None}
-    page.add_highlights([(str(count), title) for title, count in counts_of(record).items()])
-    _add_failures(page, failures, "not_watched", assets=len(known | failures))
-    if silent := sorted(known.keys() - told.keys() - failures.keys()):
-        page.add_notice(WORDS.say("silent", names=silent, most=most))
-    _add_lessons(page, folder)
-    for group in groups:
-        scenario, prefix = Scenario.model_validate(group["scenarios"][0]), f"{group['name']}/"
-        own = {name.removeprefix(prefix): told[name] for name in told if name.startswith(prefix)}
-        last = [asset["last"] for asset in own.values()]
-        mean, deviation = (
-            np.array(
-                [[one["health"][name][moment] for name in scenario.state_names] for one in last], np.float64
-            )
-            for moment in ("mean", "standard_deviation")
-        )
-        step, control = np.array([one["step"] for one in last]), [one["control"] for one in last]
-        alarmed = np.array([asset["alarms"] for asset in own.values()], np.int64)
-        chance = np.array([asset["leaving"] for asset in own.values()], np.float64)
-        page.add_section(f"Group {group['name']}")
-        _add_group(
-            page,
-            Standing(group["name"], scenario, [*own], step, mean, deviation, control, alarmed, chance),
-            most,
-        )
-
-
-def _add_failures(page: Page, failures: Mapping[str, str], notice: str, assets: int) -> None:
-    """Add what ended flights or watches, by cause; nothing without any."""
+    failures = endings_of(folder).failures
     if failures:
-        page.add_notice(WORDS.say(notice, failed=len(failures), assets=assets))
+        page.add_notice(
+            f"{len(failures)} of {len(status)} assets failed in flight; their twins end there."
+        )
+    _add_failures(page, failures, "All of them stand in fleet.json once the fleet has flown.")
+    ended_early = int(np.sum(status == ENDED))
+    if ended_early:
+        page.add_notice(
+            f"{ended_early} of {len(status)} assets ended their simulation before the mission "
+            "was over; what they have flown counts."
+        )
+    _add_lessons(page, folder)
+    for record, standing in zip(records, standings, strict=True):
+        group = groups[record["name"]]
+        page.add_section(f"Group {record['name']}")
+        leaving = _leaving_or_explanation(page, folder, record, group)
+        if leaving is not None:
+            standing = replace(standing, leaving=leaving)
+        failed = int(np.sum(group["status"].values == FAILED))
+        _add_map(page, standing, failed)
+        _add_courses(page, standing, group)
+        _add_attention_table(page, standing, most_assets)
+
+
+def _leaving_or_explanation(
+    page: Page, folder: Path, record: Mapping[str, Any], group: "xr.Dataset"
+) -> Float | None:
+    """Return the probabilities that the flown twins of a group leave their controls soon.
+
+    If they cannot be computed, the page says why, and None is returned.
+    """
+    try:
+        probabilities = leaving_probabilities(folder, record, group)
+    except TwinMasterError as error:
+        page.add_paragraph(in_one_line(f"Who leaves its control soon is not known: {error}"))
+        return None
+    return probabilities[flown_rows(group["status"].values)]
+
+
+def _opening(standings: Sequence[Standing], groups: "Sequence[xr.Dataset]") -> str:
+    """Return what a reader wants to know first: flights, alarms, fallbacks, the worst damage."""
+    asset_count = sum(group.sizes["twin"] for group in groups)
+    flown_count = sum(len(standing.names) for standing in standings)
+    sentences = [
+        f"{flown_count} of {counted(asset_count, 'asset')} have flown.",
+        _alarm_sentence(standings[0].scenario.mission.step_name, groups),
+        _fallback_sentence(standings[0].scenario.mission.step_name, groups),
+        _damage_sentence(standings),
+    ]
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _alarm_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
+    """Return how many assets raised an alarm, and in which step the first; empty if none did."""
+    alarm = NOTICE_KINDS.index("alarm")
+    first_alarm = np.concatenate([group["first_notice"].values[:, alarm] for group in groups])
+    raised = first_alarm[first_alarm >= 0]
+    if not len(raised):
+        return ""
+    return f"{counted(len(raised), 'asset')} raised an alarm, first in {step_word} {min(raised)}."
+
+
+def _fallback_sentence(step_word: str, groups: "Sequence[xr.Dataset]") -> str:
+    """Return how often the control fell back in time; empty if no damage called for it."""
+    delay = np.concatenate([group["delay"].values for group in groups])
+    called_for = delay[~np.isnan(delay)]
+    if not len(called_for):
+        return ""
+    fraction_in_time = float(np.mean(called_for <= WITHIN))
+    return (
+        f"In {counted(len(called_for), 'asset')} the damage called for another control; "
+        f"the fallback came within {WITHIN} {step_word}s of it in {100 * fraction_in_time:.0f} %."
+    )
+
+
+def _damage_sentence(standings: Sequence[Standing]) -> str:
+    """Return which asset is damaged most severely, and its state; empty if no state is believed."""
+    believed = [standing for standing in standings if standing.most_damaged is not None]
+    if not believed:
+        return ""
+    worst_group = max(believed, key=lambda standing: np.nanmax(standing.severity))
+    number = worst_group.most_damaged
+    assert number is not None
+    states = []
+    for factor, mean in zip(
+        printed_factors(worst_group.scenario), worst_group.mean[number], strict=True
+    ):
+        states.append(f"{factor.title} {factor.scale * mean:.3g} {factor.unit}".rstrip())
+    name = worst_group.names[number]
+    return f"The worst off is {name} of {worst_group.group}: {', '.join(states)}."
+
+
+def _add_watched_fleet(
+    page: Page, folder: Path, groups: Sequence[dict[str, Any]], most_assets: int
+) -> None:
+    """Add the sections of a fleet that is watched; groups are those in `config.json`."""
+    standing = read_standing(folder)
+    assets = standing["assets"]
+    failures = standing["failures"]
+    decided = {name: asset for name, asset in assets.items() if asset["last"] is not None}
+    page.add_highlights([(str(count), title) for title, count in counts_of(standing).items()])
+    if failures:
+        asset_count = counted(len(assets | failures), "asset")
+        page.add_notice(f"{len(failures)} of {asset_count} are not watched.")
+    _add_failures(page, failures, "They stand in watched.json.")
+    without_step = sorted(assets.keys() - decided.keys() - failures.keys())
+    if without_step:
+        names = ", ".join(without_step[:most_assets])
+        more = ", ..." if len(without_step) > most_assets else ""
+        count = counted(len(without_step), "asset")
+        page.add_notice(f"Without a step yet: {count} ({names}{more}).")
+    _add_lessons(page, folder)
+    for record in groups:
+        page.add_section(f"Group {record['name']}")
+        group_standing = standing_of_watched(record, decided)
+        _add_map(page, group_standing, failed=0)
+        _add_attention_table(page, group_standing, most_assets)
+
+
+def _add_failures(page: Page, failures: Mapping[str, str], caption: str) -> None:
+    """Add a table of why flights or watches ended, the most frequent reasons first.
+
+    Parameters
+    ----------
+    page : Page
+        The page.
+    failures : mapping of str to str
+        The reason for each asset, by its name.
+    caption : str
+        Where all failures stand.
+    """
     rows = []
-    for sentence, count in Counter(failures.values()).most_common(FAILURES):
-        names = [name for name, text in failures.items() if text == sentence]
-        rows.append([sentence, str(count), ", ".join(names[:3]) + (", ..." if count > 3 else "")])
-    WORDS.add_table(page, "failures", rows, watched=notice == "not_watched")
+    for reason, count in Counter(failures.values()).most_common(_FAILURE_ROWS):
+        names = [name for name, its_reason in failures.items() if its_reason == reason]
+        examples = ", ".join(names[:_FAILURE_EXAMPLES])
+        if count > _FAILURE_EXAMPLES:
+            examples += ", ..."
+        rows.append([reason, str(count), examples])
+    WORDS.add_table(page, "failures", rows, caption=caption)
 
 
 def _add_lessons(page: Page, folder: Path) -> None:
-    """Add what was learnt across the fleet beside what was assumed, where it has been learnt."""
+    """Add what was learnt across the fleet beside what was assumed, if `fleet learn` has run."""
     path = folder / LESSONS_NAME
-    if not path.is_file():
-        return
-    page.add_section("Learnt across the fleet")
-    WORDS.add_table(page, "lessons", lesson_rows(json.loads(path.read_text())))
+    if path.is_file():
+        page.add_section("Learnt across the fleet")
+        WORDS.add_table(page, "lessons", lesson_rows(json.loads(path.read_text())))
 
 
-def _add_group(
-    page: Page, standing: Standing, most: int, failed: int = 0, courses: tuple[Float, Float] | None = None
-) -> None:
-    """Add a map of a group, bands where all steps are at hand, and so many assets that need attention."""
-    count, scenario = len(standing.names), standing.scenario
-    if not count:
-        page.add_paragraph(WORDS.say("nothing"))
+def _add_map(page: Page, standing: Standing, failed: int) -> None:
+    """Add the map of the assets of a group by health, of which some failed in flight."""
+    if not standing.names:
+        page.add_paragraph("Nothing is known of its assets yet.")
         return
-    page.add_report_figure(WORDS.figure("map", map_figure(scenario, standing.mean, failed), failed=failed))
-    if courses is not None and not np.isnan(courses[0]).all():
-        page.add_report_figure(WORDS.figure("course", course_figure(scenario, *courses)))
-    factors, soon = printed_factors(scenario), np.rint(100.0 * np.nan_to_num(standing.leaving))
-    severity_first = np.nan_to_num(standing.severity, nan=np.inf)  # of no state that is believed
-    order = np.lexsort((-severity_first, -soon, -standing.alarms))[:most].tolist()
-    rows, told = [], bool(standing.alarms.any())
-    for row in order:
-        states = [
-            _moments(factor.scale * mean, factor.scale * deviation)
-            for factor, mean, deviation in zip(
-                factors, standing.mean[row], standing.deviation[row], strict=True
-            )
-        ]
-        change = "" if np.isnan(standing.leaving[row]) else f"{soon[row]:.0f}"
-        alarms = [str(standing.alarms[row] or "")] * told
-        rows.append(
-            [standing.names[row], str(standing.step[row]), *states, standing.control[row], change, *alarms]
-        )
-    more = [
-        number_column(state.name, factor.unit) for state, factor in zip(scenario.state, factors, strict=True)
-    ]
-    more += [PageColumn("control"), number_column("change", "%"), *[number_column("alarms")] * told]
+    figure = map_figure(standing.scenario, standing.mean, failed)
+    failed_sentence = f"Grey: {failed} that failed in flight." if failed else ""
+    page.add_report_figure(WORDS.figure("map", figure, failed=failed_sentence))
+
+
+def _add_courses(page: Page, standing: Standing, group: "xr.Dataset") -> None:
+    """Add the health of the assets of a group over time, if a state is believed in any step."""
+    flown = flown_rows(group["status"].values)
+    mean = believed_means(group)[flown]
+    if standing.names and not np.isnan(mean).all():
+        figure = course_figure(standing.scenario, mean, group["state"].values[flown])
+        page.add_report_figure(WORDS.figure("course", figure))
+
+
+class _AttentionTable(NamedTuple):
+    """The columns beside name and step of a table of assets, and its rows."""
+
+    columns: list[PageColumn]
+    rows: list[list[str]]
+
+
+def _add_attention_table(page: Page, standing: Standing, most_assets: int) -> None:
+    """Add the table of the assets of a group that need attention next."""
+    if not standing.names:
+        return
+    order = _attention_order(standing)[:most_assets]
+    has_alarms = bool(standing.alarms.any())
+    table = _attention_table(standing, order, has_alarms=has_alarms)
+    mission = standing.scenario.mission
     WORDS.add_table(
-        page, "next", rows, more=more, shown=len(rows), assets=count, alarms=told, mission=scenario.mission
+        page,
+        "next",
+        table.rows,
+        more=table.columns,
+        shown=len(table.rows),
+        assets=counted(len(standing.names), "asset"),
+        alarms="alarms, then by " if has_alarms else "",
+        steps=f"{mission.prediction_steps} {mission.step_name}s",
+        step=mission.step_name,
     )
 
 
-def _moments(mean: float, deviation: float) -> str:
-    """Return the cell of a table with mean and standard deviation; NaN where no state is believed."""
-    if np.isnan(mean):
-        return "not believed"
-    return f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}"
+def _leaving_percentage(standing: Standing) -> Float:
+    """Return the probability of leaving a control in whole percent, a (B,) array; 0 if unknown."""
+    return np.asarray(np.rint(100.0 * np.nan_to_num(standing.leaving)))
 
 
-@style.publication_style()
-def map_figure(scenario: Scenario, last: Float, failed: int) -> Figure:
-    """Return a map of the assets, the last means (B, F) of which are given: a panel for each factor."""
-    factors, count = printed_factors(scenario), len(last) + failed
-    wide = max(1, int(np.ceil(np.sqrt(2.0 * count))))
-    high = -(-count // wide)
-    order = np.argsort(-severity(scenario, last), kind="stable")
-    figure, rows = style.panels(
-        len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.07, right=0.99, hspace=0.25
-    )
-    for number, (factor, (axes,)) in enumerate(zip(factors, rows, strict=True)):
-        cells = np.full(high * wide, np.nan)
-        cells[: len(last)] = factor.scale * last[order, number]
-        look: dict[str, Any] = {"aspect": "auto", "interpolation": "nearest"}
-        there = np.where(np.arange(high * wide) < count, 1.0, np.nan).reshape(high, wide)
-        axes.imshow(there, cmap="Greys", vmin=0.0, vmax=2.0, **look)
-        image = axes.imshow(
-            np.ma.masked_invalid(cells.reshape(high, wide)), cmap=style.LEVELS,
-            vmin=factor.levels[0], vmax=factor.levels[-1], **look,
-        )  # fmt: skip
-        axes.set_xticks([])
-        axes.set_yticks([])
-        style.panel_label(axes, "abcdefgh"[number % 8], factor.title)
-        # On the left, where a narrow screen shows it.
-        style.color_bar(figure, image, factor.unit, ax=axes, location="left", pad=0.02, fraction=0.03)
-    return figure
+def _attention_order(standing: Standing) -> Index:
+    """Return the numbers of assets by alarms, then by leaving a control soon, then by damage.
+
+    Assets in no state that is believed count as the most damaged.
+    """
+    damage = np.nan_to_num(standing.severity, nan=np.inf)
+    # The last key counts first.
+    return np.lexsort((-damage, -_leaving_percentage(standing), -standing.alarms))
 
 
-@style.publication_style()
-def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
-    """Return bands of the states of B assets over the steps: (B, T, F), true ones NaN where not known."""
-    factors = printed_factors(scenario)
-    figure, (row,) = style.panels(1, len(factors), 2.4, 0.3, 0.45, wspace=0.25)
-    steps = np.flatnonzero(~np.isnan(mean).all(axis=(0, 2)))
-    for number, (factor, axes) in enumerate(zip(factors, row, strict=True)):
-        own, true = (factor.scale * values[:, steps, number] for values in (mean, state))
-        low, quarter, middle, three, top = np.nanquantile(own, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
-        style.band(axes, steps, low, top, style.PRESENT)
-        style.band(axes, steps, quarter, three, style.PRESENT)
-        axes.plot(steps, middle, color=style.PRESENT, label="median of the filtered means")
-        known = ~np.isnan(true).all(axis=0)  # of some, where assets have ended
-        median = np.nanmedian(true[:, known], axis=0)
-        axes.plot(steps[known], median, **style.TRUTH_LINE, label="median of the true states")
-        axes.set_xlabel(scenario.mission.step_name)
-        axes.set_ylabel(f"{factor.title} ({factor.unit})")
-        style.panel_label(axes, "abcdefgh"[number % 8])
-    return figure
+def _attention_table(
+    standing: Standing, order: Iterable[int], *, has_alarms: bool
+) -> _AttentionTable:
+    """Return the table of assets in an order, with a column of alarms if there are any."""
+    factors = printed_factors(standing.scenario)
+    columns = []
+    for state, factor in zip(standing.scenario.state, factors, strict=True):
+        columns.append(number_column(state.name, factor.unit))
+    columns += [PageColumn("control"), number_column("change", "%")]
+    if has_alarms:
+        columns.append(number_column("alarms"))
+    percentage = _leaving_percentage(standing)
+    rows = []
+    for number in order:
+        is_leaving_known = not np.isnan(standing.leaving[number])
+        row = [
+            standing.names[number],
+            str(standing.step[number]),
+            *_state_cells(standing, factors, number),
+            standing.control[number],
+            f"{percentage[number]:.0f}" if is_leaving_known else "",
+        ]
+        if has_alarms:
+            row.append(str(standing.alarms[number] or ""))
+        rows.append(row)
+    return _AttentionTable(columns, rows)
 
 
-WORST = 50
-"""Assets in the table."""
-
-
-def is_fleet(folder: Path) -> bool:
-    """Return whether a folder is that of a fleet, flown or watched."""
-    return find_config(folder, KIND, WATCHED_KIND) is not None
-
-
-def serve_fleet(
-    folder: Path, port: int, ready: Callable[[str], None], wanted: Callable[[], bool] = lambda: True
-) -> None:
-    """Show a fleet to browsers of this machine, as `viewer.server.serve` shows a flight."""
-    seen, version, html = _stamp(folder), 0, fleet_page(folder, WORST)
-
-    def current() -> str:
-        """Make the page again where the fleet has changed; what cannot be read is looked at again."""
-        nonlocal seen, version, html
-        with suppress(TwinMasterError, ReportingError, OSError, ValueError):  # it was just being written
-            if (stamp := _stamp(folder)) != seen:
-                html = fleet_page(folder, WORST)
-                seen, version = stamp, version + 1
-        return str(version)
-
-    def page() -> str:
-        tag = f'<script src="/view.js" data-version="{current()}"></script></body>'
-        return html.replace("</body>", tag)
-
-    texts = {
-        "/": (page, "text/html"),
-        "/version": (current, "text/plain"),
-        "/view.js": (text_of("twin_master.fleet", "view.js"), "text/javascript"),
-    }
-    serve_page(texts, port, ready, wanted)
-
-
-def _stamp(folder: Path) -> list[tuple[str, int, int]]:
-    paths = [folder / name for name in (JOURNAL_NAME, STATE_NAME, LESSONS_NAME)]
-    stats = [(path.name, path.stat()) for path in paths if path.is_file()]
-    return [(name, stat.st_mtime_ns, stat.st_size) for name, stat in stats]
+def _state_cells(standing: Standing, factors: Sequence[PrintedFactor], number: int) -> list[str]:
+    """Return mean and standard deviation of each factor of the state of an asset, as printed."""
+    cells = []
+    for index, factor in enumerate(factors):
+        mean = factor.scale * standing.mean[number, index]
+        deviation = factor.scale * standing.deviation[number, index]
+        if np.isnan(mean):
+            cells.append("not believed")
+        else:
+            cells.append(f"{mean:.1f}\N{NO-BREAK SPACE}±\N{NO-BREAK SPACE}{deviation:.1f}")
+    return cells

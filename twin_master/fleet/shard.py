@@ -1,107 +1,126 @@
-"""What a worker does: it flies some twins of one group, and hands back arrays.
+"""What a worker does: it flies some twins of one group, and returns arrays.
 
-A piece of work carries all that it needs, so that it can be done on any machine, by any process, any number
-of times: the result is the same to the last bit.
-
-Who flies: this process, worker processes of this machine, or a Dask cluster at an address. Results come back
-in any order.
+A shard comes with all that it needs, so that it can be flown on any machine, by any process, any
+number of times: the result is the same to the last bit.
 """
 
-import logging
 import pickle
 import shutil
-import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
-from functools import cache, lru_cache
-from itertools import islice
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from functools import lru_cache
 from pathlib import Path
 from tempfile import mkdtemp
-from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 from weakref import finalize
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.files import hash_record, write_members
-from reporting.progress import Progress, SilentProgress
-from reporting.provenance import collect_provenance
+from reporting.files import write_members
+from reporting.progress import SilentProgress
 from twin_master.assets.asset_source import Asset, AssetSource, StatelessAsset
 from twin_master.assets.fmu_source import FmuSource
 from twin_master.assets.reduced_model import ReducedModelSource
-from twin_master.errors import FleetError, said
+from twin_master.errors import FleetError
+from twin_master.fleet.checks import with_parameters
 from twin_master.fleet.plan import Member
-from twin_master.fleet.store import FAILED, outcomes_of
+from twin_master.fleet.store import FAILED, stored_variables
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge, load_knowledge
 from twin_master.mission.replay import BelievedModel, refilter
-from twin_master.mission.side_by_side import FLIGHT_ERRORS, Flights, fly_one_by_one, fly_side_by_side
+from twin_master.mission.side_by_side import (
+    FLIGHT_ERRORS,
+    Flights,
+    fly_one_by_one,
+    fly_side_by_side,
+)
 from twin_master.mission.steps import History, Reading
 from twin_master.network.estimator import Notice
 from twin_master.scenario.schema import Scenario
 from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import Fed
 
-if TYPE_CHECKING:
-    from distributed import Client
 
+def flights_of_recordings(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
+    """Return the beliefs and controls of B twins given recordings of real assets.
 
-def assimilated(knowledge: Knowledge, recordings: Sequence[Sequence[Fed]]) -> Flights:
-    """Return what B twins conclude of B recordings: beliefs and controls are those of a watch of each."""
-    flights, most = Flights.empty(knowledge, len(recordings)), knowledge.scenario.mission.steps
+    They are those of a watch of each asset.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        What the twins know.
+    recordings : sequence of sequence of Fed
+        The messages of each of the B assets.
+    """
+    flights = Flights.empty(knowledge, len(recordings))
+    most_steps = knowledge.scenario.mission.steps
     for number, messages in enumerate(recordings):
         try:
-            history = _history(knowledge, messages)
+            history = _history_of_recording(knowledge, messages)
         except FLIGHT_ERRORS as error:
             flights.failure[number] = str(error)
             continue
-        steps = len(history.steps)
-        if not steps:
+        step_count = len(history.steps)
+        if step_count == 0:
             flights.failure[number] = "its recording has no step yet."
-        elif steps > most:
+        elif step_count > most_steps:
             flights.failure[number] = (
-                f"it has {steps} steps, and {most} at most are flown: set `steps` of the group."
+                f"it has {step_count} steps, and {most_steps} at most are flown: "
+                "set `steps` of the group."
             )
         else:
             flights.store_history(number, history)
     return flights
 
 
-def _history(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
+def _history_of_recording(knowledge: Knowledge, messages: Sequence[Fed]) -> History:
+    """Return what a twin concludes from the messages of one real asset.
+
+    If any message comes late and revises a former step, all steps are filtered again at the end.
+    """
     scenario = knowledge.scenario
     twin = knowledge.twin(lag=scenario.watch.lag)
     history = History(twin, scenario.observation.count)
-    intake, seen, late = Intake(scenario, Feed(messages)), {}, False
-    lost: list[tuple[int, Notice]] = []
+    intake = Intake(scenario, Feed(messages))
+    reading_of_step: dict[int, Reading] = {}
+    has_late_message = False
+    intake_notices: list[tuple[int, Notice]] = []
     for step in operate(twin, intake, history.add):
-        at = intake.observation_step
-        seen[at] = Reading(step.reading.observed, twin.control_of(at))
-        late |= step.reading.revises is not None
-        lost += [(at, notice) for notice in intake.notices]
-    if late:
-        history = refilter(seen, [BelievedModel(0, knowledge)])
-    history.notices += lost
+        number = intake.observation_step
+        reading_of_step[number] = Reading(step.reading.observed, twin.control_of(number))
+        if step.reading.revises is not None:
+            has_late_message = True
+        intake_notices += [(number, notice) for notice in intake.notices]
+    if has_late_message:
+        history = refilter(reading_of_step, [BelievedModel(0, knowledge)])
+    history.notices += intake_notices
     return history
 
 
-ShardResult = tuple[Mapping[str, NDArray[Any]], dict[str, dict[str, str]]]
-"""Variables of the store with B rows; and by the names of twins what ended their flights, `failures`, and how
-assets ended their simulations early, `ended`."""
+class ShardResult(NamedTuple):
+    """The result of the flights of B twins.
+
+    Attributes
+    ----------
+    variables : dict of str to array
+        The variables of the store, with B rows each.
+    failures : dict of str to str
+        Why flights failed, by the name of the twin.
+    ended : dict of str to str
+        How assets ended their simulations early, by the name of the twin.
+    """
+
+    variables: Mapping[str, NDArray[Any]]
+    failures: dict[str, str]
+    ended: dict[str, str]
 
 
-def unflown(member: Member, sentence: str) -> ShardResult:
-    """Return what is kept of a twin that could not fly, and why."""
-    status = {"status": np.array([FAILED]), "seed": np.array([member.seed])}
-    return status, {"failures": {member.name: sentence}, "ended": {}}
-
-
-@cache
-def program_version() -> str:
-    """Return a hash of this program and the packages that its numbers depend on."""
-    found = collect_provenance().as_dict()
-    return hash_record([found["versions"], found["source_hashes"], list(sys.version_info[:2])])
+def result_of_unflown(member: Member, reason: str) -> ShardResult:
+    """Return the result of a twin that could not fly, with the reason."""
+    variables = {"status": np.array([FAILED]), "seed": np.array([member.seed])}
+    return ShardResult(variables, {member.name: reason}, {})
 
 
 class Kit:
@@ -110,265 +129,181 @@ class Kit:
     Parameters
     ----------
     packed : bytes
-        Pickled: the scenario, portable; the prepared folder, files by their paths: what the twin knows, and
-        the FMU; and the model that is flown in the place of an FMU, or None.
+        Pickled: the portable scenario, the files of the prepared folder by their paths (what the
+        twins know, and the FMU), and the model that is flown without an FMU, or None.
     """
 
     def __init__(self, packed: bytes) -> None:
         scenario, files, self.wing = pickle.loads(packed)
-        self._folder = folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
+        folder = Path(mkdtemp(prefix="uav_twin_fleet_"))
         finalize(self, shutil.rmtree, folder, ignore_errors=True)
         write_members(folder, files)
-        self.scenario = Scenario.model_validate(scenario).moved(folder)
+        self._folder = folder
+        self.scenario = Scenario.model_validate(scenario).with_paths_from(folder)
         self.knowledge: Knowledge = load_knowledge(folder, self.scenario)
 
-    def told(self, sentence: str) -> str:
-        """Return a sentence without the folder of this process, which nobody else knows."""
+    def without_folder(self, sentence: str) -> str:
+        """Return a sentence without the temporary folder, which no user knows."""
         return sentence.replace(f"{self._folder}/", "")
 
-    def opened(self, parameters: Mapping[str, float], seed: int | None = None) -> Asset:
-        """Return what is flown: the model, or an FMU."""
+    def open_asset(self, parameters: Mapping[str, float], seed: int | None = None) -> Asset:
+        """Return an asset to fly: the model, or an FMU.
+
+        Parameters
+        ----------
+        parameters : mapping of str to float
+            Its true parameters, in SI units.
+        seed : int, optional
+            The seed of the asset itself, if the scenario names one.
+        """
         scenario = with_parameters(self.scenario, parameters)
         if self.wing is not None:
             return ReducedModelSource(scenario, self.wing).open()
         if seed is not None:
-            scenario = scenario.under(seed)
+            scenario = scenario.with_seed(seed)
         source: AssetSource = scenario.asset.source(scenario)
         if isinstance(source, FmuSource):
-            source.use(self._folder)  # packed already
+            source.use_prepared_folder(self._folder)  # it is packed already
         else:
             source.prepare(self._folder, SilentProgress())
         return source.open()
 
 
-_unpacked = lru_cache(maxsize=1)(Kit)
-"""Gives the last kit of this process again: shards of a group follow each other."""
+_unpacked_kit = lru_cache(maxsize=1)(Kit)
+"""Unpacks a kit, or returns the last one again: shards of a group follow each other."""
 
 
-def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scenario:
-    """Return a scenario whose asset has these true parameters, beside those that it has."""
-    if not parameters:
-        return scenario
-    return scenario.having("asset", parameters={**scenario.asset.true_parameters, **parameters})
-
-
-def fly_shard(packed: bytes, members: Sequence[Member]) -> ShardResult:
+def fly_shard(packed_kit: bytes, members: Sequence[Member]) -> ShardResult:
     """Fly some twins of one group.
 
     Parameters
     ----------
-    packed : bytes
-        Of a `Kit`, pickled.
+    packed_kit : bytes
+        The packed `Kit` of the twins.
     members : sequence of Member
-        B of them.
+        The B twins.
     """
-    kit = _unpacked(packed)
-    recorded = [member.recording for member in members if member.recording is not None]
-    flights = assimilated(kit.knowledge, recorded) if recorded else _flown(kit, members)
-    told = {
-        what: {m.name: kit.told(text) for m, text in zip(members, texts, strict=True) if text}
-        for what, texts in (("failures", flights.failure), ("ended", flights.ended))
-    }
-    return outcomes_of(kit.knowledge, flights, members), told
+    kit = _unpacked_kit(packed_kit)
+    recordings = [member.recording for member in members if member.recording is not None]
+    if recordings:
+        flights = flights_of_recordings(kit.knowledge, recordings)
+    else:
+        flights = _fly_assets(kit, members)
+    return ShardResult(
+        variables=stored_variables(kit.knowledge, flights, members),
+        failures=_sentences_by_name(kit, members, flights.failure),
+        ended=_sentences_by_name(kit, members, flights.ended),
+    )
 
 
-def _flown(kit: Kit, members: Sequence[Member]) -> Flights:
-    """Fly twins with their assets."""
-    truths = [kit.knowledge.truth(member.seed) for member in members]
-    with _Hangar(kit, members) as hangar:
+def _sentences_by_name(
+    kit: Kit, members: Sequence[Member], sentences: Sequence[str]
+) -> dict[str, str]:
+    """Return the sentences on twins by their names; empty sentences are left out."""
+    named_sentences = {}
+    for member, sentence in zip(members, sentences, strict=True):
+        if sentence:
+            named_sentences[member.name] = kit.without_folder(sentence)
+    return named_sentences
+
+
+def _fly_assets(kit: Kit, members: Sequence[Member]) -> Flights:
+    """Fly twins with their assets: side by side if that is possible, else one after the other."""
+    knowledge = kit.knowledge
+    truths = [knowledge.truth(member.seed) for member in members]
+    with _AssetPool(kit, members) as pool:
         if kit.scenario.learning is None and kit.scenario.notice is None:
-            with suppress(*FLIGHT_ERRORS):  # which then happens to each of them
-                if assets := hangar.together():
-                    return fly_side_by_side(kit.knowledge, truths, assets)
-        return fly_one_by_one(kit.knowledge, truths, hangar.asset)
+            # If opening the assets fails, it will fail again, for each twin by itself.
+            with suppress(*FLIGHT_ERRORS):
+                assets = pool.open_stateless_assets()
+                if assets:
+                    return fly_side_by_side(knowledge, truths, assets)
+        return fly_one_by_one(knowledge, truths, pool.asset_at_start)
 
 
-class _Hangar(ExitStack):
-    """Assets that may have a memory, one open at a time; what failed is opened anew for the next twin."""
+class _AssetKey(NamedTuple):
+    """What makes an asset differ from others: its true parameters, and its seed if it has one."""
+
+    parameters: Mapping[str, float]
+    seed: int | None
+
+
+class _AssetPool(ExitStack):
+    """The assets of some twins, of which one is open at a time if they have a memory.
+
+    An asset whose flight failed is opened anew for the next twin.
+
+    Parameters
+    ----------
+    kit : Kit
+        What the twins need.
+    members : sequence of Member
+        The twins.
+    """
 
     def __init__(self, kit: Kit, members: Sequence[Member]) -> None:
         super().__init__()
-        seeds = bool(getattr(kit.scenario.asset, "seeds", ()))  # where assets have seeds of their own
+        assets_have_seeds = bool(getattr(kit.scenario.asset, "seeds", ()))
         self._kit = kit
-        self._wanted = [(member.parameters, member.seed if seeds else None) for member in members]
-        self._asset: Asset | None = None
-        self._start, self._opened = b"", self._wanted[0]
+        self._keys = [
+            _AssetKey(member.parameters, member.seed if assets_have_seeds else None)
+            for member in members
+        ]
+        self._open_asset: Asset | None = None
+        self._open_key = self._keys[0]
+        self._start_state = b""
 
-    def together(self) -> list[Asset]:
-        """Return the assets of all twins where none has a memory, and one stands for all that are alike."""
+    def open_stateless_assets(self) -> list[Asset]:
+        """Return an asset for each twin; empty if the assets have a memory.
+
+        Equal assets without memory are one object.
+        """
         if self._kit.wing is not None:
-            keys = [tuple(sorted(parameters.items())) for parameters, _ in self._wanted]
-            models = {key: self._kit.opened(dict(key)) for key in {*keys}}
-            return [models[key] for key in keys]
-        alike = all(wanted == self._wanted[0] for wanted in self._wanted)
-        asset = self._at_start(0, False) if alike else None
-        return [asset] * len(self._wanted) if isinstance(asset, StatelessAsset) else []
+            return self._open_models()
+        if any(key != self._keys[0] for key in self._keys):
+            return []
+        asset = self._open_at_start(0, is_reusable=False)
+        return [asset] * len(self._keys) if isinstance(asset, StatelessAsset) else []
 
-    def asset(self, twin: int, sound: bool) -> Asset:
-        """Return the asset of a twin, which flies alone, at its start."""
+    def _open_models(self) -> list[Asset]:
+        """Return the reduced model with the parameters of each twin."""
+        parameters_of_twins = [tuple(sorted(key.parameters.items())) for key in self._keys]
+        models = {}
+        for parameters in set(parameters_of_twins):
+            models[parameters] = self._kit.open_asset(dict(parameters))
+        return [models[parameters] for parameters in parameters_of_twins]
+
+    def asset_at_start(self, twin: int, is_reusable: bool) -> Asset:
+        """Return the asset of a twin that flies alone, at its start.
+
+        Parameters
+        ----------
+        twin : int
+            The number of the twin in the shard.
+        is_reusable : bool
+            Whether the flight before it went to its end, so that its asset can be set back.
+
+        Raises
+        ------
+        FleetError
+            If the twins share inspections, and so cannot fly one after the other.
+        """
         if self._kit.scenario.planner.inspections_per_step is not None:
-            raise FleetError("`inspections_per_step` needs assets without memory, which fly side by side")
-        return self._at_start(twin, sound)
+            raise FleetError(
+                "`inspections_per_step` needs assets without memory, which fly side by side"
+            )
+        return self._open_at_start(twin, is_reusable)
 
-    def _at_start(self, twin: int, sound: bool) -> Asset:
-        wanted = self._wanted[twin]
-        if self._asset is not None and sound and wanted == self._opened:
-            self._asset.restore_state(self._start)
+    def _open_at_start(self, twin: int, is_reusable: bool) -> Asset:
+        """Return the asset of a twin at its start: the open one set back, or a new one."""
+        key = self._keys[twin]
+        if self._open_asset is not None and is_reusable and key == self._open_key:
+            self._open_asset.restore_state(self._start_state)
         else:
-            self._asset = None
+            self._open_asset = None
             self.close()
-            self._asset = self._kit.opened(*wanted)
-            self.callback(self._asset.close)
-            self._start, self._opened = self._asset.save_state(), wanted
-        return self._asset
-
-
-WAITING = 2
-"""Shards that are handed out for each core beside the one that it flies; the others wait here."""
-CONNECTING = 10.0
-"""Seconds in which a scheduler must answer."""
-LAUNCHES = 2
-"""Times that workers may die over a shard before its twins fly one by one."""
-
-
-@dataclass(frozen=True)
-class Engine:
-    """Who flies.
-
-    Attributes
-    ----------
-    workers : int
-        Worker processes of this machine; 0 flies in this process.
-    cluster : str or None
-        Address of a Dask scheduler, in the place of workers of this machine.
-    """
-
-    workers: int = 0
-    cluster: str | None = None
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A shard, or a part of one that has cost a worker its life.
-
-    Attributes
-    ----------
-    group : int
-        Number of its group in the fleet.
-    kit : bytes
-        The pickled `Kit` of its twins.
-    members : tuple of Member
-        Its twins.
-    """
-
-    group: int
-    kit: bytes
-    members: tuple[Member, ...]
-
-
-def flown(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterator[tuple[Piece, ShardResult]]:
-    """Yield what becomes of each piece, as it is done.
-
-    Raises
-    ------
-    FleetError
-        The scheduler does not answer, or workers run another version of the program.
-    """
-    if engine.cluster is None and not engine.workers:
-        for piece in pieces:
-            yield piece, fly_shard(piece.kit, piece.members)
-        return
-    with _client(engine) as client:
-        progress.note(f"Dask dashboard: {client.dashboard_link}")
-        yield from _by_workers(client, pieces)
-
-
-def _by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[tuple[Piece, ShardResult]]:
-    from distributed import CancelledError, as_completed
-    from distributed.scheduler import KilledWorker
-
-    def submit(some: Iterable[Piece]) -> list[Any]:
-        futures = []
-        for piece in some:
-            future = client.submit(_fly_there, piece.kit, piece.members, program_version(), pure=False)
-            given[future.key] = piece
-            futures.append(future)
-        return futures
-
-    given: dict[Any, Piece] = {}
-    cores = max(1, sum(client.nthreads().values()))
-    waiting = as_completed(submit(islice(pieces, cores * (1 + WAITING))))
-    for future in waiting:
-        piece = given.pop(future.key)
-        try:
-            result: ShardResult = future.result()  # flown again where its worker died with it
-        except KilledWorker:
-            if len(piece.members) > 1:
-                waiting.update(submit(replace(piece, members=(one,)) for one in piece.members))
-                continue
-            sentence = "its flight ended the worker process: fly an FMU that crashes isolated."
-            result = unflown(piece.members[0], sentence)
-        except CancelledError:
-            raise FleetError(said("fleet.lost")) from None
-        yield piece, result
-        del future
-        waiting.update(submit(islice(pieces, 1)))
-
-
-def _fly_there(kit: bytes, members: Sequence[Member], version: str) -> ShardResult:
-    if version != program_version():
-        raise FleetError(said("fleet.version"))
-    return fly_shard(kit, members)
-
-
-@contextmanager
-def _client(engine: Engine) -> "Iterator[Client]":
-    """Give a client of the cluster, or of one that is made for the time being."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    quiet = {
-        "distributed.scheduler.allowed-failures": LAUNCHES,
-        "distributed.comm.timeouts.connect": CONNECTING,
-        "distributed.worker.memory.terminate": False,
-        "distributed.admin.large-graph-warning-threshold": "1 GiB",
-        "logging.distributed": "critical",
-    }
-    with dask.config.set(quiet):
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)
-        if engine.cluster is not None:
-            try:
-                client = Client(engine.cluster, timeout=CONNECTING)
-            except (OSError, TimeoutError, ValueError) as error:
-                raise FleetError(said("fleet.scheduler", cluster=engine.cluster)) from error
-            with client:
-                if not client.nthreads():
-                    raise FleetError(said("fleet.workers", cluster=engine.cluster))
-                yield client
-            return
-        with (
-            _nothing_of_the_caller(),
-            LocalCluster(
-                n_workers=engine.workers,
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=":0",
-                silence_logs=logging.CRITICAL,
-            ) as cluster,
-            Client(cluster) as client,
-        ):
-            yield client
-
-
-@contextmanager
-def _nothing_of_the_caller() -> Iterator[None]:
-    """Keep worker processes from running the caller's script again, as `multiprocessing` has them do.
-
-    That holds for those, too, that take the place of one that died.
-    """
-    main = sys.modules["__main__"]
-    sys.modules["__main__"] = ModuleType("__main__")
-    try:
-        yield
-    finally:
-        sys.modules["__main__"] = main
+            self._open_asset = self._kit.open_asset(key.parameters, key.seed)
+            self.callback(self._open_asset.close)
+            self._start_state = self._open_asset.save_state()
+            self._open_key = key
+        return self._open_asset

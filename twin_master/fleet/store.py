@@ -1,17 +1,17 @@
-"""The store of a fleet: what is kept of each twin, chunk by chunk, and which shards are there."""
+"""The store of a fleet: what is kept of each twin, in chunks of one shard."""
 
 from collections.abc import Sequence
 from importlib import util
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reporting.arrays import Float
+from reporting.arrays import Float, Index
 from reporting.files import explained_write_errors
 from reporting.former_names import warn_of_former_names
-from twin_master.errors import FleetError, said
+from twin_master.errors import FleetError
 from twin_master.fleet.plan import Fleet, Group, Member
 from twin_master.mission.preparation import Knowledge
 from twin_master.mission.side_by_side import Flights
@@ -26,24 +26,67 @@ if TYPE_CHECKING:
 
 
 NOTICE_KINDS = ("alarm", "gauge_left_out")
-"""Notices that are kept of each twin, by their kinds."""
+"""The kinds of notices that are kept of each twin."""
 CREDIBILITY = 0.9
 """Probability of the set of states in which the true one is looked for."""
 _TOLERANCE = 1e-9
+"""Rounding of probabilities: a difference below this is none."""
 WITHIN = 2
-"""Steps within which the fallback is to come."""
+"""Number of steps within which a fallback should follow the damage that calls for it."""
 
 FLOWN, FAILED, ENDED = 1, 2, 3
 """Values of `status`; 0 has not flown yet."""
+_NO_CONTROL = -1
+"""Control of steps that were not flown."""
+_NO_STEP = -1
+"""First step of a notice that was never given."""
+_NOT_DEFINED = -1
+"""Value of `early` if the policy does not depend on the level of one factor alone."""
 
 
-def has_flown(status: NDArray[Any]) -> NDArray[np.int64]:
-    """Return the rows of the twins that flew, to the end of the mission or to that of their assets."""
+_FILL_VALUES = {"control_index": _NO_CONTROL, "first_notice": _NO_STEP}
+"""Values of twins that have not flown, for variables in which 0 has a meaning."""
+
+
+class _Variable(NamedTuple):
+    """A variable of the store.
+
+    Attributes
+    ----------
+    axes : tuple of str
+        Its dimensions beside `twin`.
+    unit, title : str
+        Its unit and its name in words.
+    dtype : str
+        The type of its values, such as "f4".
+    """
+
+    axes: tuple[str, ...]
+    unit: str
+    title: str
+    dtype: str
+
+    @property
+    def fill_value(self) -> float:
+        """The value of twins that have not flown."""
+        return np.nan if self.dtype[0] == "f" else 0
+
+
+def _schema() -> dict[str, _Variable]:
+    """Return the variables of the store, by name."""
+    variables = {}
+    for name, (axes, unit, title, dtype) in SCHEMA["fleet"].items():
+        variables[name] = _Variable(tuple(axes.split()), unit, title, dtype)
+    return variables
+
+
+def flown_rows(status: NDArray[Any]) -> Index:
+    """Return the rows of the twins that flew to the end of the mission or of their assets."""
     return np.flatnonzero((status == FLOWN) | (status == ENDED))
 
 
-def sizes_of(scenario: Scenario) -> dict[str, int]:
-    """Return the lengths of the dimensions."""
+def dimension_sizes(scenario: Scenario) -> dict[str, int]:
+    """Return the sizes of the store's dimensions for a scenario, by name."""
     return {
         "step": scenario.mission.steps,
         "sensor": scenario.row_width,
@@ -53,27 +96,30 @@ def sizes_of(scenario: Scenario) -> dict[str, int]:
     }
 
 
-def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member]) -> dict[str, NDArray[Any]]:
-    """Return the variables of B twins, as they are stored."""
-    model, scenario = knowledge.model, knowledge.scenario
-    coordinates = model.states.coordinates
-    # A product for each twin: what is stored of it does not depend on its neighbours.
+def stored_variables(
+    knowledge: Knowledge, flights: Flights, members: Sequence[Member]
+) -> dict[str, NDArray[Any]]:
+    """Return the variables of B twins as they are stored, with B rows each.
+
+    Parameters
+    ----------
+    knowledge : Knowledge
+        What the twins know.
+    flights : Flights
+        Their flights.
+    members : sequence of Member
+        The B assets with their seeds and true parameters.
+    """
+    has_failed = np.array([bool(sentence) for sentence in flights.failure])
+    has_ended = np.array([bool(sentence) for sentence in flights.ended])
+    # Products of matrices twin by twin, so that a row does not depend on its neighbours.
+    coordinates = knowledge.model.states.coordinates
     mean = np.matmul(flights.filtered, coordinates)
     variance = np.matmul(flights.filtered, coordinates**2) - mean**2
-    steps = flights.control_index.shape[1]
-    rows = (-1, model.states.size), (-1, len(scenario.state))
-    inside = in_credible_set(model, flights.filtered.reshape(rows[0]), flights.state.reshape(rows[1]))
-    failed = np.array([bool(text) for text in flights.failure])
-    delay, early = _fallbacks(knowledge, flights)
-    unknown = np.isnan(flights.state[:, 0]).any(axis=1)  # of a real asset
-    steps_flown = (flights.control_index >= 0).sum(axis=1)  # a recording or a simulation may end early
-    short = np.array([bool(text) for text in flights.ended])
-    told = [
-        [[step for step, notice in own if notice.kind == kind] for kind in NOTICE_KINDS]
-        for own in flights.notices
-    ]
-    found: dict[str, Any] = {
-        "status": np.where(failed, FAILED, np.where(short, ENDED, FLOWN)),
+    fallbacks = fallbacks_of(knowledge, flights)
+    notices = _notices(flights)
+    values: dict[str, Any] = {
+        "status": np.where(has_failed, FAILED, np.where(has_ended, ENDED, FLOWN)),
         "seed": np.array([member.seed for member in members]),
         "observed": flights.observation_rows,
         "control_index": flights.control_index,
@@ -82,85 +128,179 @@ def outcomes_of(knowledge: Knowledge, flights: Flights, members: Sequence[Member
         "standard_deviation": np.sqrt(np.maximum(variance, 0.0)),
         "log_evidence": flights.log_evidence,
         "unexplained": flights.unexplained,
-        "belief": flights.filtered[np.arange(len(failed)), np.where(failed, steps, steps_flown) - 1],
-        "delay": np.where(failed, np.nan, delay),
-        "early": np.where(failed, -1, early),
-        "notices": [[len(numbers) for numbers in own] for own in told],
-        "first_notice": [[min(numbers, default=-1) for numbers in own] for own in told],
-        "credible": np.where(
-            failed | unknown, np.nan, inside.reshape(-1, steps).sum(axis=1) / np.maximum(steps_flown, 1)
-        ),
+        "belief": _last_belief(flights, has_failed),
+        "delay": np.where(has_failed, np.nan, fallbacks.delay),
+        "early": np.where(has_failed, _NOT_DEFINED, fallbacks.early),
+        "notices": notices.number,
+        "first_notice": notices.first_step,
+        "credible": np.where(has_failed, np.nan, _credible_fraction(knowledge, flights)),
     }
-    found = {name: np.ascontiguousarray(values, SCHEMA["fleet"][name][3]) for name, values in found.items()}
+    variables = {}
+    for name, variable in _schema().items():
+        variables[name] = np.ascontiguousarray(values[name], variable.dtype)
     for name in members[0].parameters:
-        found[name] = np.array([member.parameters[name] for member in members])
-    return found
+        variables[name] = np.array([member.parameters[name] for member in members])
+    return variables
 
 
-def _fallbacks(knowledge: Knowledge, flights: Flights) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return the delay of the fallback, and whether it came early (-1: none is defined), of each twin."""
-    scenario, plan = knowledge.scenario, knowledge.plan
-    first = scenario.control_names.index(scenario.mission.first_control)
-    delay = np.full(len(flights.state), np.nan)
-    early = np.full(len(delay), -1)
-    for twin, (control, state) in enumerate(zip(flights.control_index, flights.state, strict=True)):
-        if np.isnan(state[0]).any():
+def _steps_flown(flights: Flights) -> Index:
+    """Return how many steps each twin has flown, a (B,) array; a recording may end early."""
+    return np.asarray((flights.control_index != _NO_CONTROL).sum(axis=1))
+
+
+def _last_belief(flights: Flights, has_failed: NDArray[np.bool_]) -> Float:
+    """Return the belief after the last flown step of each twin, a (B, S) array.
+
+    Of a failed twin that of the last step of the mission is taken, which is NaN.
+    """
+    step_count = flights.control_index.shape[1]
+    last_step = np.where(has_failed, step_count, _steps_flown(flights)) - 1
+    return np.asarray(flights.filtered[np.arange(len(has_failed)), last_step])
+
+
+def _credible_fraction(knowledge: Knowledge, flights: Flights) -> Float:
+    """Return in which fraction of its steps each twin's credible set holds the true state, (B,).
+
+    It is NaN for real assets, whose true state nobody knows.
+    """
+    twin_count, step_count, factor_count = flights.state.shape
+    is_inside = in_credible_set(
+        knowledge.model,
+        flights.filtered.reshape(twin_count * step_count, -1),
+        flights.state.reshape(-1, factor_count),
+    )
+    steps_inside = is_inside.reshape(-1, step_count).sum(axis=1)
+    fraction = steps_inside / np.maximum(_steps_flown(flights), 1)
+    is_truth_unknown = np.isnan(flights.state[:, 0]).any(axis=1)
+    return np.where(is_truth_unknown, np.nan, fraction)
+
+
+class _Notices(NamedTuple):
+    """The notices of B twins: lists with a row for each twin and a column for each kind.
+
+    Attributes
+    ----------
+    number : list of list of int
+        How many there are.
+    first_step : list of list of int
+        The step of the first one.
+    """
+
+    number: list[list[int]]
+    first_step: list[list[int]]
+
+
+def _notices(flights: Flights) -> _Notices:
+    """Return how many notices of each kind twins gave, and in which step the first one."""
+    numbers = []
+    first_steps = []
+    for notices_of_twin in flights.notices:
+        steps_of_kind: dict[str, list[int]] = {kind: [] for kind in NOTICE_KINDS}
+        for step, notice in notices_of_twin:
+            if notice.kind in steps_of_kind:
+                steps_of_kind[notice.kind].append(step)
+        numbers.append([len(steps) for steps in steps_of_kind.values()])
+        first_steps.append([min(steps, default=_NO_STEP) for steps in steps_of_kind.values()])
+    return _Notices(numbers, first_steps)
+
+
+class Fallbacks(NamedTuple):
+    """How the controls of B twins fell back to a gentler one.
+
+    Attributes
+    ----------
+    delay : (B,) array
+        The steps from the damage that calls for the fallback to the fallback: infinite if it never
+        came, NaN if none was called for or the mission ended before it could be seen.
+    early : (B,) array
+        Whether a fallback came before the damage that calls for it (1 or 0); -1 if the policy does
+        not depend on the level of one factor alone.
+    """
+
+    delay: Float
+    early: Index
+
+
+def fallbacks_of(knowledge: Knowledge, flights: Flights) -> Fallbacks:
+    """Return how the controls of twins fell back to a gentler one."""
+    scenario = knowledge.scenario
+    first_control = scenario.control_names.index(scenario.mission.first_control)
+    twin_count = len(flights.state)
+    delay = np.full(twin_count, np.nan)
+    early = np.full(twin_count, _NOT_DEFINED)
+    for twin, steps_flown in enumerate(_steps_flown(flights).tolist()):
+        true_state = flights.state[twin]
+        if np.isnan(true_state[0]).any():  # nobody knows the true state of a real asset
             continue
-        steps_flown = int(np.sum(control >= 0))
-        course = control[:steps_flown], state[:steps_flown]
-        fallback = find_fallback(knowledge.model.states, plan.control_index, first, *course)
+        fallback = find_fallback(
+            knowledge.model.states,
+            knowledge.plan.control_index,
+            first_control,
+            flights.control_index[twin, :steps_flown],
+            true_state[:steps_flown],
+        )
         if fallback.switch_state is not None:
             early[twin] = fallback.early_step is not None
-        if fallback.called_for_step is not None:
-            # Where the mission ends so soon behind it, nobody knows whether the fallback would come.
-            late = steps_flown - fallback.called_for_step <= WITHIN
-            never = np.nan if late else np.inf
-            delay[twin] = never if fallback.delay is None else fallback.delay
-    return delay, early
+        if fallback.called_for_step is None:
+            continue
+        if fallback.delay is not None:
+            delay[twin] = fallback.delay
+        elif steps_flown - fallback.called_for_step > WITHIN:
+            delay[twin] = np.inf
+    return Fallbacks(delay, early)
 
 
 def in_credible_set(
     model: GraphicalModel, probability: Float, true_state: Float, credibility: float = CREDIBILITY
 ) -> NDArray[np.bool_]:
-    """Return whether the smallest set of states with a probability holds the true state: (T,).
+    """Return whether the smallest set of states with a probability holds the true state.
 
-    Between the levels the true state counts as the nearest level of each factor, half-way between two as
-    either. Of equally probable states all are in the set, or none.
+    Between the levels of a factor the true state counts as the nearest level, and half-way between
+    two levels as either. Of equally probable states, all are in the set or none.
 
     Parameters
     ----------
     model : GraphicalModel
-        S states of F factors.
-    probability : (T, S)
-        Beliefs.
-    true_state : (T, F)
-        True state, SI.
+        The model of S joint states of F factors.
+    probability : (T, S) array
+        The beliefs.
+    true_state : (T, F) array
+        The true state, in SI units.
     credibility : float
-        Probability of the set.
+        The probability of the set.
+
+    Returns
+    -------
+    (T,) array
+        Whether the set holds the true state.
     """
-    nearest = np.ones((len(true_state), model.states.size), dtype=bool)
+    is_nearest = np.ones((len(true_state), model.states.size), dtype=bool)
     for axis, factor in enumerate(model.states.factors):
-        distance = np.abs(np.asarray(factor.levels) - true_state[:, axis, None])  # (T, levels)
-        level_distance = np.abs(model.states.coordinates[:, axis] - true_state[:, axis, None])
-        nearest &= level_distance <= distance.min(axis=1, keepdims=True) + factor.slack
+        true_value = true_state[:, axis, None]
+        least_distance = np.abs(np.asarray(factor.levels) - true_value).min(axis=1, keepdims=True)
+        distance = np.abs(model.states.coordinates[:, axis] - true_value)  # (T, S)
+        is_nearest &= distance <= least_distance + factor.slack
+    # The least probable state of the set: the first at which the sum reaches the credibility.
     descending = -np.sort(-probability, axis=1)
-    reached = np.cumsum(descending, axis=1) >= credibility - _TOLERANCE
-    least = descending[np.arange(len(descending)), np.argmax(reached, axis=1)]
-    return np.asarray(np.any(nearest & (probability >= least[:, None] * (1.0 - _TOLERANCE)), axis=1))
+    is_reached = np.cumsum(descending, axis=1) >= credibility - _TOLERANCE
+    least_probability = descending[np.arange(len(descending)), np.argmax(is_reached, axis=1)]
+    is_in_set = probability >= least_probability[:, None] * (1.0 - _TOLERANCE)
+    return np.asarray(np.any(is_nearest & is_in_set, axis=1))
 
 
 STORE_NAME = "fleet.zarr"
+"""The folder of the store in the folder of a fleet."""
 FORMER_DIMENSION = "turn"
-"""What the dimension `step` was called in the stores of earlier versions."""
+"""The name of the dimension `step` in the stores of earlier versions."""
 
 
 def check_installed(*packages: str) -> None:
-    """Refuse to begin without what the extra `fleet` brings.
+    """Check that packages of the extra `fleet` are installed.
 
     Raises
     ------
     FleetError
-        One of the packages is not installed.
+        If one of the packages is not installed.
     """
     missing = [name for name in packages if util.find_spec(name) is None]
     if missing:
@@ -168,29 +308,43 @@ def check_installed(*packages: str) -> None:
 
 
 def open_group(folder: Path, group: str) -> "xr.Dataset":
-    """Return a group of the store, whose arrays are read as they are asked for.
+    """Return a group of the store, whose arrays are read when they are used.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the fleet.
+    group : str
+        The name of the group.
 
     Raises
     ------
     FleetError
-        There is none, or zarr is not installed.
+        If there is no such group, if it has another layout, or if zarr is not installed.
     """
     check_installed("zarr")
     import xarray as xr
 
     before = f"{folder} holds no group {group} of a fleet ("
     with FleetError.instead_of(OSError, KeyError, ValueError, before=before, after=")."):
-        found: xr.Dataset = xr.open_zarr(folder / STORE_NAME, group=group, chunks=None, consolidated=False)
-    if FORMER_DIMENSION in found.dims:
+        dataset: xr.Dataset = xr.open_zarr(
+            folder / STORE_NAME, group=group, chunks=None, consolidated=False
+        )
+    if FORMER_DIMENSION in dataset.dims:
         warn_of_former_names(f"{folder / STORE_NAME}", {FORMER_DIMENSION: "step"})
-        found = found.rename({FORMER_DIMENSION: "step"})
-    if missing := SCHEMA["fleet"].keys() - found.keys():
-        raise FleetError(said("fleet.other_layout", folder=folder, missing=", ".join(sorted(missing))))
-    return found
+        dataset = dataset.rename({FORMER_DIMENSION: "step"})
+    missing = SCHEMA["fleet"].keys() - dataset.keys()
+    if missing:
+        raise FleetError(
+            f"{folder} was flown by another version of this program and lacks "
+            f"{', '.join(sorted(missing))}: fly the fleet again with --replace, "
+            "or read it with that version."
+        )
+    return dataset
 
 
 def create_store(folder: Path, fleet: Fleet) -> None:
-    """Make the arrays of a fleet, in which nothing has flown."""
+    """Create the arrays of a fleet of which nothing has flown."""
     import zarr
 
     with explained_write_errors(folder / STORE_NAME):
@@ -199,23 +353,27 @@ def create_store(folder: Path, fleet: Fleet) -> None:
             _create_group(root.require_group(group.name), group, fleet)
 
 
-def _create_group(made: "zarr.Group", group: Group, fleet: Fleet) -> None:
-    scenario, count = group.scenarios[0], len(group.members)
-    sizes = sizes_of(scenario)
-    true = {name: ["", "SI", "true parameter", "f8"] for name in group.spreads}
-    for name, (axes, unit, title, kind) in (SCHEMA["fleet"] | true).items():
-        shape = (count, *(sizes[axis] for axis in axes.split()))
-        made.create_array(
+def _create_group(zarr_group: "zarr.Group", group: Group, fleet: Fleet) -> None:
+    """Create the arrays of a group, in chunks of one shard."""
+    scenario = group.scenarios[0]
+    twin_count = len(group.members)
+    sizes = dimension_sizes(scenario)
+    variables = _schema()
+    for name in group.parameter_spreads:
+        variables[name] = _Variable((), "SI", "true parameter", "f8")
+    for name, variable in variables.items():
+        row_shape = tuple(sizes[axis] for axis in variable.axes)
+        zarr_group.create_array(
             name,
-            shape=shape,
-            chunks=(min(fleet.head.shard, count), *shape[1:]),
-            dtype=kind,
-            fill_value=np.nan if kind[0] == "f" else -int(name in ("control_index", "first_notice")),
-            dimension_names=("twin", *axes.split()),
-            attributes={"title": title, "units": unit},
+            shape=(twin_count, *row_shape),
+            chunks=(min(fleet.head.shard, twin_count), *row_shape),
+            dtype=variable.dtype,
+            fill_value=_FILL_VALUES.get(name, variable.fill_value),
+            dimension_names=("twin", *variable.axes),
+            attributes={"title": variable.title, "units": variable.unit},
             overwrite=True,
         )
-    made.attrs.update(
+    zarr_group.attrs.update(
         {
             "scenario": scenario.mission.name,
             "fleet": fleet.head.name,

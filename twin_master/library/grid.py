@@ -1,19 +1,16 @@
-"""What a user asks to be sampled, the grid that comes of it, and one worker's way through a block of it."""
+"""The grid at whose points an FMU is sampled: from values that a user gives, or from a scenario."""
 
 import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import prod
 from pathlib import Path
 
 import numpy as np
 
 from fmu_asset.client.binding import Binding, load_binding
-from fmu_asset.client.session import FmiAsset
-from fmu_asset.errors import FmuCallError, FmuEndedError, FmuError, FmuInputError, FmuOutputError
-from reporting.arrays import Float
 from reporting.progress import reporter
+from reporting.words import comma_list
 from twin_master.assets.asset_source import BINDING_COPY, AssetBelief, PairedSource
 from twin_master.assets.coupled_source import SeveralSource
 from twin_master.assets.design_source import DesignBelief
@@ -21,47 +18,47 @@ from twin_master.assets.fmu_source import FMU_COPY, FmuSource
 from twin_master.assets.library_source import LibraryBelief
 from twin_master.assets.parameter import read_calibration
 from twin_master.assets.resolution import Overrides, resolve_scenario
-from twin_master.errors import MissionInputError, said
+from twin_master.errors import MissionInputError
 from twin_master.scenario.reading import LoadedScenario
 from twin_master.scenario.section import LARGEST_COUNT
 
 STEP_TIMEOUT = 60.0
-"""Wall-clock limit of a step where nothing else is said [s]."""
-MEMORY_TOLERANCE = 1e-8
-"""Two visits of a point that differ by more than this share of the value show that the FMU remembers."""
-SETTLED_TOLERANCE = 1e-3
-"""What may still change, as a share of the value, when a point is given as many steps again to settle."""
+"""Limit of the wall-clock time of a step [s], if neither scenario nor binding has one."""
 
 _LONGEST_BLOCK = 4096
-_BLOCKS = 64
+"""Largest number of points in a block."""
+_LEAST_BLOCKS = 64
+"""Number of blocks of a grid that is not large, so that several workers share them."""
 
 
 @dataclass(frozen=True)
 class SamplingGrid:
-    """What is sampled; plain values.
+    """The points at which an FMU is sampled: every draw, state and control.
 
     Attributes
     ----------
     fmu, binding : str
         The files.
     role : str
-        Observation of the binding.
+        The observation of the binding.
     parameter : str
         The uncertain parameter; empty without one.
     draws : tuple of float
-        Its values; one, of no meaning, without a parameter.
+        The values of the parameter; without a parameter one value that is not used.
     states : dict of str to tuple of float
-        Levels of each state factor, the outermost first.
+        The levels of each state factor; the last factor varies fastest.
     controls : dict of str to dict of str to float
-        Value of each control input under each control.
-    load, parameters : dict of str to float
-        What else is set; parameters but the uncertain one.
+        The value of each control input under each control.
+    load : dict of str to float
+        The load inputs, the same at every point.
+    parameters : dict of str to float
+        The other parameters that are the same at every point.
     others : dict of str to tuple of float
-        Parameters that are others at each draw.
+        The parameters that have a value of their own at each draw.
     settling_steps : int
-        Steps from a fresh start at every point; 0 for an FMU without memory.
+        The number of steps from a fresh start at every point; 0 for an FMU without memory.
     step_timeout : float
-        Wall-clock limit of a step [s].
+        The limit of the wall-clock time of a step [s].
     """
 
     fmu: str
@@ -79,190 +76,104 @@ class SamplingGrid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Number of draws, levels of each factor, and controls."""
-        return (len(self.draws), *(len(levels) for levels in self.states.values()), len(self.controls))
+        """The number of draws, of levels of each state factor, and of controls."""
+        level_counts = [len(levels) for levels in self.states.values()]
+        return (len(self.draws), *level_counts, len(self.controls))
 
     @property
     def size(self) -> int:
-        """Number of points."""
-        return prod(self.shape)
+        """The number of points."""
+        return math.prod(self.shape)
 
     @property
     def blocks(self) -> tuple[tuple[int, int], ...]:
-        """First and last point (excluded) of each block; they depend on nothing but the grid."""
-        length = min(_LONGEST_BLOCK, max(1, -(-self.size // _BLOCKS)))
-        return tuple((first, min(first + length, self.size)) for first in range(0, self.size, length))
+        """The first point of each block, and the point after its last; they follow from the grid.
+
+        An interrupted sampling therefore finds the same blocks again.
+        """
+        length = min(_LONGEST_BLOCK, max(1, math.ceil(self.size / _LEAST_BLOCKS)))
+        firsts = range(0, self.size, length)
+        return tuple((first, min(first + length, self.size)) for first in firsts)
 
     def point(self, index: int) -> tuple[int, dict[str, float], str]:
-        """Return draw, state and name of the control of a point."""
-        draw, *levels, control = (int(part) for part in np.unravel_index(index, self.shape))
-        state = {
-            name: float(values[level])
-            for (name, values), level in zip(self.states.items(), levels, strict=True)
-        }
-        return draw, state, list(self.controls)[control]
-
-
-class GridSampler:
-    """An FMU that is asked for the observations of blocks of a grid.
-
-    Every block begins with a reset, so that what it gives does not depend on the blocks before it.
-
-    Parameters
-    ----------
-    grid : SamplingGrid
-        What is sampled.
-
-    Raises
-    ------
-    FmuError
-        The FMU cannot be opened, or binding or grid do not fit it.
-    """
-
-    def __init__(self, grid: SamplingGrid) -> None:
-        self._grid = grid
-        self._asset = FmiAsset(grid.fmu, grid.binding, step_timeout=grid.step_timeout)
-        self._chosen = self._asset.binding.observation_slice(grid.role)
-
-    def close(self) -> None:
-        """End the FMU."""
-        self._asset.close()
-
-    def block(self, first: int, last: int) -> Float:
-        """Return the observations (last - first, G).
-
-        Raises
-        ------
-        MissionInputError
-            The FMU has a memory, or does not settle.
-        FmuError
-            The FMU failed; the sentence names the point.
-        """
-        length = 1 if self._grid.settling_steps else self._grid.size // len(self._grid.draws)
-        parts, end = [], first
-        while end < last:
-            begin, end = end, min(end - end % length + length, last)
-            self._start(begin)
-            parts.append(self._ask(begin, end))
-        values = np.concatenate(parts)
-        again = last - 1 if self._grid.settling_steps else begin  # with other points in between
-        self._check_again(again, values[again - first])
-        return values
-
-    def _start(self, index: int) -> None:
-        grid = self._grid
-        draw, state, control = grid.point(index)
-        setting = dict(grid.parameters) | {name: values[draw] for name, values in grid.others.items()}
-        if grid.parameter:
-            setting[grid.parameter] = grid.draws[draw]
-        try:
-            if grid.settling_steps:
-                self._asset.reset(setting, control=grid.controls[control], health=state, load=grid.load)
-            else:
-                self._asset.reset(setting)
-        except FmuError as error:
-            raise self._located(error, index) from error
-
-    def _ask(self, first: int, last: int) -> Float:
-        """Return the observations of points of one draw, of which each may have its steps to settle."""
-        grid, before = self._grid, self._asset.step_index
-        steps = max(grid.settling_steps, 1)
-        points = [point for point in map(grid.point, range(first, last)) for _ in range(steps)]
-        controls = [grid.controls[control] for _, _, control in points]
-        try:
-            seen = self._asset.simulate(
-                {name: [control[name] for control in controls] for name in controls[0]},
-                {name: [state[name] for _, state, _ in points] for name in grid.states},
-                grid.load,
-                steps=len(points),
-            )
-            if seen.ended:
-                raise FmuEndedError(seen.ended)
-        except FmuInputError:
-            raise  # before the first step; it names the value
-        except FmuError as error:
-            made = self._asset.step_index - before - isinstance(error, FmuOutputError)
-            raise self._located(error, first + min(made // steps, last - first - 1)) from error
-        return seen.values[steps - 1 :: steps, self._chosen]
-
-    def _located(self, error: FmuError, index: int) -> FmuError:
-        # What ends a worker is located by its last report only.
-        later = not isinstance(error, FmuCallError | FmuInputError | FmuOutputError)
-        where = "at or soon after" if later else "at"
-        return type(error)(f"{where} {self._name(index)}: {error.sentence}", error.messages)
-
-    def _name(self, index: int) -> str:
-        grid = self._grid
-        draw, state, control = grid.point(index)
-        parts = [f"{name} = {value:g}" for name, value in state.items()] + [f"control {control}"]
-        if grid.parameter:
-            parts.append(f"{grid.parameter} = {grid.draws[draw]:g}")
-        return ", ".join(parts)
-
-    def _check_again(self, index: int, before: Float) -> None:
-        """Ask for a point once more: an FMU without memory shows the same, one that has settled nearly so."""
-        steps = self._grid.settling_steps
-        again = self._ask(index, index + 1)[0]
-        change = np.abs(again - before)
-        tolerance = SETTLED_TOLERANCE if steps else MEMORY_TOLERANCE
-        if not np.any(change > tolerance * np.maximum(np.abs(before), np.abs(again))):
-            return
-        worst = int(np.argmax(change))
-        sensor = self._asset.binding.observation[self._grid.role].variables[worst]
-        shown = f"{sensor} = {before[worst]:.9g}"
-        of = {"grid": self._grid, "place": self._name(index), "shown": shown, "later": again[worst]}
-        why = said("library.unsettled" if steps else "library.remembers", **of)
-        raise MissionInputError(why)
+        """Return the index of the draw, the state, and the name of the control of a point."""
+        draw, *levels, control = np.unravel_index(index, self.shape)
+        state = {}
+        for (name, values), level in zip(self.states.items(), levels, strict=True):
+            state[name] = float(values[level])
+        return int(draw), state, list(self.controls)[control]
 
 
 _ROLES = ("health", "control", "load", "parameter")
+"""The roles of the inputs of a binding."""
 
 
 def parse_grid(texts: Sequence[str], binding: Binding) -> dict[str, dict[str, tuple[float, ...]]]:
-    """Return the values of `NAME=VALUES` texts by role and name.
+    """Return the values of texts such as `NAME=VALUES`.
 
-    NAME is a name of the binding, or ROLE.NAME where two roles share it; VALUES are numbers with commas, or
-    FIRST:LAST:COUNT.
+    NAME is a name of the binding, or ROLE.NAME if several roles have it. VALUES are numbers with
+    commas, or FIRST:LAST:COUNT.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        The texts.
+    binding : Binding
+        The binding that knows the names.
+
+    Returns
+    -------
+    dict of str to dict of str to tuple of float
+        The values by role and name; every role is there.
 
     Raises
     ------
     MissionInputError
-        A text is no such thing, or the binding has no such name.
+        If a text has another form, or the binding has no such name.
     """
-    found: dict[str, dict[str, tuple[float, ...]]] = {role: {} for role in _ROLES}
-    tables = {role: getattr(binding, role) for role in _ROLES}
+    values_by_role: dict[str, dict[str, tuple[float, ...]]] = {role: {} for role in _ROLES}
     for text in texts:
-        name, equals, values = text.partition("=")
-        role, dot, inner = name.partition(".")
-        if dot and role in tables and inner in tables[role]:
-            places = [(role, inner)]
-        else:
-            places = [(role, name) for role in _ROLES if name in tables[role]]
-        if not equals or not places:
-            known = [f"{role}.{key}" for role in _ROLES for key in tables[role]]
-            why = said("library.grid", binding=binding, known=known, text=text)
-            raise MissionInputError(why)
-        if len(places) > 1:
-            full = " or ".join(f"{role}.{key}" for role, key in places)
-            raise MissionInputError(f"{name} is a name of several roles: write {full}.")
-        role, key = places[0]
-        found[role][key] = _values(text, values)
-    return found
+        name, equals_sign, values_text = text.partition("=")
+        matches = _matching_inputs(name, binding)
+        if not equals_sign or not matches:
+            known_names = [f"{role}.{key}" for role in _ROLES for key in getattr(binding, role)]
+            raise MissionInputError(
+                f"--grid must be NAME=VALUES with a name of the binding {binding.name} "
+                f"({comma_list(known_names)}), and {text} came."
+            )
+        if len(matches) > 1:
+            full_names = " or ".join(f"{role}.{key}" for role, key in matches)
+            raise MissionInputError(f"{name} is a name of several roles: write {full_names}.")
+        role, key = matches[0]
+        values_by_role[role][key] = _parse_values(values_text, text)
+    return values_by_role
 
 
-def _values(text: str, values: str) -> tuple[float, ...]:
+def _matching_inputs(name: str, binding: Binding) -> list[tuple[str, str]]:
+    """Return role and name of the inputs of a binding that NAME or ROLE.NAME may mean."""
+    role, _, inner_name = name.partition(".")
+    if role in _ROLES and inner_name in getattr(binding, role):
+        return [(role, inner_name)]
+    return [(role, name) for role in _ROLES if name in getattr(binding, role)]
+
+
+def _parse_values(values_text: str, text: str) -> tuple[float, ...]:
+    """Return numbers with commas, or FIRST:LAST:COUNT; the whole text is for the message."""
     try:
-        if ":" in values:
-            first, last, count = values.split(":")
+        if ":" in values_text:
+            first, last, count = values_text.split(":")
             if not 1 <= int(count) <= LARGEST_COUNT:
                 raise ValueError
             numbers = np.linspace(float(first), float(last), int(count)).tolist()
         else:
-            numbers = [float(part) for part in values.split(",")]
+            numbers = [float(part) for part in values_text.split(",")]
         if not all(math.isfinite(number) for number in numbers):
             raise ValueError
     except ValueError:
-        raise MissionInputError(said("library.numbers", most=LARGEST_COUNT, text=text)) from None
+        raise MissionInputError(
+            "--grid must give numbers, as 0,0.2,0.4 or as FIRST:LAST:COUNT with a count of 1 to "
+            f"{LARGEST_COUNT}, and {text} came."
+        ) from None
     return tuple(numbers)
 
 
@@ -274,53 +185,86 @@ def grid_of_fmu(
     role: str | None = None,
     settling_steps: int = 0,
 ) -> SamplingGrid:
-    """Return the grid over the values of the inputs; controls are all their combinations.
+    """Return the grid over given values of an FMU's inputs.
+
+    The controls are all combinations of the values of the control inputs.
+
+    Parameters
+    ----------
+    fmu, binding_file : Path
+        The files.
+    texts : sequence of str
+        The values, as `parse_grid` reads them.
+    role : str, optional
+        The observation of the binding; it may be absent if the binding has one only.
+    settling_steps : int
+        The number of steps from a fresh start at every point; 0 for an FMU without memory.
 
     Raises
     ------
     MissionInputError
-        A text is wrong, something has several values that can have one, or the role is not told.
+        If a text is wrong, a name that can have one value has several, or the binding has several
+        observations and no role is given.
     """
     binding = load_binding(binding_file)
-    given = parse_grid(texts, binding)
+    values_by_role = parse_grid(texts, binding)
     if role is None:
         if len(binding.observation) != 1:
-            raise MissionInputError(said("library.role", binding=binding))
+            raise MissionInputError(
+                f"the binding {binding.name} observes {comma_list(binding.observation)}: say "
+                "which one by --role."
+            )
         role = next(iter(binding.observation))
-    swept = [name for name, values in given["parameter"].items() if len(values) > 1]
-    if len(swept) > 1:
-        raise MissionInputError(said("library.one_parameter", names=", ".join(swept)))
-    parameter = swept[0] if swept else ""
-    inputs = given["control"]
-    controls = {}
-    combinations = math.prod(len(values) for values in inputs.values())
-    if combinations > LARGEST_COUNT:
-        numbers = {"combinations": combinations, "most": LARGEST_COUNT}
-        raise MissionInputError(said("library.controls", inputs=inputs, **numbers))
-    for values in itertools.product(*inputs.values()):
-        setting = dict(zip(inputs, values, strict=True))
-        controls[", ".join(f"{name} = {value:g}" for name, value in setting.items())] = setting
+    parameters = values_by_role["parameter"]
+    swept_parameters = [name for name, values in parameters.items() if len(values) > 1]
+    if len(swept_parameters) > 1:
+        raise MissionInputError(
+            f"a library has one uncertain parameter, and {', '.join(swept_parameters)} came with "
+            "several values."
+        )
+    parameter = swept_parameters[0] if swept_parameters else ""
+    draws = parameters.pop(parameter, (0.0,))
     return SamplingGrid(
         fmu=str(fmu),
         binding=str(binding_file),
         role=role,
         parameter=parameter,
-        draws=given["parameter"].get(parameter, (0.0,)),
-        states=given["health"],
-        controls=controls if inputs else {},
-        load=_single("load", given["load"]),
-        parameters={k: v[0] for k, v in given["parameter"].items() if k != parameter},
+        draws=draws,
+        states=values_by_role["health"],
+        controls=_combined_controls(values_by_role["control"]),
+        load=_single_loads(values_by_role["load"]),
+        parameters={name: values[0] for name, values in parameters.items()},
         settling_steps=settling_steps,
         step_timeout=binding.limits.step_time or STEP_TIMEOUT,
     )
 
 
-def _single(role: str, given: dict[str, tuple[float, ...]]) -> dict[str, float]:
-    for name, values in given.items():
+def _combined_controls(
+    inputs: Mapping[str, tuple[float, ...]],
+) -> dict[str, dict[str, float]]:
+    """Return all combinations of the values of control inputs, by a name that lists them."""
+    if not inputs:
+        return {}
+    combinations = math.prod(len(values) for values in inputs.values())
+    if combinations > LARGEST_COUNT:
+        raise MissionInputError(
+            f"the values of {comma_list(inputs)} make {combinations} controls, and a library "
+            f"holds at most {LARGEST_COUNT}: give fewer values."
+        )
+    controls = {}
+    for values in itertools.product(*inputs.values()):
+        control = dict(zip(inputs, values, strict=True))
+        name = ", ".join(f"{key} = {value:g}" for key, value in control.items())
+        controls[name] = control
+    return controls
+
+
+def _single_loads(loads: Mapping[str, tuple[float, ...]]) -> dict[str, float]:
+    """Return the value of each load input, which can have only one."""
+    for name, values in loads.items():
         if len(values) > 1:
-            what = f"{role} {name}"
-            raise MissionInputError(said("library.single", what=what, number=len(values)))
-    return {name: values[0] for name, values in given.items()}
+            raise MissionInputError(f"the load {name} can have one value, and {len(values)} came.")
+    return {name: values[0] for name, values in loads.items()}
 
 
 def grid_of_scenario(
@@ -331,52 +275,91 @@ def grid_of_scenario(
     overrides: Overrides | None = None,
     settling_steps: int = 0,
 ) -> SamplingGrid:
-    """Return the grid that a scenario asks for, with its FMU and binding copied into a folder.
+    """Return the grid that a scenario needs.
 
-    Levels of the states and values of the uncertain parameter may be given otherwise by `texts`; the draws
-    are those of the scenario's calibration and seed.
+    The draws are those of the scenario's calibration and seed.
+
+    Parameters
+    ----------
+    loaded : LoadedScenario
+        The scenario.
+    folder : Path
+        The folder into which the FMU and its binding are copied.
+    texts : sequence of str
+        Other levels of the states and values of the uncertain parameter, as `parse_grid` reads
+        them.
+    overrides : Overrides, optional
+        What the command line states otherwise than the scenario.
+    settling_steps : int
+        The number of steps from a fresh start at every point; 0 for an FMU without memory.
 
     Raises
     ------
     MissionInputError
-        The scenario flies no FMU, or a text gives something else.
+        If the scenario flies no single FMU, or a text gives a value of something else.
     TwinMasterError, FmuError, FiniteElementError, CalibrationError
-        The asset of the scenario cannot be prepared.
+        If the asset of the scenario cannot be prepared.
     """
-    belief = loaded.scenario.belief
-    if isinstance(belief, LibraryBelief):  # which is to be sampled
-        plain = AssetBelief() if belief.design is None else DesignBelief(design=belief.design)
-        loaded = replace(loaded, scenario=loaded.scenario.model_copy(update={"belief": plain}))
-    scenario = resolve_scenario(loaded, overrides)
+    scenario = resolve_scenario(_without_library(loaded), overrides)
     flown = scenario.asset.source(scenario)
     if not isinstance(flown, FmuSource) or isinstance(flown, SeveralSource):
-        raise MissionInputError(said("library.kind", scenario=scenario))
+        raise MissionInputError(
+            f"the scenario {scenario.mission.name} flies an asset of the kind "
+            f"`{scenario.asset.kind}`, and one FMU can be sampled."
+        )
     believed = scenario.belief.source(scenario, flown)
     source = flown if believed is flown else PairedSource(flown, believed)
     source.check()
     source.prepare(folder, reporter())
+
     binding = load_binding(folder / BINDING_COPY)
-    given = parse_grid(texts, binding)
+    values_by_role = parse_grid(texts, binding)
     draws = source.draws(scenario.mission.seed)
-    states = {factor.name: factor.levels for factor in scenario.state} | given.pop("health")
-    swept = given.pop("parameter")
-    if any(given.values()) or {*swept} - {draws.name}:
-        raise MissionInputError(said("library.scenario", name=draws.name))
-    fixed = {name: value for name, value in flown.parameters().items() if name != draws.name}
-    values = swept.get(draws.name, tuple(draws.values.tolist()))
-    found = read_calibration(scenario.calibration)
-    others = {} if found is None else found.given(draws.name, np.array(values))
+    parameters = values_by_role["parameter"]
+    gives_other_parameter = any(name != draws.name for name in parameters)
+    if gives_other_parameter or values_by_role["control"] or values_by_role["load"]:
+        raise MissionInputError(
+            f"with a scenario --grid gives states and the uncertain parameter {draws.name}; the "
+            "rest is said by the scenario."
+        )
+    levels = {factor.name: factor.levels for factor in scenario.state}
+    values = parameters.get(draws.name, tuple(draws.values.tolist()))
+    calibration = read_calibration(scenario.calibration)
+    dependent_parameters = {}
+    if calibration is not None:
+        expected = calibration.given(draws.name, np.array(values))
+        dependent_parameters = {
+            name: tuple(expected[name].tolist()) for name in expected if name in binding.parameter
+        }
+    fixed_parameters = flown.parameters()
+    fixed_parameters.pop(draws.name, None)
     return SamplingGrid(
         fmu=str(folder / FMU_COPY),
         binding=str(folder / BINDING_COPY),
         role=scenario.observation.role,
         parameter=draws.name,
         draws=values,
-        states=states,
+        states=levels | values_by_role["health"],
         controls={control.name: dict(control.values) for control in scenario.control},
         load=dict(scenario.asset.constant_load),
-        parameters=fixed,
-        others={name: tuple(at.tolist()) for name, at in others.items() if name in binding.parameter},
+        parameters=fixed_parameters,
+        others=dependent_parameters,
         settling_steps=settling_steps,
         step_timeout=flown.section.step_timeout or binding.limits.step_time or STEP_TIMEOUT,
     )
+
+
+def _without_library(loaded: LoadedScenario) -> LoadedScenario:
+    """Return a scenario that believes a library, which is yet to be sampled, without it.
+
+    The twin then believes the design that the library is of, or what is flown.
+    """
+    belief = loaded.scenario.belief
+    if not isinstance(belief, LibraryBelief):
+        return loaded
+    if belief.design is None:
+        model: AssetBelief | DesignBelief = AssetBelief()
+    else:
+        model = DesignBelief(design=belief.design)
+    scenario = loaded.scenario.model_copy(update={"belief": model})
+    return replace(loaded, scenario=scenario)

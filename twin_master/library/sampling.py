@@ -1,4 +1,7 @@
-"""Sampling an FMU over a grid into an observation library: in several processes, resumable after a kill."""
+"""Sampling an FMU over a grid into an observation library.
+
+Several processes share the grid, and an interrupted sampling can be continued.
+"""
 
 import io
 import itertools
@@ -32,12 +35,16 @@ from twin_master.assets.library_source import (
     ObservationLibrary,
     write_observation_library,
 )
-from twin_master.errors import MissionInputError, check_names, said
-from twin_master.library.grid import GridSampler, SamplingGrid
+from twin_master.errors import MissionInputError, check_names
+from twin_master.library.grid import SamplingGrid
+from twin_master.library.sampler import GridSampler
 from twin_master.network.transition import NUMBER, check_fits
 
-PLAN_NAME, ROWS_NAME = "grid.json", "observations.npy"
-_COPIES = 3  # of what was sampled: the blocks, all of them, and the library
+PLAN_NAME = "grid.json"
+"""File in the folder of blocks: what the library is a function of."""
+ROWS_NAME = "observations.npy"
+"""File in the folder of blocks: the observations, NaN for blocks that are not finished."""
+_COPIES_IN_MEMORY = 3  # the blocks, all observations, and the library
 
 
 @dataclass(frozen=True)
@@ -51,11 +58,11 @@ class SamplingOutcome:
     library : ObservationLibrary
         Its content.
     kept_blocks, block_count : int
-        Blocks that an interrupted sampling had finished, and all blocks.
+        The number of blocks that an interrupted sampling had finished, and of all blocks.
     workers : int
-        Processes.
+        The number of processes.
     seconds : float
-        Wall clock of the sampling itself.
+        The wall-clock time of the sampling itself [s].
     """
 
     path: Path
@@ -67,7 +74,7 @@ class SamplingOutcome:
 
 
 def blocks_folder(out: Path) -> Path:
-    """Return where the finished blocks of a library that is being sampled are kept."""
+    """Return the folder that holds the finished blocks while a library is sampled."""
     return out.with_name(f"{out.name}.blocks")
 
 
@@ -79,156 +86,217 @@ def sample_library(
     resume: bool = False,
     replace_existing: bool = False,
 ) -> SamplingOutcome:
-    """Ask an FMU for its observation at every point of a grid and write the library.
+    """Sample an FMU at every point of a grid and write the library.
 
     The bytes of the file do not depend on the number of processes nor on interruptions.
 
     Parameters
     ----------
     grid : SamplingGrid
-        What is sampled.
+        The grid.
     out : Path
-        The NetCDF file. Finished blocks are kept in the folder `blocks_folder(out)` until it is written.
+        The NetCDF file. Until it is written, finished blocks are in the folder
+        `blocks_folder(out)`.
     workers : int, optional
-        Number of FMUs, each in a process; by default one for each processor.
+        The number of FMUs, each in a process; by default one for each processor.
     resume : bool
-        Go on with the finished blocks of an interrupted sampling of the same grid.
+        Whether to continue an interrupted sampling of the same grid.
     replace_existing : bool
-        Take the place of an existing library, and forget the blocks of an interrupted sampling.
+        Whether to replace an existing library, and to remove the blocks of an interrupted sampling.
 
     Raises
     ------
     MissionInputError
-        The file exists, an interrupted sampling is there or is of another grid, the FMU has a memory or does
-        not settle.
+        If the file exists; an interrupted sampling exists and is not continued, or is of another
+        grid; or the FMU has a memory or does not settle.
     InvalidModelError
-        What is asked for does not fit in memory.
+        If the library does not fit in memory.
     FmuError
-        The FMU fails, or binding or grid do not fit it.
+        If the FMU fails, or the binding or the grid does not fit it.
     FileNotWrittenError
-        The disk is full or the folder cannot be written.
+        If the disk is full or the folder cannot be written.
     """
-    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    count = own if workers is None else workers
-    if count < 1:
-        raise MissionInputError(f"the number of workers must be at least 1, and {count} came.")
+    worker_count = _processor_count() if workers is None else workers
+    if worker_count < 1:
+        raise MissionInputError(
+            f"the number of workers must be at least 1, and {worker_count} came."
+        )
     binding = load_binding(grid.binding)
-    sensors = _check_grid(grid, binding)
-    record = _record(grid)
+    _check_grid(grid, binding)
+    sensor_count = _count_sensors(grid, binding)
+    record = _library_record(grid)
     folder = _prepare_folder(out, record, resume=resume, replace_existing=replace_existing)
     lock = lock_folder(folder)
     if lock is None:
-        raise MissionInputError(said("library.locked", folder=folder))
+        raise MissionInputError(f"another process is sampling into {folder}: wait for it to end.")
     with closing_lock(lock):
-        rows = _kept_rows(folder, (grid.size, sensors))
-        todo = [(first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()]
-        kept, begin = len(grid.blocks) - len(todo), time.perf_counter()
-        with stage("Sampling the FMU", total=len(grid.blocks), unit="blocks") as shown:
-            shown.advance(kept)
-            _sample(grid, rows, todo, count, shown)
-        seconds = time.perf_counter() - begin
+        rows = _rows_on_disk(folder, (grid.size, sensor_count))
+        pending_blocks = [
+            (first, last) for first, last in grid.blocks if np.isnan(rows[first:last]).any()
+        ]
+        block_count = len(grid.blocks)
+        kept_blocks = block_count - len(pending_blocks)
+        start_time = time.perf_counter()
+        with stage("Sampling the FMU", total=block_count, unit="blocks") as progress_stage:
+            progress_stage.advance(kept_blocks)
+            _sample_blocks(grid, rows, pending_blocks, worker_count, progress_stage)
+        seconds = time.perf_counter() - start_time
         library = ObservationLibrary(sampled_dataset(grid, binding, record, np.array(rows)))
         write_observation_library(out, library)
         shutil.rmtree(folder, ignore_errors=True)
-    return SamplingOutcome(out, library, kept, len(grid.blocks), count, seconds)
+    return SamplingOutcome(out, library, kept_blocks, block_count, worker_count, seconds)
 
 
-def _sample(grid: SamplingGrid, rows: Float, todo: list[tuple[int, int]], count: int, shown: Stage) -> None:
-    """Fill the rows of blocks, each thread by an FMU of its own; what is finished stays, whatever comes."""
-    samplers, blocks = list[GridSampler](), iter(todo)
+def _processor_count() -> int:
+    """Return the number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
-    def work() -> None:
+
+def _sample_blocks(
+    grid: SamplingGrid,
+    rows: Float,
+    blocks: list[tuple[int, int]],
+    worker_count: int,
+    progress_stage: Stage,
+) -> None:
+    """Fill the rows (N, G) of blocks; each thread has an FMU of its own.
+
+    If a thread fails, the others end, and the rows of finished blocks stay filled.
+    """
+    samplers: list[GridSampler] = []
+    next_blocks = iter(blocks)  # all threads take their blocks from it
+
+    def sample_next_blocks() -> None:
         with closing(GridSampler(grid)) as sampler:
             samplers.append(sampler)
-            for first, last in blocks:
-                rows[first:last] = sampler.block(first, last)
-                shown.advance(1)
+            for first, last in next_blocks:
+                rows[first:last] = sampler.observe_block(first, last)
+                progress_stage.advance(1)
 
-    with ThreadPoolExecutor(count) as pool:
+    with ThreadPoolExecutor(worker_count) as pool:
+        thread_count = min(worker_count, len(blocks))
+        futures = [pool.submit(sample_next_blocks) for _ in range(thread_count)]
         try:
-            for done in as_completed([pool.submit(work) for _ in range(min(count, len(todo)))]):
-                done.result()
+            for future in as_completed(futures):
+                future.result()
         finally:
-            todo.clear()
+            blocks.clear()  # which also ends the iterator
             for sampler in samplers:
                 sampler.close()
 
 
-def _check_grid(grid: SamplingGrid, binding: Binding) -> int:
-    """Check the grid against binding and FMU, before anything is started; return the number of sensors."""
-    parameters = [*grid.parameters, *([grid.parameter] if grid.parameter else [])]
-    rows = (
+def _check_grid(grid: SamplingGrid, binding: Binding) -> None:
+    """Refuse a grid with names that the binding does not have, or with unusable values."""
+    parameter_names = list(grid.parameters)
+    if grid.parameter:
+        parameter_names.append(grid.parameter)
+    control_inputs = next(iter(grid.controls.values()), {})
+    names_by_sort = (
         ("state", grid.states, binding.health),
-        ("control input", next(iter(grid.controls.values()), {}), binding.control),
+        ("control input", control_inputs, binding.control),
         ("load", grid.load, binding.load),
-        ("parameter", parameters, binding.parameter),
+        ("parameter", parameter_names, binding.parameter),
     )
-    check_names("the grid has the", f"the binding {binding.name}", rows)
-    binding.observation_slice(grid.role)
+    check_names("the grid has the", f"the binding {binding.name}", names_by_sort)
+    binding.observation_slice(grid.role)  # raises an error for an unknown role
     if not grid.states or not grid.controls or not grid.draws:
-        raise MissionInputError(said("library.bare"))
-    taken = sorted({*grid.states} & {*RESERVED})
-    if taken:
-        raise MissionInputError(said("library.reserved", name=taken[0]))
+        raise MissionInputError(
+            "a grid needs at least one state and one control with values: give --grid NAME=VALUES "
+            "for them."
+        )
+    reserved_names = sorted(set(grid.states) & set(RESERVED))
+    if reserved_names:
+        raise MissionInputError(
+            f"a state cannot be called {reserved_names[0]} in an observation library: give it "
+            "another name in the binding."
+        )
     for name, levels in grid.states.items():
-        if any(b <= a for a, b in itertools.pairwise(levels)):
+        if any(second <= first for first, second in itertools.pairwise(levels)):
             raise MissionInputError(f"the levels of {name} must increase, and {levels} came.")
+
+
+def _count_sensors(grid: SamplingGrid, binding: Binding) -> int:
+    """Return the number of sensors of the FMU; refuse a library that does not fit in memory."""
+    # Only the FMU knows the lengths of arrays.
     fmu = FmiAsset(grid.fmu, binding)
     warn_without_sandbox(grid.fmu, binding.limits.grants)
     sensors = fmu.binding.observation_slice(grid.role)
-    count: int = sensors.stop - sensors.start
+    sensor_count: int = sensors.stop - sensors.start
+    size = _COPIES_IN_MEMORY * NUMBER * sensor_count * grid.size
     check_fits(
-        {f"{count} sensors at {grid.size} points": _COPIES * NUMBER * count * grid.size},
+        {f"{sensor_count} sensors at {grid.size} points": size},
         "take fewer levels, draws or controls",
     )
-    return count
+    return sensor_count
 
 
-def _record(grid: SamplingGrid) -> dict[str, Any]:
-    """Return what a library is a function of: the grid with hashes in the place of files."""
+def _library_record(grid: SamplingGrid) -> dict[str, Any]:
+    """Return what a library is a function of: the grid, hashes of the files, and the version."""
     record: dict[str, Any] = json.loads(json.dumps(asdict(grid)))
     del record["step_timeout"]
-    hashes = {"fmu": hash_file(Path(grid.fmu)), "binding": hash_file(Path(grid.binding))}
-    return record | hashes | {"version": version("uav-twin")}
+    record["fmu"] = hash_file(Path(grid.fmu))
+    record["binding"] = hash_file(Path(grid.binding))
+    record["version"] = version("uav-twin")
+    return record
 
 
-def _prepare_folder(out: Path, record: dict[str, Any], *, resume: bool, replace_existing: bool) -> Path:
+def _prepare_folder(
+    out: Path, record: dict[str, Any], *, resume: bool, replace_existing: bool
+) -> Path:
+    """Return the folder of blocks, new or of an interrupted sampling of the same record."""
     if out.suffix != ".nc":
-        raise MissionInputError(said("library.suffix", out=out))
+        raise MissionInputError(
+            f"an observation library must have the suffix .nc, and {out} was given."
+        )
     folder = blocks_folder(out)
-    plan = folder / PLAN_NAME
+    plan_file = folder / PLAN_NAME
     if replace_existing:
         shutil.rmtree(folder, ignore_errors=True)
     elif out.exists():
         raise MissionInputError(f"{out} exists: choose another --out or give --replace.")
-    text = json.dumps(record, indent=1) + "\n"  # the order of the states matters
+    plan = json.dumps(record, indent=1) + "\n"  # not sorted: the order of the states matters
     if folder.exists():
         if not resume:
-            raise MissionInputError(said("library.interrupted", folder=folder))
-        kept = plan.read_bytes() if plan.is_file() else b""
-        if kept and kept != text.encode("utf-8"):
-            what = _difference(kept, record)
-            raise MissionInputError(said("library.another", folder=folder, what=what))
-        if kept:
+            raise MissionInputError(
+                f"{folder} holds the finished blocks of an interrupted sampling: give --resume to "
+                "go on with them, or --replace to begin anew."
+            )
+        former_plan = plan_file.read_bytes() if plan_file.is_file() else b""
+        if former_plan and former_plan != plan.encode("utf-8"):
+            difference = _differing_keys(former_plan, record)
+            raise MissionInputError(
+                f"{folder} holds blocks of another FMU, binding, grid or version ({difference}): "
+                "give --replace to begin anew."
+            )
+        if former_plan:
             return folder
-    atomic_write_text(plan, text)
+    atomic_write_text(plan_file, plan)
     return folder
 
 
-def _difference(kept: bytes, record: dict[str, Any]) -> str:
+def _differing_keys(former_plan: bytes, record: dict[str, Any]) -> str:
+    """Return the keys in which a former plan differs from a record, in words."""
     try:
-        before = parse_json(kept, PLAN_NAME, MissionInputError)
-        return ", ".join(key for key in record if before.get(key) != record[key]).replace("_", " ")
+        former = parse_json(former_plan, PLAN_NAME, MissionInputError)
+        keys = [key for key in record if former.get(key) != record[key]]
     except (MissionInputError, AttributeError):
         return "damaged"
+    return ", ".join(keys).replace("_", " ")
 
 
-def _kept_rows(folder: Path, shape: tuple[int, int]) -> Float:
-    """Return the observations (N, G) on disk, NaN where there is none yet; whoever fills them keeps them."""
-    path, sound = folder / ROWS_NAME, False
-    with suppress(OSError, EOFError, ValueError):  # there are none, or they are damaged
-        sound = np.load(path, mmap_mode="r").shape == shape  # a short file would grow
-    if not sound:
+def _rows_on_disk(folder: Path, shape: tuple[int, int]) -> Float:
+    """Return the observations (N, G) as a file that is mapped into memory.
+
+    They are NaN if they were not sampled yet. Who fills them writes them to the file.
+    """
+    path = folder / ROWS_NAME
+    is_sound = False
+    with suppress(OSError, EOFError, ValueError):  # there is no file, or it is damaged
+        # Opened for reading: opened for writing, a file that is too short would grow.
+        is_sound = np.load(path, mmap_mode="r").shape == shape
+    if not is_sound:
         content = io.BytesIO()
         np.save(content, np.full(shape, np.nan))
         atomic_write_bytes(path, content.getvalue())
@@ -240,31 +308,27 @@ def _kept_rows(folder: Path, shape: tuple[int, int]) -> Float:
 def sampled_dataset(
     grid: SamplingGrid, binding: Binding, record: Mapping[str, Any], rows: Float
 ) -> xr.Dataset:
-    """Return observations (N, G) of a grid as a labelled dataset; each state factor is a dimension."""
-    vector, inputs = binding.observation[grid.role], list(next(iter(grid.controls.values())))
-    units = {name: binding.control[name].unit for name in inputs}
-    of_parameter = {
-        "long_name": grid.parameter or "none",
-        "units": binding.parameter[grid.parameter].unit if grid.parameter else "1",
-    }
-    sensor = {"long_name": f"FMU variable of each value of {grid.role}"}
-    draws = np.array(grid.draws) if grid.parameter else np.array([np.nan])
-    coordinates = {
-        "sensor": xr.Variable("sensor", np.array(vector.variables), sensor),
-        "sensor_unit": xr.Variable("sensor", np.array(vector.units), {"long_name": "unit"}),
-        "control": xr.Variable("control", np.array(list(grid.controls)), {"long_name": "control"}),
-        "parameter_value": xr.Variable("draw", draws, of_parameter),
-    }
-    for name, levels in grid.states.items():
-        about = {"long_name": "state", "units": binding.health[name].unit}
-        coordinates[name] = xr.Variable(name, np.array(levels), about)
-    for name in inputs:
-        about = {"long_name": f"control input {name}", "units": units[name]}
-        values = np.array([control[name] for control in grid.controls.values()])
-        coordinates[f"control_{name}"] = xr.Variable("control", values, about)
+    """Return the observations of a grid as a labelled dataset.
+
+    Its dimensions are the draw, each state factor, the control and the sensor.
+
+    Parameters
+    ----------
+    grid : SamplingGrid
+        The grid.
+    binding : Binding
+        The binding of the FMU.
+    record : mapping
+        The hashes of the files, and the version.
+    rows : (N, G) array
+        The observation at each point, in the units of the sensors.
+    """
     dimensions = ("draw", *grid.states, "control", "sensor")
-    shown = {"long_name": f"{grid.role} without noise", "units": "see sensor_unit"}
-    attributes: dict[str, Any] = {
+    description = {"long_name": f"{grid.role} without noise", "units": "see sensor_unit"}
+    observation = (dimensions, rows.reshape(*grid.shape, -1), description)
+    control_inputs = next(iter(grid.controls.values()))
+    control_units = {name: binding.control[name].unit for name in control_inputs}
+    attributes = {
         "kind": KIND,
         "format": FORMAT,
         "role": grid.role,
@@ -276,8 +340,35 @@ def sampled_dataset(
         "uav_twin_version": record["version"],
         "load": json.dumps(dict(grid.load), sort_keys=True),
         "parameters": json.dumps(dict(grid.parameters), sort_keys=True),
-        "control_units": json.dumps(units, sort_keys=True),
+        "control_units": json.dumps(control_units, sort_keys=True),
     }
-    return xr.Dataset(
-        {"observation": (dimensions, rows.reshape(*grid.shape, -1), shown)}, coordinates, attributes
-    )
+    coordinates = _library_coordinates(grid, binding, control_units)
+    return xr.Dataset({"observation": observation}, coordinates, attributes)
+
+
+def _library_coordinates(
+    grid: SamplingGrid, binding: Binding, control_units: Mapping[str, str]
+) -> dict[str, xr.Variable]:
+    """Return the coordinates of a library: sensors, controls, draws, and levels of the states."""
+    vector = binding.observation[grid.role]
+    sensor_attributes = {"long_name": f"FMU variable of each value of {grid.role}"}
+    controls = np.array(list(grid.controls))
+    draws = np.array(grid.draws) if grid.parameter else np.array([np.nan])
+    draw_attributes = {"long_name": "none", "units": "1"}
+    if grid.parameter:
+        draw_attributes["long_name"] = grid.parameter
+        draw_attributes["units"] = binding.parameter[grid.parameter].unit
+    coordinates = {
+        "sensor": xr.Variable("sensor", np.array(vector.variables), sensor_attributes),
+        "sensor_unit": xr.Variable("sensor", np.array(vector.units), {"long_name": "unit"}),
+        "control": xr.Variable("control", controls, {"long_name": "control"}),
+        "parameter_value": xr.Variable("draw", draws, draw_attributes),
+    }
+    for name, levels in grid.states.items():
+        attributes = {"long_name": "state", "units": binding.health[name].unit}
+        coordinates[name] = xr.Variable(name, np.array(levels), attributes)
+    for name, unit in control_units.items():
+        attributes = {"long_name": f"control input {name}", "units": unit}
+        values = np.array([control[name] for control in grid.controls.values()])
+        coordinates[f"control_{name}"] = xr.Variable("control", values, attributes)
+    return coordinates

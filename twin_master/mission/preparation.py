@@ -311,7 +311,9 @@ class Knowledge:
         probability = self.scenario.truth.probability
         if not probability:
             return self.model
-        return build_graphical_model(self.scenario.having("transition", probability=probability))
+        return build_graphical_model(
+            self.scenario.with_changes("transition", probability=probability)
+        )
 
     def truth(self, seed: int) -> Truth:
         """Return what really happens in a mission of a seed."""

@@ -287,7 +287,7 @@ class Truth:
         for fault in scenario.truth.sensor_faults:
             last_step = fault.last_step if fault.last_step is not None else scenario.mission.steps
             is_active = (steps >= fault.first_step) & (steps <= last_step)
-            sensors = np.array(fault.places(scenario.observation.count))
+            sensors = np.array(fault.sensor_indices(scenario.observation.count))
             cells = np.ix_(is_active, sensors)
             if fault.kind == "dropout":
                 self.status[cells] = SensorStatus.LOST

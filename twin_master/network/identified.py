@@ -15,7 +15,7 @@ from reporting.arrays import Float, Index
 from twin_master.errors import InvalidObservationError, said
 from twin_master.network.kernels import LOG_ROOT_TWO_PI
 from twin_master.network.sensor_model import GaussianSensorModel
-from twin_master.scenario.section import row_width
+from twin_master.scenario.observation import row_width
 
 
 def packed_row(values: Float, covariance: Float) -> Float:

@@ -1,1 +1,1 @@
-"""The report of a run: its data, one file for each group of figures, and the page that holds them."""
+"""The report of a run: a page with figures and tables, made from the run folder."""

@@ -1,17 +1,17 @@
-"""A run as its pages read it: the stored arrays by their names, and what the scenario says of them."""
+"""A run as its report reads it: stored arrays by name, and how states and sensors are printed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reporting.arrays import Float
 from reporting.json_file import read_json
-from twin_master.errors import RunFolderError, TwinMasterError, said
+from twin_master.errors import RunFolderError, TwinMasterError
 from twin_master.network.graphical_model import GraphicalModel
 from twin_master.network.inference import smooth
 from twin_master.network.twin import build_graphical_model
@@ -34,19 +34,26 @@ if TYPE_CHECKING:
 
 NORMAL_95 = 1.959963984540054
 """Half-width of a 95 % interval of the normal distribution, in standard deviations."""
+_CALIBRATION_NAME = "calibration.json"
+_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 
 
 @dataclass(frozen=True)
 class PrintedFactor:
-    """A factor of the state, as printed.
+    """A factor of the state, as reports print it.
 
     Attributes
     ----------
-    symbol, title, unit : str
+    symbol : str
+        The name with its trailing digits as a subscript, such as z₁.
+    title : str
+        The name in words.
+    unit : str
+        The printed unit.
     scale : float
-        From the stored unit to the printed one.
+        The factor from the stored unit to the printed one.
     levels : tuple of float
-        Printed, the lowest first.
+        The levels in the printed unit, the lowest first.
     """
 
     symbol: str
@@ -57,28 +64,28 @@ class PrintedFactor:
 
     @property
     def label(self) -> str:
-        """Symbol and printed unit."""
+        """The symbol and the printed unit, as an axis shows them."""
         return f"{self.symbol} ({self.unit})"
 
 
 @dataclass(frozen=True)
 class PrintedSensors:
-    """The sensors, as printed.
+    """The G sensors of a scenario, as reports print them.
 
     Attributes
     ----------
     word : str
-        What one is called.
+        The noun for one sensor, such as "gauge".
     titles : tuple of str
-        Of each.
+        The title of each sensor.
     quantity : str
-        What they show.
+        The quantity that the sensors measure, such as "strain".
     units : tuple of str
-        Of each.
+        The printed unit of each sensor.
     scale : float
-        From the stored unit to the printed one.
+        The factor from the stored unit to the printed one.
     named : bool
-        Whether the scenario names them.
+        Whether the scenario gives the titles; otherwise the sensors are numbered.
     """
 
     word: str
@@ -90,31 +97,49 @@ class PrintedSensors:
 
     @property
     def unit(self) -> str:
-        """The unit of all; empty where they have several."""
+        """The unit of all sensors; empty if they have different units."""
         return self.units[0] if len(set(self.units)) == 1 else ""
 
 
 def printed_factors(scenario: Scenario) -> tuple[PrintedFactor, ...]:
-    """Return the factors of the state, as printed."""
-    found = []
+    """Return the factors of a scenario's state, as reports print them."""
+    factors = []
     for factor in scenario.state:
         scale, unit = printed_state(factor.unit)
-        levels = tuple(scale * level for level in factor.levels)
-        found.append(PrintedFactor(symbol(factor.name), factor.title or factor.name, unit, scale, levels))
-    return tuple(found)
+        factors.append(
+            PrintedFactor(
+                symbol=symbol(factor.name),
+                title=factor.title or factor.name,
+                unit=unit,
+                scale=scale,
+                levels=tuple(scale * level for level in factor.levels),
+            )
+        )
+    return tuple(factors)
 
 
 def printed_sensors(scenario: Scenario) -> PrintedSensors:
-    """Return the sensors, as printed."""
-    section, word = scenario.observation, scenario.observation.word
-    scale, named = section.printed
-    units = tuple("µε" if unit == "microstrain" else unit for unit in named)
-    titles = section.titles or tuple(f"{word} {number}" for number in range(1, section.count + 1))
-    return PrintedSensors(word, titles, section.role, units, scale, bool(section.titles))
+    """Return the sensors of a scenario, as reports print them."""
+    observation = scenario.observation
+    scale, units = observation.printed
+    numbers = range(1, observation.count + 1)
+    return PrintedSensors(
+        word=observation.word,
+        titles=observation.titles or tuple(f"{observation.word} {number}" for number in numbers),
+        quantity=observation.role,
+        units=tuple(_short_unit(unit) for unit in units),
+        scale=scale,
+        named=bool(observation.titles),
+    )
+
+
+def _short_unit(unit: str) -> str:
+    """Return the unit as reports print it."""
+    return "µε" if unit == "microstrain" else unit
 
 
 def short_number(value: float) -> str:
-    """Return a number that fits beside an axis: 0.5, 1500, 1e-4."""
+    """Return a number that fits beside an axis, such as 0.5, 1500 or 1e-4."""
     text = f"{value:g}"
     if len(text.lstrip("-")) <= 4:
         return text
@@ -123,26 +148,53 @@ def short_number(value: float) -> str:
 
 
 def symbol(name: str) -> str:
-    """Return the name with its trailing digits as a subscript: ``z1`` -> z₁."""
+    """Return a name with its trailing digits as a subscript: z1 becomes z₁."""
     stem = name.rstrip("0123456789")
+    if not stem:
+        return name
     digits = name[len(stem) :]
-    return stem + digits.translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")) if stem else name
+    return stem + digits.translate(_SUBSCRIPTS)
+
+
+class Moments(NamedTuple):
+    """Moments of posteriors, as `run.nc` stores them on the last axis of an array.
+
+    Attributes
+    ----------
+    mean, standard_deviation : array
+        The mean and the standard deviation.
+    lower, upper : array
+        The ends of the central 90 % interval.
+    """
+
+    mean: Float
+    standard_deviation: Float
+    lower: Float
+    upper: Float
+
+
+def moments_of(values: Float) -> Moments:
+    """Return the moments of a (..., 4) array as four arrays without its last axis."""
+    return Moments(*np.moveaxis(values, -1, 0))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A run of T steps, S joint states of K factors, G sensors, U controls, H predicted steps.
+    """A run of T steps, S joint states of K factors, G sensors, U controls and H predicted steps.
 
-    ``run["filtered/mean"]`` is a variable of `run.nc` as an array, SI; see `docs/run_folder.md`.
+    ``run["filtered/mean"]`` is a variable of `run.nc` as an array in SI units; the page
+    `docs/run_folder.md` lists the variables.
 
     Attributes
     ----------
     tree : DataTree
         All groups of `run.nc`.
     scenario : Scenario
-        What was flown.
-    config, summary, calibration : mapping
-        The JSON files of the folder; the last two are empty where there is none.
+        The scenario that was flown.
+    config : mapping
+        The content of `config.json`.
+    summary, calibration : mapping
+        The content of `summary.json` and of `calibration.json`; empty if the file is missing.
     """
 
     tree: "xr.DataTree"
@@ -152,140 +204,169 @@ class Run:
     calibration: Mapping[str, Any]
 
     def __getitem__(self, path: str) -> Float:
-        """Return a variable."""
+        """Return the variable at a path such as "filtered/mean"."""
         return np.asarray(self.tree[path].values)
 
     def get(self, path: str) -> Float | None:
-        """Return a variable; None where the run does not have it."""
+        """Return the variable at a path; None if the run does not have it."""
         group, _, name = path.partition("/")
-        return self[path] if group in self.tree.children and name in self.tree[group] else None
+        if group in self.tree.children and name in self.tree[group]:
+            return self[path]
+        return None
 
     @cached_property
     def factors(self) -> tuple[PrintedFactor, ...]:
-        """The K factors of the state, as printed."""
+        """The K factors of the state, as reports print them."""
         return printed_factors(self.scenario)
 
     @cached_property
     def sensors(self) -> PrintedSensors:
-        """The G sensors, as printed."""
+        """The G sensors, as reports print them."""
         return printed_sensors(self.scenario)
 
     @property
     def controls(self) -> tuple[str, ...]:
-        """Names of the U controls."""
+        """The names of the U controls."""
         return self.scenario.control_names
 
     @property
-    def step(self) -> str:
-        """What a step is called."""
+    def step_word(self) -> str:
+        """The scenario's noun for a step, such as "step" or "shift"."""
         return self.scenario.mission.step_name
 
     @property
-    def decides_ahead(self) -> bool:
-        """Whether it is decided by the belief that is predicted for the next step."""
-        told = self.tree["filtered/decision_probability"].attrs["long_name"]
-        return "predicted" in told  # a policy that was given decides as it is made, not as the scenario says
+    def decides_on_prediction(self) -> bool:
+        """Whether the belief predicted for the next step decides its control.
+
+        The stored description is read, not the scenario: a given policy decides as it was planned,
+        whatever the scenario says.
+        """
+        description = self.tree["filtered/decision_probability"].attrs["long_name"]
+        return "predicted" in description
 
     @property
-    def watched(self) -> bool:
-        """Whether it is that of a real asset."""
+    def is_watched(self) -> bool:
+        """Whether the run is the watch of a real asset, not a simulated flight."""
         return bool(self.config.get("watched"))
 
     @property
-    def observed(self) -> Float:
-        """What the sensors said, SI: (T, G); NaN where lost."""
+    def observations(self) -> Float:
+        """The readings of the sensors as a (T, G) array in SI units; NaN where one was lost."""
         return self[f"observed/{self.sensors.quantity}"]
 
     @property
-    def truth(self) -> Float | None:
-        """True state, SI: (T, K); None where nobody knows it."""
+    def true_state(self) -> Float | None:
+        """The true state as a (T, K) array in SI units; None if nobody knows it."""
         return self.get("truth/state")
 
     @cached_property
     def control_index(self) -> NDArray[np.int64]:
-        """Control in force: (T,)."""
+        """The index of the control in force in each step, a (T,) array."""
         return self["observed/control_index"].astype(np.int64)
 
     @property
-    def steps(self) -> int:
-        """Number T of steps."""
+    def step_count(self) -> int:
+        """The number T of steps."""
         return len(self.control_index)
 
     @cached_property
-    def numbers(self) -> NDArray[np.int64]:
-        """Numbers of the steps: (T,)."""
+    def step_numbers(self) -> NDArray[np.int64]:
+        """The numbers of the steps, a (T,) array."""
         return self["observed/step"].astype(np.int64)
 
     @property
     def first_step(self) -> int:
-        """Number of the first step."""
-        return int(self.numbers[0])
+        """The number of the first step; the steps of a watch may begin late."""
+        return int(self.step_numbers[0])
 
     @property
     def horizon(self) -> int:
-        """Number H of predicted steps."""
+        """The number H of predicted steps."""
         return int(self["predicted/mean"].shape[1])
 
     @cached_property
-    def scales(self) -> Float:
-        """From the stored units of the factors to the printed ones: (K,)."""
+    def factor_scales(self) -> Float:
+        """The factors from the stored units of the state to the printed ones, a (K,) array."""
         return np.array([factor.scale for factor in self.factors])
 
     @cached_property
     def model(self) -> GraphicalModel:
-        """States and transitions that the twin believes."""
+        """The twin's graphical model: its states and transitions."""
         return build_graphical_model(self.scenario)
 
     @cached_property
-    def learnt(self) -> tuple[LearntQuantity, ...]:
-        """What was learnt, in printed units, in the order in which it is stored; empty where nothing is."""
+    def learnt_quantities(self) -> tuple[LearntQuantity, ...]:
+        """The quantities that the twin learnt, in printed units and in the order of the store."""
         if "learnt" not in self.tree.children:
             return ()
-        found = []
+        quantities = []
+        ending = f"_prior_{MOMENTS[0]}"  # each learnt quantity has one variable with this ending
         for variable, stored in self.tree["learnt"].data_vars.items():
-            name = str(variable).removesuffix(f"_prior_{MOMENTS[0]}")
-            if name == variable:
-                continue
-            scale, unit = printed_unit_of_quantity(name, str(stored.attrs["units"]), self.scenario)
-            course, prior = (
-                scale * np.stack([self[f"learnt/{name}{part}_{moment}"] for moment in MOMENTS], axis=-1)
-                for part in ("", "_prior")
-            )
-            truth = self.get(f"truth/{name}")
-            unit = "µε" if unit == "microstrain" else unit
-            truth = None if truth is None else scale * truth
-            found.append(LearntQuantity(name, quantity_titles(name)[1], unit, course, prior, truth))
-        return tuple(found)
+            if str(variable).endswith(ending):
+                name = str(variable).removesuffix(ending)
+                quantities.append(self._learnt_quantity(name, str(stored.attrs["units"])))
+        return tuple(quantities)
+
+    def _learnt_quantity(self, name: str, stored_unit: str) -> LearntQuantity:
+        """Return a learnt quantity by its name in the store, in printed units."""
+        scale, unit = printed_unit_of_quantity(name, stored_unit, self.scenario)
+        course = [self[f"learnt/{name}_{moment}"] for moment in MOMENTS]
+        prior = [self[f"learnt/{name}_prior_{moment}"] for moment in MOMENTS]
+        truth = self.get(f"truth/{name}")
+        return LearntQuantity(
+            name=name,
+            title=quantity_titles(name)[1],
+            unit=_short_unit(unit),
+            posterior=scale * np.stack(course, axis=-1),
+            prior=scale * np.stack(prior, axis=-1),
+            truth=None if truth is None else scale * truth,
+        )
 
     def smoothed_until(self, now: int) -> Float:
-        """Return p(D_t | o_0..o_now) for t = 0..now, (now + 1, S), from the filtered beliefs."""
-        with np.errstate(divide="ignore"):
-            rows = np.log(self["filtered/probability"][: now + 1])
-        return smooth(self.model, self.control_index[: now + 1], rows)
+        """Return p(D_t | o_0..o_now) of the joint states for t = 0..now, a (now + 1, S) array."""
+        with np.errstate(divide="ignore"):  # impossible states have the logarithm -inf
+            log_belief = np.log(self["filtered/probability"][: now + 1])
+        return smooth(self.model, self.control_index[: now + 1], log_belief)
 
 
 def read_run(folder: Path) -> Run:
     """Read a run folder.
 
+    Parameters
+    ----------
+    folder : Path
+        The folder of a run, with `run.nc` and `config.json`.
+
+    Returns
+    -------
+    Run
+        The run.
+
     Raises
     ------
     RunFolderError
-        There is no ``run.nc``, it is damaged, or of another version.
+        If `run.nc` is missing, damaged, or of another version.
     """
     tree = open_run(folder)
-    config, summary, calibration = (
-        _read_json(folder / name) for name in (CONFIG_NAME, SUMMARY_NAME, "calibration.json")
-    )
-    with RunFolderError.instead_of(TwinMasterError, after=" The run cannot be shown: fly it again."):
+    config = _read_object(folder / CONFIG_NAME)
+    summary = _read_object(folder / SUMMARY_NAME)
+    calibration = _read_object(folder / _CALIBRATION_NAME)
+    with RunFolderError.instead_of(
+        TwinMasterError, after=" The run cannot be shown: fly it again."
+    ):
         scenario = parse_scenario(config.get("scenario", {}), str(folder / CONFIG_NAME))
     run = Run(tree, scenario, config, summary, calibration)
-    missing = [path for path in variable_paths(scenario.observation.role) if run.get(path) is None]
-    if missing:
-        raise RunFolderError(said("run_folder.layout", name=RUN_NAME, path=missing[0]))
+    for path in variable_paths(scenario.observation.role):
+        if run.get(path) is None:
+            raise RunFolderError(
+                f"{RUN_NAME} does not have the layout of a run of this version "
+                f"(the variable {path} is missing): fly the run again."
+            )
     return run
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_object(path: Path) -> dict[str, Any]:
+    """Return the object in a JSON file; empty if there is no such file."""
     content = read_json(path, RunFolderError) if path.is_file() else {}
     if not isinstance(content, dict):
         raise RunFolderError(f"{path} must hold one JSON object: fly the run again.")

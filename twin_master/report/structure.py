@@ -1,49 +1,48 @@
-"""The structure in the report: what is believed of its regions, and what its gauges show; pictures of plans.
+"""The structure after the last step: a wing from above, or the surface of a mesh."""
 
-They show what is done where on triangles of beliefs, and which sensors tell most.
-"""
-
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.tri import Triangulation
 
 from fe.elements.cells import CellMesh
 from fe.elements.kinds import KINDS, meshio_with_wedges
 from fe.structure.design import MeshDesign, load_structure
 from fe.wing.design import WingDesign, load_design
 from reporting import figures as style
-from reporting.arrays import Float
+from reporting.arrays import Float, Index
 from twin_master.assets.design_source import DESIGN_COPY, FLOWN_DESIGN_COPY
 from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.assets.structure_source import FLOWN_COPY, MODEL_COPY
-from twin_master.network.graphical_model import GraphicalModel
-from twin_master.network.planner import BeliefPolicy
 from twin_master.report.reading import Run
-from twin_master.scenario.schema import CALIBRATION_COPY, Scenario
+from twin_master.scenario.mission import CALIBRATION_COPY
+from twin_master.scenario.schema import Scenario
 
-LOSS = "YlOrRd"
-"""Colour map of what regions have lost."""
-_BAR = {"pad": 0.02, "fraction": 0.02, "aspect": 14}
-_LENGTH = 0.08
-"""Length of the largest displacement in the picture, as a part of the structure's."""
+LOSS_COLORS = "YlOrRd"
+"""Colour map of the stiffness that regions have lost."""
+_COLOR_BAR: dict[str, Any] = {"pad": 0.02, "fraction": 0.02, "aspect": 14}
+_DRAWN_DISPLACEMENT = 0.08
+"""Length of the largest displacement in the picture, as a fraction of the structure's diagonal."""
 
 
 class Planform(NamedTuple):
-    """A wing from above [m]: x along the span from the root, y along the chord, positive to the front.
+    """A wing seen from above.
+
+    Coordinates are in metres: x along the span from the root, y along the chord, positive to the
+    front.
 
     Attributes
     ----------
-    outline : (N, 2)
-    regions : tuple of (N, 2)
-        The damage regions, in the order of the state's factors.
-    gauges : (G, 2)
+    outline : (N, 2) array
+        The corners of the wing.
+    regions : tuple of (N, 2) array
+        The corners of the damage regions, in the order of the factors of the state; empty if the
+        factors are not the regions of the wing.
+    gauges : (G, 2) array
+        The positions of the gauges.
     """
 
     outline: Float
@@ -52,35 +51,77 @@ class Planform(NamedTuple):
 
 
 def planform_of(design: WingDesign | None, scenario: Scenario) -> Planform | None:
-    """Return a wing from above; None without one that has the sensors of a scenario."""
+    """Return a wing seen from above.
+
+    Parameters
+    ----------
+    design : WingDesign or None
+        The design of the wing.
+    scenario : Scenario
+        The scenario, which knows the sensors and the factors of the state.
+
+    Returns
+    -------
+    Planform or None
+        The wing; None if there is no design, or if its gauges are not the sensors of the scenario.
+    """
     if design is None or len(design.gauges.positions) != scenario.observation.count:
         return None
-    plan = design.planform
-
-    def place(span: float, chord: float) -> tuple[float, float]:
-        return span, (plan.straight_chord_line - chord) * plan.chord(span / plan.semi_span)
-
-    def panel(start: float, end: float, front: float, rear: float) -> Float:
-        corners = ((start, front), (end, front), (end, rear), (start, rear))
-        return np.array([place(span, chord) for span, chord in corners])
-
-    places = {
-        f"z{number}": panel(d.span_start, d.span_end, d.chord_start, d.chord_end)
-        for number, d in enumerate(design.defects, start=1)
-    }
+    regions = {}
+    for number, defect in enumerate(design.defects, start=1):
+        span = (defect.span_start, defect.span_end)
+        regions[f"z{number}"] = _wing_panel(design, span, (defect.chord_start, defect.chord_end))
     names = scenario.state_names
+    has_regions_as_states = {*names} <= {*regions}
     return Planform(
-        outline=panel(0.0, plan.semi_span, 0.0, 1.0),
-        regions=tuple(places[name] for name in names) if {*names} <= {*places} else (),
-        gauges=np.array([place(span, chord) for span, chord in design.gauges.positions]),
+        outline=_wing_panel(design, (0.0, design.planform.semi_span), (0.0, 1.0)),
+        regions=tuple(regions[name] for name in names) if has_regions_as_states else (),
+        gauges=np.array([_wing_point(design, *position) for position in design.gauges.positions]),
     )
 
 
+def _wing_point(design: WingDesign, span: float, chord_fraction: float) -> tuple[float, float]:
+    """Return the coordinates [m] of a point of a wing from above.
+
+    Parameters
+    ----------
+    design : WingDesign
+        The design, whose straight chord line is the x axis.
+    span : float
+        The distance from the root [m].
+    chord_fraction : float
+        The distance behind the leading edge, as a fraction of the local chord.
+    """
+    planform = design.planform
+    chord = planform.chord(span / planform.semi_span)
+    return span, (planform.straight_chord_line - chord_fraction) * chord
+
+
+def _wing_panel(design: WingDesign, span: tuple[float, float], chord: tuple[float, float]) -> Float:
+    """Return the four corners [m] of a panel of a wing from above, a (4, 2) array.
+
+    The panel lies between two distances from the root [m] and two fractions of the chord.
+    """
+    start, end = span
+    front, rear = chord
+    corners = [
+        _wing_point(design, start, front),
+        _wing_point(design, end, front),
+        _wing_point(design, end, rear),
+        _wing_point(design, start, rear),
+    ]
+    return np.array(corners)
+
+
 def design_of(folder: Path) -> WingDesign | None:
-    """Return the design that the twin of a run folder believes, or else that of what is flown."""
-    for copy in (DESIGN_COPY, FLOWN_DESIGN_COPY):
-        if (folder / copy).is_file():
-            return load_design(folder / copy)
+    """Return the wing of a run folder; None if the run has none.
+
+    The design that the twin believes comes first, then that of what is flown, then that of the
+    calibration.
+    """
+    for name in (DESIGN_COPY, FLOWN_DESIGN_COPY):
+        if (folder / name).is_file():
+            return load_design(folder / name)
     if (folder / CALIBRATION_COPY).is_file():
         from calibration.result.file import load_calibration
 
@@ -88,183 +129,274 @@ def design_of(folder: Path) -> WingDesign | None:
     return None
 
 
+@style.publication_style()
 def planform_figure(run: Run, planform: Planform, residual: Float) -> Figure:
-    """Draw a wing after its last step: regions by belief, gauges by reading and by residual (G,)."""
-    measured, sensors = run.sensors.scale * run.observed[-1], run.sensors
-    shown: tuple[tuple[str, str, Float, str, dict[str, Any]], ...] = (
-        ("a", f"Measured {sensors.quantity}", measured, f"{sensors.quantity} ({sensors.unit})", {}),
-        ("b", "Measured less expected", residual, "standard deviations", style.RESIDUALS),
+    """Draw a wing after its last step, seen from above.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    planform : Planform
+        The wing.
+    residual : (G,) array
+        The residuals of the last observations, in standard deviations; NaN where one was lost.
+    """
+    figure, ((upper,), (lower,)) = style.panels(
+        2, 1, 4.0, 0.3, 0.1, left=0.1, right=0.92, hspace=0.25
     )
-    with style.publication_style():
-        figure, rows = style.panels(2, 1, 4.0, 0.3, 0.1, left=0.1, right=0.92, hspace=0.25)
-        for (axes,), (label, title, values, unit, look) in zip(rows, shown, strict=True):
-            axes.fill(*planform.outline.T, facecolor="#f2f4f6", edgecolor=style.REFERENCE)
-            regions = PolyCollection(
-                planform.regions, array=(run.scales * run["filtered/mean"][-1])[: len(planform.regions)],
-                cmap=LOSS, edgecolors="black", linewidths=0.7,
-                clim=(run.factors[0].levels[0], max(factor.levels[-1] for factor in run.factors)),
-            )  # fmt: skip
-            axes.add_collection(regions)
-            _draw_gauges(figure, axes, planform.gauges, values, unit, **look)
-            axes.set_aspect("equal")
-            axes.axis("off")
-            style.panel_label(axes, label, title)
-            if planform.regions:
-                unit = run.factors[0].unit
-                style.color_bar(figure, regions, f"expected loss ({unit})", ax=axes, location="left", **_BAR)
+    sensors = run.sensors
+    _draw_wing(
+        figure,
+        upper,
+        run,
+        planform,
+        values=sensors.scale * run.observations[-1],
+        value_label=f"{sensors.quantity} ({sensors.unit})",
+        look={"cmap": style.LEVELS},
+    )
+    style.panel_label(upper, "a", f"Measured {sensors.quantity}")
+    _draw_wing(
+        figure,
+        lower,
+        run,
+        planform,
+        values=residual,
+        value_label="standard deviations",
+        look=style.RESIDUALS,
+    )
+    style.panel_label(lower, "b", "Measured less expected")
     return figure
 
 
-def _draw_gauges(figure: Figure, axes: Axes, places: Float, values: Float, unit: str, **look: Any) -> None:
-    """Draw gauges (G, 2) by their values (G,), and a cross where one was lost."""
-    known = np.isfinite(values)
-    look = {"cmap": style.LEVELS, **look}
-    (x, y), (left, low) = places[known].T, places[~known].T
-    dots = axes.scatter(x, y, c=values[known], s=36.0, edgecolors="black", linewidths=0.5, **look)
-    axes.scatter(left, low, marker="x", s=30.0, color=style.TRUTH, label="lost")
-    style.color_bar(figure, dots, unit, ax=axes, **_BAR)
+def _draw_wing(
+    figure: Figure,
+    axes: Axes,
+    run: Run,
+    planform: Planform,
+    *,
+    values: Float,
+    value_label: str,
+    look: dict[str, Any],
+) -> None:
+    """Draw a wing from above, its regions by the expected loss and its gauges by values (G,)."""
+    x, y = planform.outline.T
+    axes.fill(x, y, facecolor="#f2f4f6", edgecolor=style.REFERENCE)
+    expected_loss = run.factor_scales * run["filtered/mean"][-1]
+    lowest_level = run.factors[0].levels[0]
+    highest_level = max(factor.levels[-1] for factor in run.factors)
+    regions = PolyCollection(
+        planform.regions,
+        array=expected_loss[: len(planform.regions)],
+        cmap=LOSS_COLORS,
+        edgecolors="black",
+        linewidths=0.7,
+        clim=(lowest_level, highest_level),
+    )
+    axes.add_collection(regions)
+    _draw_gauges(figure, axes, planform.gauges, values, value_label, look)
+    axes.set_aspect("equal")
+    axes.axis("off")
+    if planform.regions:
+        label = f"expected loss ({run.factors[0].unit})"
+        style.color_bar(figure, regions, label, ax=axes, location="left", **_COLOR_BAR)
+
+
+def _draw_gauges(
+    figure: Figure,
+    axes: Axes,
+    positions: Float,
+    values: Float,
+    value_label: str,
+    look: dict[str, Any],
+) -> None:
+    """Draw gauges at positions (G, 2) as dots coloured by values (G,), and a cross if one is lost.
+
+    `look` holds the colours of the values, as arguments of `Axes.scatter`.
+    """
+    is_known = np.isfinite(values)
+    x, y = positions[is_known].T
+    dots = axes.scatter(
+        x, y, c=values[is_known], s=36.0, edgecolors="black", linewidths=0.5, **look
+    )
+    x, y = positions[~is_known].T
+    axes.scatter(x, y, marker="x", s=30.0, color=style.TRUTH, label="lost")
+    style.color_bar(figure, dots, value_label, ax=axes, **_COLOR_BAR)
 
 
 class StructurePicture(NamedTuple):
-    """A picture, the largest displacement [m] in it, and how many times displacements are exaggerated."""
+    """A picture of a displaced structure.
+
+    Attributes
+    ----------
+    figure : Figure
+        The picture.
+    largest : float
+        The largest displacement [m].
+    scale : float
+        The factor by which displacements are drawn larger than they are.
+    """
 
     figure: Figure
     largest: float
     scale: float
 
 
-def mesh_figure(run: Run, folder: Path, residual: Float) -> StructurePicture:
-    """Draw the surface of a structure, regions by what they have lost, gauges by residual (G,)."""
-    mesh = meshio_with_wedges().read(folder / FIELD_NAME)
-    body = CellMesh(KINDS[mesh.cells[0].type], mesh.points, np.asarray(mesh.cells[0].data))
-    loss = np.asarray(mesh.cell_data["stiffness_loss"][0], dtype=np.float64)
-    region = np.asarray(mesh.cell_data["region"][0])
-    displacement = np.asarray(mesh.point_data["displacement"], dtype=np.float64)
-    largest = float(np.linalg.norm(displacement, axis=1).max())
-    size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-    scale = _LENGTH * size / largest if largest > 0.0 else 0.0
-    cells, faces, _ = body.outer_faces
-    corners = [body.cells[cell, list(body.kind.faces[face])] for cell, face in zip(cells, faces, strict=True)]
-    points = np.asarray(mesh.points + scale * displacement)
-    # seen from above, in front and the right; what is farther is drawn first
-    angle, tilt = np.radians(-60.0), np.radians(28.0)
-    across = np.array([-np.sin(angle), np.cos(angle), 0.0])
-    towards = np.array([np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)])
-    view = np.column_stack((across, np.cross(towards, across)))
-    order = np.argsort([(points[nodes] @ towards).mean() for nodes in corners])
-    with style.publication_style():
-        figure, ((axes,),) = style.panels(1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9)
-        patches = PolyCollection(
-            [points[corners[number]] @ view for number in order], array=100.0 * loss[cells][order], cmap=LOSS,
-            edgecolors=["black" if region[cells[number]] > 0 else "0.6" for number in order], linewidths=0.4,
-            clim=(0.0, 100.0),
-        )  # fmt: skip
-        axes.add_collection(patches)
-        copies = (folder / name for name in (MODEL_COPY, FLOWN_COPY))
-        places = gauge_places(next((copy for copy in copies if copy.is_file()), None))
-        if places is not None and len(places) == len(residual):
-            nearest = np.argmin(np.linalg.norm(mesh.points[:, None] - places, axis=2), axis=0)
-            places = (places + scale * displacement[nearest]) @ view
-            _draw_gauges(figure, axes, places, residual, "gauges: standard deviations", **style.RESIDUALS)
-        axes.autoscale_view()
-        axes.set_aspect("equal")
-        axes.axis("off")
-        style.color_bar(figure, patches, "stiffness loss (%)", ax=axes, location="left", **_BAR)
+class StructureField(NamedTuple):
+    """The last state of a structure of n nodes and m cells, as a run folder keeps it.
+
+    Attributes
+    ----------
+    body : CellMesh
+        The mesh; positions in metres.
+    displacement : (n, 3) array
+        The displacements of the nodes [m].
+    stiffness_loss : (m,) array
+        The fraction of its stiffness that each cell has lost.
+    region : (m,) array
+        The number of the damage region of each cell; 0 outside of all regions.
+    """
+
+    body: CellMesh
+    displacement: Float
+    stiffness_loss: Float
+    region: Index
+
+
+def read_field(path: Path) -> StructureField:
+    """Read the last state of a structure from a file of a run folder."""
+    mesh = meshio_with_wedges().read(path)
+    cells = mesh.cells[0]
+    return StructureField(
+        body=CellMesh(KINDS[cells.type], mesh.points, np.asarray(cells.data)),
+        displacement=np.asarray(mesh.point_data["displacement"], dtype=np.float64),
+        stiffness_loss=np.asarray(mesh.cell_data["stiffness_loss"][0], dtype=np.float64),
+        region=np.asarray(mesh.cell_data["region"][0]),
+    )
+
+
+class Camera(NamedTuple):
+    """A view of a structure from above, in front and the right.
+
+    Attributes
+    ----------
+    towards : (3,) array
+        The unit vector towards the viewer.
+    plane : (3, 2) array
+        The unit vectors to the right and upwards in the picture, as columns.
+    """
+
+    towards: Float
+    plane: Float
+
+
+def _camera() -> Camera:
+    """Return the camera of all pictures of structures."""
+    azimuth = np.radians(-60.0)
+    elevation = np.radians(28.0)
+    towards = np.array(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ]
+    )
+    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    upwards = np.cross(towards, right)
+    return Camera(towards, np.column_stack((right, upwards)))
+
+
+@style.publication_style()
+def mesh_figure(run_folder: Path, residual: Float) -> StructurePicture:
+    """Draw the surface of a structure after its last step.
+
+    Parameters
+    ----------
+    run_folder : Path
+        The folder of the run, with the last state of the structure.
+    residual : (G,) array
+        The residuals of the last observations, in standard deviations; NaN where one was lost.
+    """
+    field = read_field(run_folder / FIELD_NAME)
+    points = field.body.points
+    largest = float(np.linalg.norm(field.displacement, axis=1).max())
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    scale = _DRAWN_DISPLACEMENT * diagonal / largest if largest > 0.0 else 0.0
+    displaced = np.asarray(points + scale * field.displacement)
+    camera = _camera()
+    figure, ((axes,),) = style.panels(
+        1, 1, 0.55 * style.FULL_WIDTH, 0.05, 0.05, left=0.1, right=0.9
+    )
+    surface = _draw_surface(axes, field, displaced, camera)
+    gauges = _run_gauge_places(run_folder)
+    if gauges is not None and len(gauges) == len(residual):
+        distance = np.linalg.norm(points[:, None] - gauges, axis=2)  # (nodes, gauges)
+        nearest_node = np.argmin(distance, axis=0)
+        displaced_gauges = gauges + scale * field.displacement[nearest_node]
+        in_picture = displaced_gauges @ camera.plane
+        label = "gauges: standard deviations"
+        _draw_gauges(figure, axes, in_picture, residual, label, style.RESIDUALS)
+    axes.autoscale_view()
+    axes.set_aspect("equal")
+    axes.axis("off")
+    label = "stiffness loss (%)"
+    style.color_bar(figure, surface, label, ax=axes, location="left", **_COLOR_BAR)
     return StructurePicture(figure, largest, scale)
 
 
+def _draw_surface(
+    axes: Axes, field: StructureField, points: Float, camera: Camera
+) -> PolyCollection:
+    """Draw the outer faces of a structure with nodes at points (n, 3), and return them.
+
+    Faces are coloured by the stiffness that their cells have lost; those of damage regions have
+    black edges. The farthest face is drawn first.
+    """
+    body = field.body
+    outer = body.outer_faces
+    corners = []
+    for cell, face in zip(outer.cell, outer.number, strict=True):
+        corners.append(body.cells[cell, list(body.kind.faces[face])])
+    distance = [(points[nodes] @ camera.towards).mean() for nodes in corners]
+    order = np.argsort(distance)
+    is_in_region = field.region[outer.cell] > 0
+    surface = PolyCollection(
+        [points[corners[face]] @ camera.plane for face in order],
+        array=100.0 * field.stiffness_loss[outer.cell][order],
+        cmap=LOSS_COLORS,
+        edgecolors=["black" if is_in_region[face] else "0.6" for face in order],
+        linewidths=0.4,
+        clim=(0.0, 100.0),
+    )
+    axes.add_collection(surface)
+    return surface
+
+
+def _run_gauge_places(run_folder: Path) -> Float | None:
+    """Return the positions of the gauges (G, 3) [m] of a run's structure, if a copy has them.
+
+    The model that the twin believes comes first, then that of what is flown.
+    """
+    for name in (MODEL_COPY, FLOWN_COPY):
+        if (run_folder / name).is_file():
+            return gauge_places(run_folder / name)
+    return None
+
+
 def gauge_places(file: Path | None) -> Float | None:
-    """Return where the gauges of a structure are (G, 3) [m]; None where its file does not say it."""
+    """Return the positions of the gauges in a structure file.
+
+    Parameters
+    ----------
+    file : Path or None
+        The file of a structure.
+
+    Returns
+    -------
+    (G, 3) array or None
+        The positions [m]; None if there is no file, or if it describes no mesh.
+    """
     structure = None if file is None else load_structure(file)
     if not isinstance(structure, MeshDesign):
         return None
     return structure.unit * np.array([gauge.point for gauge in structure.gauge])
-
-
-_COLORS = ("#56B4E9", "#E69F00", style.PRESENT, style.DECISION, style.PREDICTION, "#F0E442", style.PAST)
-_ROWS = 60
-"""Rows of points in a triangle."""
-
-
-def triangle_of(model: GraphicalModel, place: int) -> Float:
-    """Return three beliefs (3, S) of one factor: at its lowest level, at its highest, and not known.
-
-    The other factors are at their lowest levels.
-    """
-    corners = []
-    for own in (0, -1, slice(None)):
-        belief = np.zeros(model.states.shape)
-        levels: list[Any] = [0] * belief.ndim
-        levels[place] = own
-        belief[tuple(levels)] = 1.0
-        corners.append(belief.ravel() / belief.sum())
-    return np.array(corners)
-
-
-@style.publication_style()
-def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
-    """Draw for each factor of the state what a policy does between three beliefs, the control by colour."""
-    factors, count = model.states.names[:3], len(model.controls)
-    share = np.array([(i, j) for i in range(_ROWS + 1) for j in range(_ROWS + 1 - i)]) / _ROWS
-    weight = np.column_stack((1.0 - share.sum(axis=1), share))
-    x, y = (weight @ np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.866]])).T
-    mesh = Triangulation(x, y)
-    colors = [_COLORS[number % len(_COLORS)] for number in range(count)]
-    cmap = ListedColormap(colors)
-    figure, (row,) = style.panels(1, len(factors), 3.2, 0.4, 0.45, left=0.03, right=0.97)
-    centre = weight[mesh.triangles].mean(axis=1)
-    for place, (axes, name) in enumerate(zip(row, factors, strict=True)):
-        chosen = policy.decide(centre @ triangle_of(model, place))
-        axes.tripcolor(mesh, facecolors=chosen, edgecolors="face", cmap=cmap, vmin=-0.5, vmax=count - 0.5)
-        for text, at in (("lowest", (0.0, -0.06)), ("highest", (1.0, -0.06)), ("not known", (0.5, 0.9))):
-            axes.text(*at, text, ha="center", va="top" if at[1] < 0.0 else "bottom")
-        axes.set_aspect("equal")
-        axes.set_axis_off()
-        style.panel_label(axes, "abc"[place], f"Belief of {name}")
-    handles = style.swatches(model.controls, colors)
-    figure.legend(handles=handles, loc="lower center", ncols=count, handlelength=1.4)
-    return figure
-
-
-@style.publication_style()
-def design_figure(
-    information: Sequence[float], of_all: float, names: Sequence[str], places: Float | None,
-    chosen: Sequence[int], outlines: Sequence[Float],
-) -> Figure:  # fmt: skip
-    """Draw what the chosen sensors tell together, and where they are on a wing from above.
-
-    Parameters
-    ----------
-    information : sequence of float
-        Of the first, the first two, ... of them [bit].
-    of_all : float
-        Of all candidates [bit].
-    names : sequence of str
-        Of the chosen sensors.
-    places : (G, 2) or None
-        Of all sensors [m]; None where they are not known.
-    chosen : sequence of int
-        Sensors, from 0.
-    outlines : sequence of (N, 2)
-        What is drawn below the sensors [m].
-    """
-    figure = style.new_figure(2.6)
-    ratios = [1] if places is None else [2, 3]
-    panels = figure.subplots(1, len(ratios), squeeze=False, width_ratios=ratios)[0]
-    number = np.arange(1, len(information) + 1)
-    panels[0].plot(number, information, "o-", color=style.PRESENT)
-    panels[0].axhline(of_all, color=style.REFERENCE, linestyle="--", label="all candidates")
-    panels[0].set(xlabel="sensors", ylabel="expected information [bit]", ylim=(0.0, None))
-    panels[0].set_xticks(number, names, rotation=60)
-    panels[0].legend(loc="lower right")
-    if places is not None:
-        for outline in outlines:
-            panels[1].fill(*outline.T, facecolor="none", edgecolor=style.REFERENCE, linewidth=0.8)
-        panels[1].plot(*places.T, "o", color=style.REFERENCE, markersize=3.5)
-        panels[1].plot(*places[list(chosen)].T, "o", color=style.PRESENT, markersize=6)
-        for rank, sensor in enumerate(chosen, start=1):
-            panels[1].annotate(str(rank), places[sensor], (3, 3), textcoords="offset points")
-        panels[1].set_aspect("equal")
-        panels[1].set_axis_off()
-    figure.tight_layout()
-    return figure

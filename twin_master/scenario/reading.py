@@ -1,4 +1,4 @@
-"""Reading scenario files: TOML in, a checked `Scenario` out, and one clear sentence for whatever is wrong."""
+"""Reading scenario files: from TOML to a checked `Scenario`, or one clear sentence on a fault."""
 
 import hashlib
 from collections.abc import Mapping
@@ -11,10 +11,16 @@ from reporting.former_names import with_present_names
 from reporting.toml_file import read_toml, validate
 from reporting.words import brief
 from scenarios import scenario_files
-from twin_master.errors import ScenarioError, said
+from twin_master.errors import ScenarioError
+from twin_master.scenario.kinds import CALIBRATED_DESIGN_NAME
 from twin_master.scenario.schema import Scenario
-from twin_master.scenario.section import CALIBRATED_DESIGN_NAME
-from twin_master.scenario.tables import GAINS, MOST_DRAWS, NUMBERS_BY_DEFAULT, Noticing
+from twin_master.scenario.section import Table
+from twin_master.scenario.tables import (
+    GAINS_PER_SENSOR,
+    MOST_DRAWS,
+    MOST_NUMBERS_BY_DEFAULT,
+    Noticing,
+)
 
 PRESENT_NAMES = {
     "notice.memory_turns": "memory_steps",
@@ -24,48 +30,96 @@ PRESENT_NAMES = {
 }
 """The present name of each key of a scenario, by the location that it had before."""
 
-_OF_SEVERAL = ("component", "connection", "algorithm", "iterations", "tolerance")
-_OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
+_KEYS_OF_COUPLED_FMUS = ("component", "connection", "algorithm", "iterations", "tolerance")
+_KEYS_OF_FMUS = ("binding", "isolated", "step_timeout", "parameters", "load", "seeds")
 
 
-def from_format_1(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a table of format 1 as one of format 2; what is wrong with it stays wrong."""
-    given = table.get("asset")
-    if not isinstance(given, Mapping):
+def from_format_1(table: Mapping[str, Any]) -> Table:
+    """Return a table of format 1 as one of format 2.
+
+    In format 1 the table `asset` also said what the twin believes. A fault of the table stays in
+    it, so that the schema refuses it.
+
+    Parameters
+    ----------
+    table : mapping
+        The scenario as a file of format 1 has it.
+    """
+    former = table.get("asset")
+    if not isinstance(former, Mapping):
         return {**table, "format": 2, "belief": {"kind": "asset"}}
-    asset = {key: value for key, value in given.items() if value not in (None, [], (), {})}
-    believed, library = asset.pop("observation_model", None), asset.pop("library", None)
-    design, effects = asset.pop("design", None), asset.pop("model_patch", None)
-    kind = asset.pop("kind", "fmu")
-    flown: dict[str, Any] = {}
-    if kind == "fmu":
-        kind = "fmu" if "file" in asset else "script" if "script" in asset else "design"
-        flown = _of_design(design) if kind == "design" else {}
-    elif kind == "coupled" and "file" in asset:
-        kind = "ssp"
-    if kind not in ("coupled", "ssp"):
-        asset = {key: value for key, value in asset.items() if key not in _OF_SEVERAL}
-    if kind == "strain_library":
-        asset = {key: value for key, value in asset.items() if key not in _OF_FMUS}
-    belief: dict[str, Any] = {"kind": "asset"}
-    if library is not None or believed == "library":
+    asset = {key: value for key, value in former.items() if value not in (None, [], (), {})}
+    belief = _belief_of_format_1(asset)
+    for key in ("observation_model", "library", "model_patch"):
+        asset.pop(key, None)
+    return {**table, "format": 2, "asset": _asset_of_format_1(asset), "belief": belief}
+
+
+def _belief_of_format_1(asset: Mapping[str, Any]) -> Table:
+    """Return the table `belief` that the table `asset` of a file of format 1 implies."""
+    model = asset.get("observation_model")
+    library = asset.get("library")
+    design = asset.get("design")
+    belief: Table = {"kind": "asset"}
+    if library is not None or model == "library":
         belief = {"kind": "library", "file": library, "design": design}
-    elif believed == "design" or (design is not None and believed is None):
-        belief = _of_design(design)
-    if effects is not None:
-        belief["patch"] = effects
-    return {**table, "format": 2, "asset": {"kind": kind} | asset | flown, "belief": belief}
+    elif model == "design" or (model is None and design is not None):
+        belief = _table_of_design(design)
+    if "model_patch" in asset:
+        belief["patch"] = asset["model_patch"]
+    return belief
 
 
-def _of_design(design: object) -> dict[str, Any]:
+def _asset_of_format_1(former: Mapping[str, Any]) -> Table:
+    """Return the table `asset` of format 2 for one of format 1, without the keys on the belief.
+
+    In format 1 the kind `fmu` also stood for scripts and wing designs, the kind `coupled` also for
+    SSP files, and a table could have keys of other kinds, which were not used.
+    """
+    asset = dict(former)
+    design = asset.pop("design", None)
+    kind = asset.pop("kind", "fmu")
+    packed_design: Table = {}
+    if kind == "fmu" and "file" not in former:
+        kind = "script" if "script" in former else "design"
+        if kind == "design":
+            packed_design = _table_of_design(design)
+    elif kind == "coupled" and "file" in former:
+        kind = "ssp"
+    unused_keys: tuple[str, ...] = ()
+    if kind not in ("coupled", "ssp"):
+        unused_keys += _KEYS_OF_COUPLED_FMUS
+    if kind == "strain_library":
+        unused_keys += _KEYS_OF_FMUS
+    for key in unused_keys:
+        asset.pop(key, None)
+    return {"kind": kind} | asset | packed_design
+
+
+def _table_of_design(design: object) -> Table:
+    """Return the table of a wing design by its name; None is a design without a name."""
     if design == CALIBRATED_DESIGN_NAME:
         return {"kind": "calibration"}
-    return {"kind": "design"} | ({} if design is None else {"design": design})
+    if design is None:
+        return {"kind": "design"}
+    return {"kind": "design", "design": design}
 
 
 @dataclass(frozen=True)
 class LoadedScenario:
-    """A scenario, its file, the SHA-256 of that file's content, and a remark for its user, if any."""
+    """A scenario that was read from a file.
+
+    Attributes
+    ----------
+    scenario : Scenario
+        The scenario.
+    path : Path
+        The file.
+    content_hash : str
+        The SHA-256 of the file's content.
+    remark : str
+        A sentence for the user; empty if there is none.
+    """
 
     scenario: Scenario
     path: Path
@@ -77,17 +131,22 @@ class LoadedScenario:
 
     @property
     def file(self) -> dict[str, str]:
-        """Name and hash of the file, by which folders of the scenario are known."""
+        """The name and hash of the file, which the folders of its runs contain."""
         return {"name": self.path.name, "sha256": self.content_hash}
 
 
 def find_scenario(name: str) -> Path:
-    """Return the file of a shipped scenario, or of a path to a TOML file.
+    """Return the file of a scenario.
+
+    Parameters
+    ----------
+    name : str
+        The name of a shipped scenario, or the path of a TOML file.
 
     Raises
     ------
     ScenarioError
-        Neither a shipped scenario nor a file has this name.
+        If it is neither.
     """
     shipped = scenario_files()
     if name in shipped:
@@ -95,61 +154,91 @@ def find_scenario(name: str) -> Path:
     path = Path(name)
     if path.is_file():
         return path
-    raise ScenarioError(said("scenario.unknown", name=name, shipped=", ".join(shipped)))
+    raise ScenarioError(
+        f"There is no scenario `{name}`: give the path of a TOML file or one of "
+        f"{', '.join(shipped)}."
+    )
 
 
 def load_scenario(given: LoadedScenario | str | Path) -> LoadedScenario:
-    """Read and check a scenario by its shipped name or its path; one that was read stays as it is.
+    """Read and check a scenario.
 
-    Where the file says nothing of `notice` the twin gives notices, if it can. `config.json` of a run says
-    what was flown: nothing is added to that.
+    If the file does not mention `notice`, the twin gives notices, provided that it can. A run's
+    `config.json` is read by `parse_scenario`, which adds nothing to what was flown.
+
+    Parameters
+    ----------
+    given : LoadedScenario, str or Path
+        The name of a shipped scenario, or the path of a file. A scenario that was read already is
+        returned as it is.
 
     Raises
     ------
     ScenarioError
-        There is no such scenario, or the file cannot be read, is not TOML, or breaks the schema; the sentence
-        names file and key.
+        If there is no such scenario, or the file cannot be read, is not TOML, or breaks the schema.
+        The sentence names the file and the key.
     """
     if isinstance(given, LoadedScenario):
         return given
     path = find_scenario(str(given))
     table = read_toml(path, ScenarioError, what="scenario")
     content_hash = hashlib.sha256(path.read_bytes()).hexdigest()
-    scenario, remark = parse_scenario(table, str(path)), ""
-    if "notice" not in table:
-        reason = why_no_notices(scenario)
-        scenario = scenario.model_copy(update={"notice": None if reason else Noticing()})
-        remark = f"This twin gives no notices: {reason}; `notice = false` says that it is meant so."
-    return LoadedScenario(scenario, path, content_hash, remark if scenario.notice is None else "")
+    scenario = parse_scenario(table, str(path))
+    if "notice" in table:
+        return LoadedScenario(scenario, path, content_hash)
+    obstacle = obstacle_to_notices(scenario)
+    if obstacle:
+        scenario = scenario.model_copy(update={"notice": None})
+        remark = (
+            f"This twin gives no notices: {obstacle}; `notice = false` says that it is meant so."
+        )
+        return LoadedScenario(scenario, path, content_hash, remark)
+    scenario = scenario.model_copy(update={"notice": Noticing()})
+    return LoadedScenario(scenario, path, content_hash)
 
 
-def why_no_notices(scenario: Scenario) -> str:
-    """Return why notices are not given by themselves, in words; empty where they are."""
-    observation, calibration = scenario.observation, scenario.calibration
+def obstacle_to_notices(scenario: Scenario) -> str:
+    """Return why a scenario has no notices by default; an empty text if it has them."""
+    observation = scenario.observation
     if observation.modes is not None:
         return "observations of modes have a covariance of their own"
     if scenario.readings:
         return "a scenario with inspections asks for them by `[notice]`"
     if observation.average_over_draws == "inside":
-        return "the average over the draws is taken `inside`, so that each sensor has a parameter of its own"
-    draws = 1 if calibration.source == "fixed" else min(calibration.draws, MOST_DRAWS)
-    numbers = prod(len(factor.levels) for factor in scenario.state) * draws * observation.count * GAINS
-    if numbers > NUMBERS_BY_DEFAULT:
         return (
-            f"they take {numbers:,} numbers a step, more than {NUMBERS_BY_DEFAULT:,} (`[notice]` takes them)"
+            "the average over the draws is taken `inside`, so that each sensor has a parameter of "
+            "its own"
+        )
+    joint_states = prod(len(factor.levels) for factor in scenario.state)
+    draws = min(scenario.calibration.draw_count, MOST_DRAWS)
+    numbers = joint_states * draws * observation.count * GAINS_PER_SENSOR
+    if numbers > MOST_NUMBERS_BY_DEFAULT:
+        return (
+            f"they take {numbers:,} numbers a step, more than {MOST_NUMBERS_BY_DEFAULT:,} "
+            "(`[notice]` takes them)"
         )
     return ""
 
 
 def parse_scenario(table: Mapping[str, Any], source: str) -> Scenario:
-    """Return the scenario that a table (of a TOML file, or of `config.json`) describes.
+    """Return the scenario that a table describes.
+
+    Parameters
+    ----------
+    table : mapping
+        The content of a TOML file, or the scenario of a run's `config.json`.
+    source : str
+        The name of the file, for the sentence.
 
     Raises
     ------
     ScenarioError
-        The table breaks the schema; `source` names it in the sentence.
+        If the table breaks the schema.
     """
-    if table.get("format") == 1 and table["format"] is not True and "belief" not in table:
+    file_format = table.get("format")
+    # In Python `True == 1`; the format `true` is left to the schema, which refuses it.
+    is_format_1 = file_format == 1 and file_format is not True
+    if is_format_1 and "belief" not in table:
         table = from_format_1(table)
     table = with_present_names(table, PRESENT_NAMES, source, ScenarioError)
     return validate(Scenario, table, source, ScenarioError, what="a scenario")

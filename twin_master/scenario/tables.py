@@ -1,82 +1,149 @@
-"""Tables of a scenario: how the state moves, the truth, actions, learning, notices, the watch."""
+"""Tables of a scenario: transitions, the truth, actions, learning, notices and the watch."""
 
 from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field
 
 from reporting.toml_file import Fault, NotNegative, Number, Positive
-from twin_master.errors import said
+from twin_master.scenario.kinds import FileSection
+from twin_master.scenario.observation import RecordSection
 from twin_master.scenario.section import (
     Count,
-    FileSection,
     Flag,
     Name,
     PerSensor,
     Probability,
-    RecordSection,
     Section,
     Step,
-    incomplete,
-    one_or_each,
-    short,
+    Table,
+    incomplete_table_fault,
+    value_count_fault,
 )
 
 ROW_SUM_TOLERANCE = 1e-12
-"""Largest departure of the sum of probabilities from one, as the graphical model has it."""
+"""Largest departure of a sum of probabilities from one; the graphical model has the same."""
+
+
+class FigureGroup(NamedTuple):
+    """A group of figures of the summary, as `figures.toml` has it.
+
+    Attributes
+    ----------
+    name : str
+        The table of `figures.toml`.
+    fields : dict of str to str
+        What stands in the braces in the names of its figures.
+    """
+
+    name: str
+    fields: dict[str, str]
 
 
 class Rewards(Section):
-    """Figures of the rewards, eqs. (9)-(11), and their weights in planning."""
+    """The parameters of the rewards, eqs. (9)-(11), and their weights in planning."""
 
-    units: ClassVar[Mapping[str, str]] = {"health_limit": "microstrain", "error_scale": "microstrain"}
+    units: ClassVar[Mapping[str, str]] = {
+        "health_limit": "microstrain",
+        "error_scale": "microstrain",
+    }
     health_limit: PerSensor
-    """Value at which the health reward is zero, one for all sensors that count for it or one for each."""
+    """Value at which the health reward is zero, one for all sensors that count for it or one for
+    each."""
     health_sensors: Literal["all"] | Annotated[tuple[Count, ...], Field(min_length=1)] = "all"
-    """Sensors, numbered from 1, that have a limit and so count for the health reward."""
+    """The sensors, numbered from 1, that have a limit and so count for the health reward."""
     health_weight: Number = 1.0
     control_weight: Number = 1.0
     error_scale: PerSensor
-    """Distance of observation and model that costs one, one for all sensors or one for each."""
+    """Distance between observation and model that costs one, one for all sensors or for each."""
     normalise_error_by: Name | None = None
     control: dict[str, Number]
 
 
 class Transition(Section):
-    """How the state moves in one step under each control; factors move independently given the control."""
+    """How the state moves in one step under each control.
+
+    Given the control, the state factors move independently.
+    """
 
     kind: Literal["independent_worsening", "independent_tables"]
     probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
-    """`independent_worsening`: probability of one level up, for each control (or control and state)."""
+    """`independent_worsening`: probability of one level up, by control, or by control and state."""
     tables: dict[str, dict[str, tuple[tuple[Probability, ...], ...]]] = Field(default_factory=dict)
-    """`independent_tables`: for each control and state a square table, rows from, columns to."""
+    """`independent_tables`: a square table by control and state; a row is the level before the
+    step, a column the level after it."""
 
-    def faults_among(self, controls: tuple[str, ...], levels: Mapping[str, int]) -> Iterator[Fault]:
-        """Yield what is missing or too much for the controls, and states with their numbers of levels."""
-        worsening = self.kind == "independent_worsening"
-        key, other, kind = "probability", "tables", "independent_tables"
-        if not worsening:
-            key, other, kind = other, key, "independent_worsening"
-        yield getattr(self, other), f"`transition.{other}` belongs to the kind `{kind}`"
-        given: dict[str, Any] = getattr(self, key)
-        yield incomplete(given, controls, f"transition.{key}", "control")
-        for name, entry in given.items():
-            if isinstance(entry, dict):
-                yield incomplete(entry, tuple(levels), f"transition.{key}.{name}", "state")
-            for state, size in () if worsening else levels.items():
-                told, wide = {"name": name, "state": state}, {size} != {len(row) for row in entry[state]}
-                yield wide or len(entry[state]) != size, said("scenario.table_size", **told, size=size)
-                worst = max(abs(sum(row) - 1.0) for row in entry[state])
-                yield worst > ROW_SUM_TOLERANCE, said("scenario.table_sum", **told, worst=worst)
+    def faults_beside(
+        self, controls: tuple[str, ...], level_counts: Mapping[str, int]
+    ) -> Iterator[Fault]:
+        """Yield the possible faults, each with whether it is there: names and tables.
+
+        Parameters
+        ----------
+        controls : tuple of str
+            The names of the controls.
+        level_counts : mapping of str to int
+            The number of levels of each state factor, by its name.
+        """
+        if self.kind == "independent_worsening":
+            yield self.tables, "`transition.tables` belongs to the kind `independent_tables`"
+            yield from self._probability_faults(controls, tuple(level_counts))
+        else:
+            yield (
+                self.probability,
+                "`transition.probability` belongs to the kind `independent_worsening`",
+            )
+            yield from self._table_faults(controls, level_counts)
+
+    def _probability_faults(
+        self, controls: tuple[str, ...], states: tuple[str, ...]
+    ) -> Iterator[Fault]:
+        """Yield the possible faults, each with whether it is there: names of probabilities."""
+        key = "transition.probability"
+        yield incomplete_table_fault(self.probability, controls, key, "control")
+        for control, probability in self.probability.items():
+            if isinstance(probability, dict):
+                yield incomplete_table_fault(probability, states, f"{key}.{control}", "state")
+
+    def _table_faults(
+        self, controls: tuple[str, ...], level_counts: Mapping[str, int]
+    ) -> Iterator[Fault]:
+        """Yield the possible faults, each with whether it is there: names and rows of tables."""
+        yield incomplete_table_fault(self.tables, controls, "transition.tables", "control")
+        for control, tables in self.tables.items():
+            key = f"transition.tables.{control}"
+            yield incomplete_table_fault(tables, tuple(level_counts), key, "state")
+            for state, size in level_counts.items():
+                rows = tables[state]
+                has_other_size = len(rows) != size or any(len(row) != size for row in rows)
+                yield (
+                    has_other_size,
+                    f"`{key}.{state}` must be {size} rows of {size} probabilities",
+                )
+                departure = max(abs(sum(row) - 1.0) for row in rows)
+                yield (
+                    departure > ROW_SUM_TOLERANCE,
+                    f"each row of `{key}.{state}` must sum to 1, one misses it by {departure:.3g}",
+                )
 
 
-def probability_of(table: Mapping[str, float | Mapping[str, float]], control: str, state: str) -> float:
-    """Return the probability of a factor of the state to worsen under a control."""
-    entry = table[control]
-    return entry[state] if isinstance(entry, Mapping) else entry
+def probability_of(
+    probabilities: Mapping[str, float | Mapping[str, float]], control: str, state: str
+) -> float:
+    """Return the probability that a state factor worsens by a level in a step under a control.
+
+    Parameters
+    ----------
+    probabilities : mapping
+        For each control one probability for all state factors, or one by state factor.
+    control, state : str
+        The names of the control and of the state factor.
+    """
+    probability = probabilities[control]
+    return probability[state] if isinstance(probability, Mapping) else probability
 
 
 class Span(Section):
@@ -86,13 +153,16 @@ class Span(Section):
     last_step: Step | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield an end before the beginning."""
-        before = self.last_step is not None and self.last_step < self.first_step
-        yield before, f"`last_step` {self.last_step} lies before `first_step` {self.first_step}"
+        """Yield the possible faults, each with whether it is there: an early end."""
+        ends_early = self.last_step is not None and self.last_step < self.first_step
+        yield (
+            ends_early,
+            f"`last_step` {self.last_step} lies before `first_step` {self.first_step}",
+        )
 
 
 class Gain(Span):
-    """What one factor of the true state gains at each step from `first_step` to `last_step`."""
+    """How much one factor of the true state grows in each step of a span."""
 
     units: ClassVar[Mapping[str, str]] = {"gain": "percent"}
     state: Name
@@ -100,7 +170,7 @@ class Gain(Span):
 
 
 class Noise(Section):
-    """Noise of the real sensors, Gaussian and independent."""
+    """The noise of the real sensors, Gaussian and independent."""
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "microstrain"}
     standard_deviation: NotNegative | tuple[NotNegative, ...]
@@ -108,7 +178,7 @@ class Noise(Section):
 
 
 class SensorFault(Span):
-    """A fault of some sensors (numbered from 1) between two steps, the last one included."""
+    """A fault of some sensors, numbered from 1, in a span of steps."""
 
     units: ClassVar[Mapping[str, str]] = {"rate": "microstrain_per_step"}
     kind: Literal["dropout", "drift"]
@@ -116,87 +186,137 @@ class SensorFault(Span):
     rate: Number | None = None
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what a span has, and a rate that the kind has not."""
+        """Yield the possible faults, each with whether it is there: span and rate."""
         yield from super().faults()
-        drifts = self.kind == "drift"
-        yield drifts != (self.rate is not None), said("scenario.rate")
+        needs_rate = self.kind == "drift"
+        has_rate = self.rate is not None
+        yield (
+            needs_rate != has_rate,
+            "a drift needs `rate_microstrain_per_step`, and a dropout has none",
+        )
 
-    def places(self, count: int) -> list[int]:
-        """Return the places of its sensors among so many, from 0."""
-        return list(range(count)) if self.sensors == "all" else [sensor - 1 for sensor in self.sensors]
+    def sensor_indices(self, sensor_count: int) -> list[int]:
+        """Return the indices, from 0, of the sensors that have the fault."""
+        if self.sensors == "all":
+            return list(range(sensor_count))
+        return [sensor - 1 for sensor in self.sensors]
 
 
 class TruthSection(Section):
     """What really happens, unseen by the twin: damage, sensor noise and faults.
 
-    With the kind `asset`, all of it happens inside the asset, and is read back for scoring only.
+    If the kind is `asset`, all of it happens inside the asset, and is read for scoring only.
     """
 
     kind: Literal["scripted", "random_growth", "asset"]
     gains: tuple[Gain, ...] = ()
     probability: dict[str, Probability | dict[str, Probability]] = Field(default_factory=dict)
-    """`random_growth`: the true probabilities to worsen, as in `transition`; those of the twin if absent."""
+    """`random_growth`: the true probabilities to worsen, as in `transition`; by default those that
+    the twin assumes."""
     noise: Noise = Noise(standard_deviation=0.0)
     sensor_faults: tuple[SensorFault, ...] = ()
     state: dict[str, Name] = Field(default_factory=dict)
-    """`asset`: for each state, the monitor of the binding that tells its true value."""
+    """`asset`: for each state factor, the monitor of the binding that holds its true value."""
     observation: Name | None = None
-    """`asset`: the observation of the binding that is free of noise; that of the scenario if absent."""
+    """`asset`: the observation of the binding without noise; by default that of the scenario."""
     received: Name | None = None
-    """`asset`: the observation of the binding that is 0 where a sensor is lost."""
+    """`asset`: the observation of the binding that is 0 for a lost sensor."""
 
     record: RecordSection | None = None
-    """Where modes are observed: the record of each step."""
+    """How the record of each step is made, if modes are observed."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield keys that do not go together."""
-        faults, inside = self.sensor_faults or self.noise.standard_deviation, self.kind == "asset"
+        """Yield the possible faults, each with whether it is there: keys of another kind."""
+        is_inside_asset = self.kind == "asset"
+        has_sensor_errors = self.sensor_faults or self.noise.standard_deviation
         if self.record is not None:
-            yield inside or faults, said("scenario.record_noise")
-        elif inside:
-            yield self.gains or faults, said("scenario.asset_truth")
+            yield (
+                is_inside_asset or has_sensor_errors,
+                "with `truth.record` the noise is that of the record (`truth.record.noise`), and "
+                "the truth the scenario's: leave out `truth.noise`, `truth.sensor_faults`, the "
+                "kind `asset`",
+            )
+        elif is_inside_asset:
+            yield (
+                self.gains or has_sensor_errors,
+                "the kind `asset` leaves damage, noise and faults to the asset: leave out "
+                "`truth.gains`, `truth.noise` and `truth.sensor_faults`",
+            )
         else:
-            yield self.state or self.observation or self.received, said("scenario.told_truth")
+            yield (
+                self.state or self.observation or self.received,
+                "`state`, `observation` and `received` of `truth` belong to the kind `asset`",
+            )
             yield "noise" not in self.model_fields_set, "`truth.noise` is missing"
 
 
+class InspectedState(NamedTuple):
+    """A reading that an action takes of a state factor.
+
+    Attributes
+    ----------
+    name : str
+        The name of the reading.
+    state : str
+        The name of the state factor.
+    standard_deviation : float
+        The standard deviation of the reading.
+    """
+
+    name: str
+    state: str
+    standard_deviation: float
+
+
 class Action(Section):
-    """One choice of a step beside the controls."""
+    """A choice in a step beside the controls, such as an inspection or a repair."""
 
     units: ClassVar[Mapping[str, str]] = {"standard_deviation": "percent"}
     name: Name
     title: str = ""
     control: Name
-    """The control whose loads are on the asset in that step."""
+    """The control whose loads act on the asset in that step."""
     cost: NotNegative
-    """What the reward of the step is less than under the control."""
+    """By how much the reward of the step is lower than under the control alone."""
     inspects: tuple[Name, ...] = ()
-    """States that are read in that step, and only then."""
+    """The state factors that are read in that step, and only then."""
     standard_deviation: PerSensor | None = None
-    """Of these readings, one for all or one for each."""
+    """Standard deviation of these readings, one for all or one for each."""
     repairs: tuple[Name, ...] = ()
-    """States that are at their lowest level in the step after."""
+    """The state factors that are at their lowest level in the next step."""
     success: Probability = 1.0
-    """Probability with which a repair succeeds, for each state."""
+    """Probability with which a repair succeeds, for each state factor."""
     ends: Flag = False
     """Whether the mission ends with that step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield what is not given together, and that it does nothing."""
-        alone = bool(self.inspects) != (self.standard_deviation is not None)
-        yield alone, said("scenario.inspects", name=self.name)
-        yield one_or_each("action.standard_deviation", self.standard_deviation, len(self.inspects))
-        idle = not (self.inspects or self.repairs or self.ends)
-        yield idle, said("scenario.idle_action", name=self.name)
+        """Yield the possible faults, each with whether it is there: readings and effect."""
+        inspects = bool(self.inspects)
+        has_deviation = self.standard_deviation is not None
+        yield (
+            inspects != has_deviation,
+            f"action `{self.name}`: `inspects` and `standard_deviation` go together: the states "
+            "that are read, and how well",
+        )
+        yield value_count_fault(
+            "action.standard_deviation", self.standard_deviation, len(self.inspects)
+        )
+        has_effect = self.inspects or self.repairs or self.ends
+        yield (
+            not has_effect,
+            f"action `{self.name}` does nothing that its control does not: give `inspects`, "
+            "`repairs` or `ends`",
+        )
 
     @property
-    def readings(self) -> tuple[tuple[str, str, float], ...]:
-        """Name of each reading, the state that is read, and the standard deviation."""
-        given = self.standard_deviation
-        each = given if isinstance(given, tuple) else (given or 0.0,) * len(self.inspects)
+    def readings(self) -> tuple[InspectedState, ...]:
+        """The readings that the action takes."""
+        deviations = self.standard_deviation
+        if not isinstance(deviations, tuple):
+            deviations = (deviations or 0.0,) * len(self.inspects)
         return tuple(
-            (f"{self.name}_{state}", state, deviation)
-            for state, deviation in zip(self.inspects, each, strict=True)
+            InspectedState(f"{self.name}_{state}", state, deviation)
+            for state, deviation in zip(self.inspects, deviations, strict=True)
         )
 
 
@@ -205,143 +325,200 @@ class Planner(Section):
 
     gamma: Annotated[float, Field(strict=True, ge=0.0, lt=1.0)]
     decide_on: Literal["filtered", "predicted"] = "filtered"
-    """Which belief the next control is the most probable one of: D_t, or D_{t+1} as predicted."""
+    """The belief of which the next control is the most probable one: D_t, or D_{t+1} as
+    predicted."""
     safest: Name | None = None
-    """Control where no state explains the sensors; by default the one with the least load."""
+    """The control if no state explains the sensors; by default the one with the least load."""
     policy: Literal["mode", "qmdp", "belief"] = "mode"
-    """The mode of the control of each state; the best control in the mean over the states, taken as if they
-    were known from the next step on; or what is planned on the belief."""
+    """`mode`: the most probable one of the best controls of each state; `qmdp`: the best control in
+    the mean over the states, as if they were known from the next step on; `belief`: the control
+    that is planned on the belief."""
     limit_probability: Annotated[Probability, Field(gt=0.0)] | None = None
-    """`belief`: share of the steps, discounted, in which a health limit may be exceeded."""
+    """`belief`: the fraction of the steps, discounted, in which a health limit may be exceeded."""
 
     inspections_per_step: Count | None = None
-    """`belief` and `qmdp`: steps with an inspection that assets which fly side by side have among them."""
+    """`belief` and `qmdp`: how many of the assets that fly side by side may inspect in one step."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield keys of another policy."""
-        limited = self.limit_probability is not None and self.policy != "belief"
-        yield limited, "`planner.limit_probability` needs `planner.policy` `belief`"
-        shared = self.inspections_per_step is not None and self.policy == "mode"
-        yield shared, "`planner.inspections_per_step` needs `planner.policy` `belief` or `qmdp`"
+        """Yield the possible faults, each with whether it is there: keys of another policy."""
+        yield (
+            self.limit_probability is not None and self.policy != "belief",
+            "`planner.limit_probability` needs `planner.policy` `belief`",
+        )
+        yield (
+            self.inspections_per_step is not None and self.policy == "mode",
+            "`planner.inspections_per_step` needs `planner.policy` `belief` or `qmdp`",
+        )
 
 
-def with_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the table of a scenario with an entry for each action wherever there is one for each control.
+def with_controls_of_actions(table: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return the table of a scenario in which each action is a control as well.
 
-    What is malformed stays as it is: the schema says what is wrong with it.
+    The action has the values, the probabilities and, less its cost, the reward of its control. A
+    malformed table is returned as it is: the schema refuses it with a sentence.
+
+    Parameters
+    ----------
+    table : mapping
+        The table of a scenario with actions, as the file has it.
     """
-    made = deepcopy(dict(table))
+    extended = deepcopy(dict(table))
     try:
-        controls, rewards, truth = made["control"], made["rewards"], made.get("truth", {})
-        entries = [made["transition"].get(key) for key in ("probability", "tables")]
-        weight = rewards.get("control_weight", 1.0) or 1.0
-        for action in made["action"]:
-            name, base = action["name"], action["control"]
-            known = {control["name"]: control for control in controls}
-            if name not in known:
-                controls.append(known[base] | {"name": name, "title": action.get("title", "")})
-            rewards["control"].setdefault(name, rewards["control"][base] - action["cost"] / weight)
-            for entry in filter(None, [*entries, truth.get("probability")]):
-                entry.setdefault(name, entry[base])
+        for action in extended["action"]:
+            _add_control_of_action(extended, action)
     except (KeyError, TypeError, ValueError, AttributeError):
         return table
-    return made
+    return extended
+
+
+def _add_control_of_action(table: Table, action: Mapping[str, Any]) -> None:
+    """Add a control, its reward and its probabilities for an action; those that exist stay."""
+    name = action["name"]
+    base_name = action["control"]
+    controls = {control["name"]: control for control in table["control"]}
+    if name not in controls:
+        title = action.get("title", "")
+        table["control"].append(controls[base_name] | {"name": name, "title": title})
+
+    rewards = table["rewards"]
+    # With a weight of 0 costs have no meaning; the schema refuses them.
+    weight = rewards.get("control_weight", 1.0) or 1.0
+    rewards["control"].setdefault(name, rewards["control"][base_name] - action["cost"] / weight)
+
+    transition = table["transition"]
+    truth = table.get("truth", {})
+    for values_by_control in (
+        transition.get("probability"),
+        transition.get("tables"),
+        truth.get("probability"),
+    ):
+        if values_by_control:
+            values_by_control.setdefault(name, values_by_control[base_name])
 
 
 class Learning(Section):
-    """What is learnt, each with its prior; everything else stays as the scenario says it."""
+    """What is learnt, each with its prior; everything else stays as the scenario states it."""
 
-    units: ClassVar[Mapping[str, str]] = {"gauge_gain": "percent", "gauge_offset": "microstrain"}
+    units: ClassVar[Mapping[str, str]] = {
+        "gauge_gain": "percent",
+        "gauge_offset": "microstrain",
+    }
     parameter: Flag = True
-    """The draws of the calibrated parameter keep their weights from step to step."""
+    """Whether the draws of the calibrated parameter keep their weights from step to step."""
     noise: Flag = True
-    """The noise scale of each sensor, about the standard deviation that is assumed."""
+    """Whether the noise scale of each sensor is learnt, about the assumed standard deviation."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
-    """How sure the assumed noise is: as if it came from so many observations, more than two."""
+    """Certainty of the assumed noise, as a number of observations, which is more than two."""
     gauge_gain: NotNegative | tuple[NotNegative, ...] = 0.0
     """Prior standard deviation of the relative gain error of each sensor; 0 is not learnt."""
     gauge_offset: NotNegative | tuple[NotNegative, ...] = 0.0
-    """Prior standard deviation of the offset of each sensor, in the unit of the sensors; 0 is not learnt."""
+    """Prior standard deviation of the offset of each sensor, in the unit of the sensors; 0 is not
+    learnt."""
     transition_factors: tuple[Positive, ...] = ()
-    """Factors on the probabilities to leave a state, equally probable at first; none is not learnt."""
+    """Factors on the probabilities to leave a state, equally probable at first; by default they are
+    not learnt."""
 
     def faults(self) -> Iterator[Fault]:
-        """Yield factors that do not increase, or are no choice."""
-        key, factors = "`learning.transition_factors`", self.transition_factors
-        yield any(b <= a for a, b in pairwise(factors)), f"{key} must increase, and {short(factors)} came"
-        yield len(factors) == 1, f"{key} needs two or more factors to choose from"
+        """Yield the possible faults, each with whether it is there: transition factors."""
+        factors = self.transition_factors
+        does_not_increase = any(second <= first for first, second in pairwise(factors))
+        listed = ", ".join(str(factor) for factor in factors)
+        yield does_not_increase, f"`learning.transition_factors` must increase, and {listed} came"
+        yield (
+            len(factors) == 1,
+            "`learning.transition_factors` needs two or more factors to choose from",
+        )
 
-    @property
-    def figures(self) -> list[tuple[str, object, list[dict[str, str]]]]:
-        """Groups of figures on what is learnt beside the parameter, whether it is, and their words."""
-        return [
-            ("learnt", self.transition_factors, [{"quantity": "transition_factor"}]),
-            ("learnt_of_sensors", self.noise, [{"quantity": "noise_scale"}]),
-            ("learnt_of_sensors", _any(self.gauge_offset), [{"quantity": "gauge_offset"}]),
-            ("learnt_of_sensors", _any(self.gauge_gain), [{"quantity": "gauge_gain"}]),
-        ]
+    def figure_groups(self) -> list[FigureGroup]:
+        """Return the groups of figures on what is learnt beside the parameter."""
+        groups = []
+        if self.transition_factors:
+            groups.append(FigureGroup("learnt", {"quantity": "transition_factor"}))
+        if self.noise:
+            groups.append(FigureGroup("learnt_of_sensors", {"quantity": "noise_scale"}))
+        if _has_positive(self.gauge_offset):
+            groups.append(FigureGroup("learnt_of_sensors", {"quantity": "gauge_offset"}))
+        if _has_positive(self.gauge_gain):
+            groups.append(FigureGroup("learnt_of_sensors", {"quantity": "gauge_gain"}))
+        return groups
 
 
-def _any(value: float | tuple[float, ...]) -> bool:
-    return any(number > 0.0 for number in (value if isinstance(value, tuple) else (value,)))
+def _has_positive(value: float | tuple[float, ...]) -> bool:
+    """Return whether a number, or one of several, is above zero."""
+    numbers = value if isinstance(value, tuple) else (value,)
+    return any(number > 0.0 for number in numbers)
 
 
-GAINS = 4
-"""Gain errors that are compared for each sensor."""
+GAINS_PER_SENSOR = 4
+"""Number of gain errors that notices compare for each sensor."""
 MOST_DRAWS = 15
-"""Draws of the parameter that are kept apart: evidence is compared, and no fine posterior is needed."""
-NUMBERS_BY_DEFAULT = 1_000_000
-"""Numbers of the beliefs about sensors up to which a scenario gives notices by itself: 0.1 s a step."""
+"""Largest number of draws of the parameter that notices distinguish: evidence is compared, and a
+fine posterior is not needed."""
+MOST_NUMBERS_BY_DEFAULT = 1_000_000
+"""Most numbers in the beliefs about sensors with which a scenario gives notices by default; they
+take 0.1 s a step."""
 _LARGEST_GAIN = 0.4
-"""The largest gain errors that are compared are two and a half times as large."""
+"""Largest `gauge_gain`: two and a half times as much is also compared, and a gain error of -1 or
+less makes no sense."""
 
 
 class Noticing(Section):
-    """When an alarm is raised; the belief is not touched, but by readings that are left out."""
+    """When an alarm is raised.
+
+    The belief stays as it is, except that implausible readings are left out.
+    """
 
     units: ClassVar[Mapping[str, str]] = {"gauge_gain": "percent", "all_gain": "percent"}
     threshold: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=1.0)] = 100.0
-    """Evidence from which an alarm is raised: a false one is at most so improbable, for each of two kinds."""
+    """Evidence that raises an alarm; the probability of a false alarm of each of the two kinds is
+    at most its inverse."""
     gauge_gain: Annotated[float, Field(strict=True, gt=0.0, le=_LARGEST_GAIN)] = 0.2
     """Gain error of a single sensor that is to be found; less than half of it raises no alarm."""
     all_gain: Annotated[float, Field(strict=True, gt=0.0, le=1.0)] = 0.1
-    """Prior standard deviation of the gains of sensors that have one, where no state explains all of them."""
+    """Prior standard deviation of the gain error of each sensor under the hypothesis that no state
+    explains all sensors."""
     memory_steps: Positive = 20.0
     """Steps after which what was learnt of these gains has faded to 1 / e."""
     onset_steps: Positive = 50.0
-    """Steps within which half of the faults begin that were not there from the start."""
+    """Steps within which half of the faults begin that did not exist from the start."""
     absurd_deviations: Annotated[float, Field(strict=True, allow_inf_nan=False, ge=3.0)] = 8.0
-    """A reading so many assumed standard deviations beyond what any state can show is left out."""
+    """A reading is left out if it is so many assumed standard deviations beyond the readings of all
+    states."""
     prior: Annotated[float, Field(strict=True, gt=0.0, lt=0.5)] = 0.01
     """Prior probability of each of the two kinds of fault, for their posterior."""
     noise_degrees: Annotated[float, Field(strict=True, allow_inf_nan=False, gt=2.0)] = 10.0
-    """How sure the assumed noise is: as if it came from so many observations, more than two."""
+    """Certainty of the assumed noise, as a number of observations, which is more than two."""
 
 
-NoticingOrNot = Annotated[Noticing | None, BeforeValidator(lambda given: None if given is False else given)]
+def _none_for_false(value: object) -> object:
+    """Return None for `false`, and anything else as it is."""
+    return None if value is False else value
+
+
+NoticingOrNot = Annotated[Noticing | None, BeforeValidator(_none_for_false)]
 """The table, or `notice = false`."""
 
 
 class WatchSection(FileSection):
     """How a real asset is watched."""
 
-    kept: ClassVar[Mapping[str, str]] = {"observations": ""}  # a run folder has no copy
+    copy_paths: ClassVar[Mapping[str, str]] = {"observations": ""}  # a run folder has no copy
     observations: str | None = None
-    """A recorded file that is watched where nothing else is given, or the name of a shipped one."""
+    """A recorded file that is watched by default, or the name of a shipped one."""
     lag: Count = 50
-    """Steps back over which the twin smooths, and which a message may be late."""
+    """Steps back over which the twin smooths; a message may be as late."""
     longest_gap: Count = 1000
-    """Steps that a message may be ahead of the next one; those between are predicted through."""
+    """Steps that a message may be ahead of the next one; the twin predicts those between."""
     seconds_per_step: Positive | None = None
-    """Of messages that have a time in the place of a step."""
+    """Length of a step, for messages that have a time and no step [s]."""
     time_unit: Literal["s", "ms", "us", "ns"] = "s"
-    """Of the times of messages."""
+    """Unit of the times of messages."""
     allow_unknown: bool = False
-    """Keys and columns that are no sensor are passed over, and not refused."""
+    """Whether keys and columns that name no sensor are passed over instead of refused."""
     quiet_after_seconds: Positive | None = None
-    """Without a step for so long, a notice says that the last decision grows old."""
+    """Time without a step after which a notice says that the last decision grows old [s]."""
 
     @property
     def recording(self) -> Path | None:
-        """The recorded file."""
-        return self.all_files().get("")
+        """The recorded file; None if the scenario names none."""
+        return self.all_files().get(self.copy_paths["observations"])

@@ -179,7 +179,7 @@ def _true_value(scenario: Scenario, name: str) -> Float | None:
         return None
     if name == "noise_scale":
         return _true_noise_scale(scenario)
-    if name in ("gauge_gain", "gauge_offset") and not scenario.another_model:
+    if name in ("gauge_gain", "gauge_offset") and not scenario.models_differ:
         return _true_gauge_error(scenario)
     return None
 
@@ -203,7 +203,7 @@ def _true_gauge_error(scenario: Scenario) -> Float:
     error = np.zeros(sensors)
     for fault in scenario.truth.sensor_faults:
         if fault.kind == "drift":
-            error[fault.places(sensors)] = np.nan
+            error[fault.sensor_indices(sensors)] = np.nan
     return error
 
 

@@ -14,8 +14,9 @@ from reporting.table_file import table_text
 from twin_master.learning.expectation import Expected, joined
 from twin_master.mission.residuals import expected_ahead, expected_in_steps
 from twin_master.mission.steps import SensorStatus, Truth
+from twin_master.scenario.observation import ObservationSection
 from twin_master.scenario.schema import REWARD_NAMES
-from twin_master.scenario.section import ObservationSection, printed_state
+from twin_master.scenario.section import printed_state
 from twin_master.store.mission_result import MOMENTS, SCHEMA, SEVERAL_UNITS, MissionResult
 
 SchemaFields = Mapping[str, str]

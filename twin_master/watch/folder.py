@@ -13,7 +13,7 @@ from reporting.arrays import Float
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_bytes, hash_record
 from reporting.progress import Progress
-from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibrated_with
+from twin_master.assets.asset_source import AssetSource, FlownAndBelieved, calibration_sentence
 from twin_master.assets.resolution import believed_source
 from twin_master.errors import MissionInputError, said
 from twin_master.mission.decision_record import decision_from_line
@@ -105,7 +105,7 @@ class Watch:
         with self._progress.stage("Calibrating and planning"):
             knowledge = prepare_knowledge(self.scenario, self._source, self.scenario.mission.seed)
         origin = self._source.origin.model
-        told = calibrated_with(knowledge.draws.record or {}, WATCHED, origin, self._inputs)
+        told = calibration_sentence(knowledge.draws.record or {}, WATCHED, origin, self._inputs)
         if told is not None:
             self._progress.note(told)
         own = getattr(self.scenario.belief, "patch", None)

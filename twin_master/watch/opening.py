@@ -14,8 +14,8 @@ from reporting.progress import Progress, SilentProgress
 from twin_master import run_folder
 from twin_master.assets.resolution import (
     Overrides,
+    as_overrides,
     believed_source,
-    given_overrides,
     resolve_scenario,
 )
 from twin_master.errors import MissionInputError, NotResumableError, said
@@ -113,7 +113,7 @@ def flown(folder: Path, first: int | None, last: int | None, progress: Progress)
         shutil.copytree(folder / "asset", copy / "asset")
         with (folder / JOURNAL_NAME).open("rb") as journal:
             (copy / JOURNAL_NAME).write_bytes(journal.read(end))
-        Watch(copy, config, run_folder.read_scenario(folder).moved(copy), progress).store(
+        Watch(copy, config, run_folder.read_scenario(folder).with_paths_from(copy), progress).store(
             Counts(), report=False
         )
         yield copy
@@ -241,7 +241,7 @@ def watch(
         With one clear sentence; what was observed is kept.
     """
     loaded = None if scenario is None else load_scenario(scenario)
-    given, progress = given_overrides(overrides), progress or SilentProgress()
+    given, progress = as_overrides(overrides), progress or SilentProgress()
     patch = None if model_patch is None or from_step is None else (Path(model_patch), from_step)
     if (model_patch, from_step) != (None, None) and (patch is None or not resume):
         raise MissionInputError("--model-patch and --from-step go together, with --resume.")
@@ -287,10 +287,10 @@ def _read(
     """Return the folder of a watch, and the scenario by which observations are read."""
     if loaded is None:
         folder = Path(str(folder))
-        scenario = run_folder.read_scenario(folder).moved(folder)
+        scenario = run_folder.read_scenario(folder).with_paths_from(folder)
     else:
         folder = Path("runs", loaded.scenario.mission.name) if folder is None else Path(folder)
-        scenario = loaded.scenario.moved(loaded.path.parent)
+        scenario = loaded.scenario.with_paths_from(loaded.path.parent)
     if allow_unknown:
-        scenario = scenario.having("watch", allow_unknown=True)
+        scenario = scenario.with_changes("watch", allow_unknown=True)
     return folder, scenario

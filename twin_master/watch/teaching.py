@@ -67,7 +67,7 @@ def patched_model(
     """
     if not isinstance(scenario.belief, DesignBelief):
         raise MissionInputError("only a twin that believes a design can be given a patch of its model.")
-    scenario = scenario.having("belief", patch=str(file))
+    scenario = scenario.with_changes("belief", patch=str(file))
     source: AssetSource = scenario.belief.source(scenario, None)
     return BelievedModel(from_step, prepare_without_folder(scenario, source, progress), file)
 

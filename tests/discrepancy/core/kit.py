@@ -142,15 +142,17 @@ class Linear:
 
     def point(self, x) -> Point:
         """Return the point of a vector: shared, effect, then local unknowns."""
-        q, e = self.problem.shared.size, self.candidate.size
-        ends = np.cumsum([data.unknowns.size for data in self.problem.trials])
+        q, e = self.problem.shared.unknown_count, self.candidate.parameter_count
+        ends = np.cumsum([data.unknowns.unknown_count for data in self.problem.trials])
         return Point(x[:q], tuple(np.split(x[q + e :], ends[:-1])), x[q : q + e])
 
     @property
     def precision(self):
         """Prior precisions in the order of `point`."""
         local = [data.unknowns.precision for data in self.problem.trials]
-        return np.concatenate((self.problem.shared.precision, np.ones(self.candidate.size), *local))
+        return np.concatenate(
+            (self.problem.shared.precision, np.ones(self.candidate.parameter_count), *local)
+        )
 
     @property
     def size(self) -> int:
@@ -161,15 +163,16 @@ class Linear:
         """Return all residuals, those that do not count left out."""
         point, parts = self.point(x), []
         for number, data in enumerate(self.problem.trials):
-            response = self.problem.response_with(number, point, self.candidate)
-            parts.append(self.problem.residual(number, point, response)[data.weight > 0.0])
+            response = self.problem.response_of_candidate(number, point, self.candidate)
+            parts.append(self.problem.standardised_residual(number, point, response)[data.weight > 0.0])
         return np.concatenate(parts)
 
     @property
     def groups(self):
         """Channel of each residual."""
         return np.concatenate([
-            np.broadcast_to(data.groups, data.weight.shape)[data.weight > 0.0] for data in self.problem.trials
+            np.broadcast_to(data.channel_indices, data.weight.shape)[data.weight > 0.0]
+            for data in self.problem.trials
         ])  # fmt: skip
 
     def dense(self):
@@ -211,13 +214,13 @@ def closed_problem(
     bare = Campaign("closed form", channels, trials, None, dict(parameters or {}), "")
     model = ClosedForm(bent)
     problem = problem_of(bare, model)
-    shared = generator.standard_normal(problem.shared.size) * (problem.shared.precision > 0.0)
+    shared = generator.standard_normal(problem.shared.unknown_count) * (problem.shared.precision > 0.0)
     measured = []
     for number, data in enumerate(problem.trials):
-        local = [np.zeros(item.unknowns.size) for item in problem.trials]
-        local[number] = generator.standard_normal(data.unknowns.size)
+        local = [np.zeros(item.unknowns.unknown_count) for item in problem.trials]
+        local[number] = generator.standard_normal(data.unknowns.unknown_count)
         if not at_rest and data.trial.release is not None:
-            local[number][data.unknowns.zeros :] *= 0.3
+            local[number][data.unknowns.zero_count :] *= 0.3
         patch = ModelPatch((RunOffset("A", effect, channel="y1", quantity=""),) if effect else ())
         response, _ = problem.response(number, shared, local[number], patch)
         values = problem.prediction(number, Point(shared, tuple(local), np.empty(0)), response)
@@ -249,7 +252,7 @@ def with_noise(problem: Problem, **records: NoiseRecord | None) -> Problem:
 def fitted(problem: Problem, *terms: EffectTerm, **given) -> CandidateFit:
     """Return the fit of some terms, from the start that the problem has for them."""
     candidate = Candidate(terms)
-    return fit(problem, candidate, problem.start(candidate), **given)
+    return fit(problem, candidate, problem.prior_mean_point(candidate), **given)
 
 
 # ---------------------------------------------------------------- the lumped chain

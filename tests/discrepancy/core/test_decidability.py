@@ -221,9 +221,9 @@ def test_proposals_are_trials_of_the_kinds_that_were_done():
     assert oscillates(problem, none)
     decay = tuple(
         replace(part, response=np.exp(-data.trial.time)[:, np.newaxis] * np.ones(part.response.shape[1]))
-        for data, part in zip(problem.trials, none.linearisations, strict=True)
+        for data, part in zip(problem.trials, none.trial_derivatives, strict=True)
     )
-    assert not oscillates(problem, replace(none, linearisations=decay))
+    assert not oscillates(problem, replace(none, trial_derivatives=decay))
     names = [item.trial.name for item in proposals(problem, swings=False)]
     assert names
     assert "longer record" not in names
@@ -266,7 +266,7 @@ def test_simulated_campaigns_have_the_noise_and_the_nuisances_of_the_real_one():
         assert np.array_equal(again, drawn.trials[-1].values)
         # sixth differences of a slow motion hold noise alone: variance times the sum of squared binomials
         sixth = np.diff(drawn.trials[-1].values[:, 0], 6)
-        noise = simulator.problem.noise[drawn.trials[-1].channels[0]].standard_deviation
+        noise = simulator.problem.noise_models[drawn.trials[-1].channels[0]].standard_deviation
         squares.append(float(np.mean(sixth**2)) / 924.0 / noise**2)
     assert np.mean(squares) == pytest.approx(1.0, abs=0.12)
 

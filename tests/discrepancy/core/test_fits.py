@@ -15,7 +15,7 @@ from discrepancy.catalogue.effect_file import effects_of_file
 from discrepancy.catalogue.entry import Prior
 from discrepancy.errors import DiscrepancyError, FitError
 from discrepancy.fits.candidate import Candidate, EffectTerm
-from discrepancy.fits.fitting import attempt, fit
+from discrepancy.fits.fitting import fit, try_fit
 from discrepancy.fits.normal_equations import cholesky_factor
 from discrepancy.fits.predictive import residual_set
 from discrepancy.verdict import VerdictKind
@@ -45,17 +45,17 @@ def check(problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):
     linear = kit.Linear(problem, candidate)
     x = spread * np.random.default_rng(1).standard_normal(linear.size)
     if effect is not None:
-        x[problem.shared.size : problem.shared.size + candidate.size] = effect
+        x[problem.shared.unknown_count : problem.shared.unknown_count + candidate.parameter_count] = effect
     point = linear.point(x)
     steps = STEP * np.eye(linear.size)
     numerical = np.stack([(linear.residual(x - e) - linear.residual(x + e)) / (2.0 * STEP) for e in steps])
     columns = np.zeros_like(numerical)
-    at, first = 0, problem.shared.size + candidate.size
+    at, first = 0, problem.shared.unknown_count + candidate.parameter_count
     for number, data in enumerate(problem.trials):
         parts = problem.linearise(number, point, candidate)
         found, index = problem.prediction_derivatives(number, point, parts, candidate)
-        rows = data.standardised(found).reshape(len(found), -1)
-        local, shared = np.split(rows, [data.unknowns.size])
+        rows = data.standardise(found).reshape(len(found), -1)
+        local, shared = np.split(rows, [data.unknowns.unknown_count])
         counts = (data.weight > 0.0).ravel()
         assert np.all(local[:, ~counts] == 0.0)
         assert np.all(shared[:, ~counts] == 0.0)
@@ -65,7 +65,9 @@ def check(problem, candidate, effect=None, tolerance=TOLERANCE, spread=0.5):
         at, first = stop, first + len(local)
     limits = np.full(linear.size, tolerance)
     if tolerance == TOLERANCE:
-        limits[problem.shared.size : problem.shared.size + candidate.size] = CENTRAL
+        limits[problem.shared.unknown_count : problem.shared.unknown_count + candidate.parameter_count] = (
+            CENTRAL
+        )
     for number, (have, want) in enumerate(zip(columns, numerical, strict=True)):
         error = np.linalg.norm(have - want)
         assert error <= limits[number] * np.linalg.norm(want) + 1e-9, f"unknown {number}: {error}"
@@ -80,7 +82,7 @@ def test_derivatives_by_all_unknowns_of_the_closed_form(at_rest, noise):
         left_out={0: ((2, 1),), 2: ((0, 0), (30, 2), (59, 1))}, samples=80,
     )  # fmt: skip
     applies = noise.samples is not None
-    assert all(problem.noise[name].applies(0.01) is applies for name in problem.channel_names)
+    assert all(problem.noise_models[name].applies(0.01) is applies for name in problem.channel_names)
     check(problem, BOTH)
 
 
@@ -88,7 +90,7 @@ def test_derivatives_by_all_unknowns_of_the_closed_form(at_rest, noise):
 def test_derivatives_by_an_effect_on_the_chain(free, tolerance):
     """A law of speed, and its exponent."""
     candidate = Candidate((EffectTerm(kit.chosen("quadratic_damping")[0], "end", free_shape=free),))
-    about, spread = (candidate.start() + 0.1, 0.2) if free else (0.3, 0.3)
+    about, spread = (candidate.start_values() + 0.1, 0.2) if free else (0.3, 0.3)
     check(kit.BENCH.problem(1), candidate, effect=about, spread=spread, tolerance=tolerance)
 
 
@@ -103,7 +105,8 @@ def test_samples_that_do_not_count_change_nothing():
     point = linear.point(0.3 * np.random.default_rng(0).standard_normal(linear.size))
     for number in range(len(problem.trials)):
         first, second = (
-            p.residual(number, point, p.response_with(number, point, Candidate())) for p in (problem, other)
+            p.standardised_residual(number, point, p.response_of_candidate(number, point, Candidate()))
+            for p in (problem, other)
         )
         np.testing.assert_allclose(first, second, atol=1e-9)
     # nor are they counted as residuals of nought
@@ -154,17 +157,19 @@ def test_evidence_mean_covariance_and_leverage_are_the_gaussian_ones(terms, zero
     y, a, hessian = linear.dense()
     mean, covariance = np.linalg.solve(hessian, a.T @ y), np.linalg.inv(hessian)
     x = np.concatenate((found.point.shared, found.point.effect, *found.point.local))
-    shared = problem.shared.size + len(terms)
+    shared = problem.shared.unknown_count + len(terms)
     assert found.converged
     # a fit ends where a step promises less than CONVERGED, 0.01 nats
     assert float((x - mean) @ hessian @ (x - mean)) < 0.02
     np.testing.assert_allclose(found.covariance, covariance[:shared, :shared], rtol=1e-6, atol=1e-12)
     leverage = np.einsum("ni,ij,nj->n", a, covariance, a)
-    np.testing.assert_allclose(found.spent, np.bincount(linear.groups, leverage, minlength=3), rtol=1e-8)
-    assert found.spent.sum() == pytest.approx(
+    np.testing.assert_allclose(
+        found.absorbed_freedom, np.bincount(linear.groups, leverage, minlength=3), rtol=1e-8
+    )
+    assert found.absorbed_freedom.sum() == pytest.approx(
         linear.size - covariance.diagonal() @ linear.precision, rel=1e-8
     )
-    assert problem.counts.sum() == len(leverage)
+    assert problem.sample_counts.sum() == len(leverage)
     if zeros == inf:  # free zeros are least squares; their evidence is beside another hypothesis' only
         assert 0.0 in linear.precision
         return
@@ -198,7 +203,7 @@ def test_evidence_with_unknown_variance_against_quadrature(freedom):
 
     def log_joint(u):
         x = np.zeros(linear.size)
-        x[problem.shared.size] = u
+        x[problem.shared.unknown_count] = u
         sums = np.bincount(linear.groups, linear.residual(x) ** 2, minlength=3)
         return -problem.misfit(sums) - 0.5 * u * u - 0.5 * log(2.0 * pi)
 
@@ -249,11 +254,11 @@ def problem():
 @settings(max_examples=12, deadline=None)
 def test_a_fit_ends_with_finite_numbers_or_a_sentence(problem, u, coefficient, reference, iterations):
     candidate = Candidate((softening(coefficient, reference),))
-    start = replace(problem.start(candidate), effect=np.array([u]))
+    start = replace(problem.prior_mean_point(candidate), effect=np.array([u]))
     try:
         found = fit(problem, candidate, start, iterations=iterations)
     except DiscrepancyError:
-        assert attempt(problem, candidate, start, iterations=iterations) is None
+        assert try_fit(problem, candidate, start, iterations=iterations) is None
         assert problem.refusals["ninth_power"].endswith(".")
         return
     assert np.isfinite(found.log_evidence)

@@ -211,7 +211,7 @@ def test_what_all_probable_sets_hold_is_named_and_what_does_not_fit_is_no_part_o
     places = {"coulomb_friction": "joint", "load_cell": "", "gauge_gain": "g1"}
     friction, cell, gain = (EffectTerm(kit.chosen(key)[0], place) for key, place in places.items())
     for terms in ((cell,), (friction, gain), (cell, gain)):
-        found.record(kit.fitted(problem, *terms), exact=True)
+        found.record_fit(kit.fitted(problem, *terms), exact=True)
     right, more = ("coulomb_friction",), Candidate((friction, gain)).identifiers
     outcome = Case(found, {more: 0.7, right: 0.3}).common_effects()
     assert outcome[0].kind is VerdictKind.NAMED
@@ -257,7 +257,7 @@ def test_coloured_noise_with_a_short_record_is_no_gap(seed):
 
 def share_of(after, gap, noise):
     """Return the share that a law is of a gap, by what is left of it, in trials that were held out."""
-    return GapShare(noise + gap, after, noise, True, 4, 1.0, 2.0, OF_READINGS, tested=True)
+    return GapShare(noise + gap, after, noise, True, 4, 1.0, 2.0, OF_READINGS, is_tested=True)
 
 
 def test_shares_and_their_interval():

@@ -12,7 +12,7 @@ from discrepancy.campaign.records import NoiseRecord
 from discrepancy.fits.candidate import Candidate, EffectTerm, Point, ResidualProcess
 from discrepancy.fits.fitting import fit
 from discrepancy.fits.gates import (
-    SHAPE_GAIN,
+    LEAST_SHAPE_GAIN,
     absolute_fit_tests,
     check_absolute_fit,
     check_shape,
@@ -23,7 +23,7 @@ from discrepancy.fits.screening import Screen
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.location.locate import locate
 from discrepancy.search.starts import best_pairs
-from discrepancy.search.wide_noise import refit_under_wide_noise, residual_process_of, with_wide_noise
+from discrepancy.search.wide_noise import estimate_residual_process, refit_under_wide_noise, with_wide_noise
 from discrepancy.workflow import patch_draws
 from fe.runtime.patch import ModelPatch, RunOffset
 
@@ -39,21 +39,23 @@ def test_pairs_and_gains_are_those_of_fits():
         EffectTerm(kit.offset_effect(deviation=10.0), "y1"),
         EffectTerm(kit.drift_effect(deviation=10.0), "y1"),
     )
-    changes = [next(iter(screen.changes(term))) for term in terms]
-    ((misfit, first, second),) = best_pairs(changes, screen.sign)
+    changes = [next(iter(screen.changes_on_grid(term))) for term in terms]
+    ((misfit, first, second),) = best_pairs(changes, screen.inner_product_signs)
     found = kit.fitted(problem, *terms)
     assert none.objective - found.objective == pytest.approx(-misfit, rel=0.02, abs=0.05)
-    start = np.concatenate((first.best, second.best))
+    start = np.concatenate((first.best_values, second.best_values))
     np.testing.assert_allclose(start, found.point.effect, rtol=0.03, atol=1e-3)
     same = replace(changes[0], term=terms[1])
     assert (
-        best_pairs([changes[0], changes[0]], screen.sign) == best_pairs([changes[0], same], screen.sign) == []
+        best_pairs([changes[0], changes[0]], screen.inner_product_signs)
+        == best_pairs([changes[0], same], screen.inner_product_signs)
+        == []
     )
     for term, change in zip(terms, changes, strict=True):
         found = kit.fitted(problem, term)
         prior = 0.5 * float(found.point.effect @ found.point.effect)
         assert none.objective - found.objective + prior == pytest.approx(change.gain, rel=0.02, abs=0.03)
-        assert change.best[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
+        assert change.best_values[0] == pytest.approx(found.point.effect[0], rel=0.02, abs=1e-4)
 
 
 def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
@@ -61,8 +63,8 @@ def test_a_further_mode_is_tried_where_what_is_left_has_its_peak():
     line = 0.1 * np.cos(2.0 * np.pi * 7.0 * 0.01 * np.arange(200))
     problem = kit.closed_problem(kinds=("ringdown",), samples=200, extra=lambda rows: line)
     (mode,) = kit.chosen("unmodelled_mode")
-    change = next(Screen(problem, kit.fitted(problem)).changes(EffectTerm(mode, "y1")))
-    assert mode.parameters[0].prior.value(change.start[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
+    change = next(Screen(problem, kit.fitted(problem)).changes_on_grid(EffectTerm(mode, "y1")))
+    assert mode.parameters[0].prior.value(change.effect_values[0]) == pytest.approx(7.0 / 3.0, rel=0.01)
 
 
 @pytest.mark.parametrize(
@@ -82,9 +84,9 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
     draws, rejected, of_one = 120 if gap else 300, 0, []
     for _ in range(draws):
         scale = 1.0 if freedom == inf else generator.chisquare(freedom, 3) / freedom
-        sums = (1.0 + gap) * generator.chisquare(problem.counts - found.spent) / scale
+        sums = (1.0 + gap) * generator.chisquare(problem.sample_counts - found.absorbed_freedom) / scale
         residuals = tuple(generator.standard_normal(r.shape) for r in found.residuals)
-        drawn = replace(found, sums=sums, residuals=residuals)
+        drawn = replace(found, squares_by_channel=sums, residuals=residuals)
         rejected += check_absolute_fit(problem, drawn).passed is False
         of_one.append(absolute_fit_tests(problem, drawn)[0][1])
     assert gap or kstest(of_one, "uniform").pvalue > 1e-3
@@ -93,8 +95,10 @@ def test_absolute_gate_has_its_level_and_its_power(freedom, kinds, samples, gap)
     assert rejected > 112 if gap else rejected <= binom.isf(1e-3, draws, 1e-3)
     wide = ResidualProcess(np.zeros(3), np.full(3, 2.0), *np.zeros((2, 3)), np.ones(3, dtype=bool))
     told = dict(absolute_fit_tests(problem, replace(found, residual_process=wide)))["variance of y1"]
-    count = problem.counts[0] - found.spent[0]
-    assert told == pytest.approx(variance_p_value(found.sums[0] / count, count / 4.0, freedom / 4.0))
+    count = problem.sample_counts[0] - found.absorbed_freedom[0]
+    assert told == pytest.approx(
+        variance_p_value(found.squares_by_channel[0] / count, count / 4.0, freedom / 4.0)
+    )
 
 
 @pytest.mark.parametrize("spread", [0.01, 1.0])
@@ -136,7 +140,7 @@ def test_without_a_record_nothing_absolute_is_said_but_of_colour():
 def test_shape_gate_compares_evidence():
     problem = kit.closed_problem(seed=1)
     found = kit.fitted(problem, EffectTerm(kit.offset_effect(), "y1"))
-    for gain, passes in ((-3.0, True), (SHAPE_GAIN - 0.01, True), (SHAPE_GAIN + 0.01, False)):
+    for gain, passes in ((-3.0, True), (LEAST_SHAPE_GAIN - 0.01, True), (LEAST_SHAPE_GAIN + 0.01, False)):
         gate = check_shape(found, replace(found, log_evidence=found.log_evidence + gain))
         assert gate.passed is passes
         assert gate.statistic == pytest.approx(gain)
@@ -257,7 +261,9 @@ def test_held_out_trials_move_nothing_that_is_shared():
     np.testing.assert_array_equal(found.point.shared, other.point.shared)
     assert found.log_evidence == other.log_evidence
     there = problem.with_trials(problem.campaign.held_out)
-    start = Point(found.point.shared, tuple(np.zeros(d.unknowns.size) for d in there.trials), np.empty(0))
+    start = Point(
+        found.point.shared, tuple(np.zeros(d.unknowns.unknown_count) for d in there.trials), np.empty(0)
+    )
     adapted = fit(there, Candidate(), start, local_only=True)
     np.testing.assert_array_equal(adapted.point.shared, found.point.shared)
     assert any(np.any(u != 0.0) for u in adapted.point.local)
@@ -266,8 +272,10 @@ def test_held_out_trials_move_nothing_that_is_shared():
     for number, data in enumerate(there.trials):
         parts = there.linearise(number, start, Candidate())
         columns, index = there.prediction_derivatives(number, start, parts, Candidate())
-        local, shared = np.split(data.standardised(columns).reshape(len(columns), -1), [data.unknowns.size])
-        residual = there.residual(number, start, parts.response).ravel()
+        local, shared = np.split(
+            data.standardise(columns).reshape(len(columns), -1), [data.unknowns.unknown_count]
+        )
+        residual = there.standardised_residual(number, start, parts.response).ravel()
         taken = np.linalg.solve(local @ local.T + np.diag(data.unknowns.precision), local)
         np.testing.assert_allclose(adapted.point.local[number], taken @ residual, atol=0.02)
         # what is left varies by what is shared, less what they took
@@ -284,7 +292,7 @@ def ringing(seed, samples, extra=None, **given):
     """Return ring-downs with something added to the first channel, and what their fit leaves."""
     problem = kit.closed_problem(seed=seed, kinds=("ringdown",), samples=samples, extra=extra, **given)
     none = kit.fitted(problem)
-    return problem, none, residual_process_of(problem, none)
+    return problem, none, estimate_residual_process(problem, none)
 
 
 def covariance(time, size, tau, frequency):
@@ -359,7 +367,7 @@ def test_colour_of_the_noise_is_no_gap_where_stamps_are_uneven_and_it_stays():
         found = kit.fitted(problem)
         wrong[0] += (
             check_absolute_fit(
-                problem, replace(found, residual_process=residual_process_of(problem, found))
+                problem, replace(found, residual_process=estimate_residual_process(problem, found))
             ).passed
             is False
         )

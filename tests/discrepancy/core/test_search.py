@@ -123,7 +123,7 @@ def test_an_effect_of_a_set_that_fails_is_tried_at_its_other_places():
     friction, gain = kit.chosen("coulomb_friction", "gauge_gain")
     wrong = kit.fitted(problem, EffectTerm(friction, "end"), EffectTerm(gain, "g1"))
     search = Search(problem, (friction, gain), kit.fitted(problem))
-    search.record(wrong, exact=True)
+    search.record_fit(wrong, exact=True)
     assert search.best() is wrong
     search.move_effects()
     assert set(search.best().candidate.key) == {("coulomb_friction", "joint"), ("gauge_gain", "g1")}

@@ -61,10 +61,10 @@ def test_a_right_pendulum_is_found_with_nothing_missing_from_unknown_beginnings(
 
 def test_beginnings_are_taken_from_the_first_readings_where_a_fit_from_rest_fails():
     problem = kit.problem_of(swings(far=2.2), PENDULUM)
-    start = problem.start(Candidate())
+    start = problem.prior_mean_point(Candidate())
     start = replace(start, shared=np.array([1.5, 0.5]))  # the parameters are those of the readings
     from_rest = fit(problem, Candidate(), start, local_only=True)
-    count = float(problem.counts.sum())
+    count = float(problem.sample_counts.sum())
     assert from_rest.chi_square > 1e3 * count
     assert refit_from_first_readings(problem, from_rest, local_only=True).chi_square < 1.2 * count
 
@@ -128,7 +128,7 @@ def test_a_model_that_is_not_fitted_gives_no_evidence_of_a_force():
 def test_parameters_that_the_model_moves_beyond_two_deviations_are_named_with_their_figures():
     model = held_by_a_spring(stiffness=0.004, damping=0.2)
     problem = kit.problem_of(pushed(model, (1.03, 1.0)), model)
-    none = fit(problem, Candidate(), problem.start(Candidate()))
+    none = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
     (moved,) = moved_unknowns(problem, none)
     assert moved.name == "stiffness"
     assert moved.deviations == pytest.approx((moved.value - moved.stated) / moved.deviation)
@@ -247,7 +247,7 @@ def test_a_hypothesis_with_which_the_error_grows_is_not_named():
     verdict, fit_of_name = found.verdict, found.fit
     assert verdict.kind is VerdictKind.NAMED
     candidate = fit_of_name.candidate
-    values = candidate.stepped(fit_of_name.effect, np.full(candidate.size, 4.0))
+    values = candidate.add_step(fit_of_name.effect, np.full(candidate.parameter_count, 4.0))
     worse = fit(found.problem, candidate, replace(fit_of_name.point, effect=values), iterations=0)
     outcome = checked_verdict(VerdictOutcome(verdict, found.search, worse))
     assert outcome.verdict.kind is VerdictKind.UNEXPLAINED

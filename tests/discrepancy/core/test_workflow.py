@@ -274,9 +274,9 @@ def test_a_moment_that_is_a_parameter_is_found_within_one_percent(campaign):
     problem = kit.problem_of(replace(campaign, trials=campaign.trials[:1], events=()), MODEL)
     term = EffectTerm(effect, "slide")
     candidate = Candidate((term,))
-    start = replace(problem.start(candidate), effect=np.array([0.0, 0.8]))
+    start = replace(problem.prior_mean_point(candidate), effect=np.array([0.0, 0.8]))
     found = fit(problem, candidate, start)
-    values = term.values(found.point.effect)
-    assert found.chi_square < 1.3 * float(problem.counts.sum())
+    values = term.physical_values(found.point.effect)
+    assert found.chi_square < 1.3 * float(problem.sample_counts.sum())
     assert abs(values["moment"] - 4.137) < 0.01 * 8.0
     assert values["size"] == pytest.approx(0.4, rel=0.03)

@@ -6,7 +6,7 @@ import pytest
 from discrepancy.estimation.effects import EffectLaws
 from discrepancy.estimation.estimator import EstimatorStart, MotionEstimator
 from discrepancy.estimation.linearised import Trajectory
-from discrepancy.estimation.refinement import adjustable_laws, refined
+from discrepancy.estimation.refinement import refine_hypotheses, unknowns_of_model_laws
 from discrepancy.fits.candidate import Candidate
 from discrepancy.missing_force.naming import ForceSearch
 from tests.discrepancy.missing_force.test_force import CART, CART_IN_AIR, available, blind
@@ -21,11 +21,14 @@ def friction(tmp_path_factory):
 
 def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):
     search = ForceSearch(blind(tmp_path, CART_IN_AIR))
-    seen = search.whole
-    trials = tuple(seen.view.trials)
-    nothing = EffectLaws(search.columns, trials, Candidate(), search.own_laws, adjustable_laws(search))
+    seen = search.hypothesis_of_all_ports
+    trials = tuple(seen.linear_trials.trials)
+    nothing = EffectLaws(
+        search.column_builder, trials, Candidate(), search.evaluate_model_laws, unknowns_of_model_laws(search)
+    )
     trajectories = tuple(
-        Trajectory(motion.added, motion.positions, motion.speeds, motion.forces) for motion in seen.motions
+        Trajectory(motion.added_state, motion.positions, motion.speeds, motion.forces)
+        for motion in seen.motions
     )
     estimator = MotionEstimator(
         trials, search.problem.shared.precision, search.prior_processes(seen.processes)
@@ -35,12 +38,12 @@ def test_without_a_law_it_is_the_missing_force_as_it_was_seen(tmp_path):
     assert found.log_evidence == pytest.approx(seen.log_evidence, abs=0.05)
     for one, motion in zip(found.trials, seen.motions, strict=True):
         scale = np.abs(motion.forces[0]).max()
-        np.testing.assert_allclose(one.missing[0], motion.forces[0], atol=0.02 * scale)
+        np.testing.assert_allclose(one.missing_forces[0], motion.forces[0], atol=0.02 * scale)
 
 
 def test_friction_that_ends_a_motion_leads_over_a_free_exponent(friction):
     search, effects = friction
-    followed = search.name(effects)
+    followed = search.rank_hypotheses(effects)
     assert followed[0].candidate.identifiers != ("coulomb_friction",)  # along a motion taken as known
-    ranked = refined(search, followed, len(effects))
+    ranked = refine_hypotheses(search, followed, len(effects))
     assert ranked[0].candidate.identifiers == ("coulomb_friction",)

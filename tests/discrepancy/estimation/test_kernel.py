@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
 
-from discrepancy.estimation.kernel import filter_record, smooth_record, step_matrices
-from discrepancy.estimation.linearised import push_matrices
+from discrepancy.estimation.kernel import filter_record, smooth_record, substep_matrices_with_laws
+from discrepancy.estimation.linearised import input_matrices
 
 PARTS, SAMPLES, STATES, CHANNELS, WIDTH = 2, 6, 3, 2, 3
 STAMPS = PARTS * (SAMPLES - 1) + 1
@@ -84,8 +84,8 @@ def test_a_linear_law_in_the_steps_is_of_second_order_in_their_length():
     errors = []
     for count in (8, 16):
         length = np.array([1.0 / count])
-        begin, end = push_matrices(generator, length)
-        transition, _ = step_matrices(
+        begin, end = input_matrices(generator, length)
+        transition, _ = substep_matrices_with_laws(
             count,
             np.zeros(2, dtype=np.int64),
             expm(generator * length)[None],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from discrepancy.estimation.laws import force_along
+from discrepancy.estimation.laws import force_and_tangents
 from fe.runtime.patch import PowerDamping, PowerStiffness
 
 TIME = np.linspace(0.0, 2.0, 401)
@@ -25,11 +25,11 @@ def damping(velocity_exponent, displacement_exponent=0.0):
 @pytest.mark.parametrize("law", [CUBIC, damping(2.0), damping(1.0, 1.0)], ids=["cubic", "drag", "by both"])
 def test_tangents_are_the_derivatives_of_the_force(law):
     step = 1e-6
-    along = force_along(law, TIME, POSITIONS, SPEEDS, 1e-4)
+    along = force_and_tangents(law, TIME, POSITIONS, SPEEDS, 1e-4)
     changes = []
     for by_position, by_speed in ((1.0, 0.0), (0.0, 1.0)):
         ends = [
-            force_along(
+            force_and_tangents(
                 law, TIME, POSITIONS + side * step * by_position, SPEEDS + side * step * by_speed, 1e-4
             )
             for side in (1.0, -1.0)
@@ -42,7 +42,7 @@ def test_tangents_are_the_derivatives_of_the_force(law):
 
 def test_dry_friction_has_a_tangent_where_the_motion_turns():
     half_window = 0.05 * float(np.sqrt(np.mean(SPEEDS**2)))
-    along = force_along(damping(0.0), TIME, POSITIONS, SPEEDS, 0.05)
+    along = force_and_tangents(damping(0.0), TIME, POSITIONS, SPEEDS, 0.05)
     turning = np.abs(SPEEDS) < 0.5 * half_window
     np.testing.assert_allclose(along.by_speed[turning], 2.0 / half_window)
     assert np.all(along.by_speed[np.abs(SPEEDS) > half_window] == 0.0)

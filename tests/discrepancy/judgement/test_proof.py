@@ -237,9 +237,10 @@ def test_statistic_is_the_fall_of_the_penalised_sum_of_squares():
     for k, direction in enumerate(columns):
         for number, column in direction.items():
             data = problem.trials[number]
-            extra[ends[number] : ends[number + 1], k] = data.standardised(column)[data.weight > 0.0]
+            extra[ends[number] : ends[number + 1], k] = data.standardise(column)[data.weight > 0.0]
     precision = dense.precision.copy()
-    precision[problem.shared.size : problem.shared.size + found.candidate.size] = 0.0
+    first_effect = problem.shared.unknown_count
+    precision[first_effect : first_effect + found.candidate.parameter_count] = 0.0
     left = []
     for a, p in ((matrix, precision), (np.hstack((matrix, extra)), np.concatenate((precision, [0.0, 0.0])))):
         x = np.linalg.solve(a.T @ a + np.diag(p), a.T @ y)
@@ -247,7 +248,7 @@ def test_statistic_is_the_fall_of_the_penalised_sum_of_squares():
     assert test.count == 2
     assert test.statistic == pytest.approx(left[0] - left[1], rel=1e-5)
     # what is free already is no direction: the derivative by the effect itself, and one that is nothing
-    own = {n: part.effect[0] for n, part in enumerate(found.linearisations) if np.any(part.effect)}
+    own = {n: part.by_effect[0] for n, part in enumerate(found.trial_derivatives) if np.any(part.by_effect)}
     nothing = {0: np.zeros_like(problem.trials[0].weight)}
     assert score_tests(problem, found, {"own": {"offset": own}, "nothing": {"zero": nothing}}) == []
     assert score_tests(problem, found, {}) == []
@@ -259,8 +260,8 @@ def test_p_value_beside_a_short_noise_record_is_that_of_the_f_test():
     found, _, _ = asked(problem)
     columns = 0.02 * np.random.default_rng(5).standard_normal((2, 9, 1)) * [1.0, 0.0, 0.0]
     (test,) = score_tests(problem, found, {"both": {"a": {0: columns[0]}, "b": {0: columns[1]}}})
-    known = 12.0 + problem.counts[0]
-    square, freedom = 12.0 + found.sums[0], known - found.spent[0] - 2
+    known = 12.0 + problem.sample_counts[0]
+    square, freedom = 12.0 + found.squares_by_channel[0], known - found.absorbed_freedom[0] - 2
     fall = test.statistic * square / known
     assert test.p_value == pytest.approx(stats.f.sf(0.5 * fall / ((square - fall) / freedom), 2, freedom))
 

@@ -104,10 +104,10 @@ def test_the_value_of_the_law_is_that_of_the_simulation(sticking: Investigation)
 def test_evidence_under_recorded_noise_has_the_scale_of_that_with_a_missing_force() -> None:
     campaign = pushed_axis(0.0, 300)
     problem = without_wrong_ends(campaign, model_of(AXIS))
-    no_effect = fit(problem, Candidate(), problem.start(Candidate()))
+    no_effect = fit(problem, Candidate(), problem.prior_mean_point(Candidate()))
     candidates = FittedCandidates(problem, (), no_effect)
     evidence = candidates.score_under_recorded_noise(no_effect) - candidates.log_prior(no_effect.candidate)
-    count = float(problem.counts.sum())
+    count = float(problem.sample_counts.sum())
     # of a right model: half the readings, and half the logarithms of how much the readings tell of
     # mass, damping, and the two unknowns of each beginning
     assert -0.5 * count - 80.0 < evidence < -0.5 * count

@@ -10,13 +10,13 @@ from benchmarks.force_events import KINDS, counted, drawn, found_in, problem_of
 from discrepancy.campaign.noise import NoiseModel
 from discrepancy.judgement.remarks import begins_inside, when_sentence
 from discrepancy.missing_force.events import EventSearch
-from discrepancy.missing_force.explained import with_most_probable_forces
-from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, regression
+from discrepancy.missing_force.explained import fit_missing_forces
+from discrepancy.missing_force.filtered import ForceFilter, Process, Regression, sum_regressions
+from discrepancy.missing_force.linear_trials import LinearTrials
 from discrepancy.missing_force.shares import _simulated_noise
 from discrepancy.missing_force.switched_record import SwitchedRecord
-from discrepancy.missing_force.trial import SeenTrial, decaying_part
-from discrepancy.missing_force.view import View
-from discrepancy.missing_force.windows import _most_probable_place, residual_windows, sized_windows
+from discrepancy.missing_force.trial import ColouredNoise, PortedTrial, SampleIntervals, correlated_noise_part
+from discrepancy.missing_force.windows import _port_or_channel_error, add_window_sizes, windows_of_residuals
 from discrepancy.report.load_and_time_figures import time_line_figure
 from discrepancy.system.response import PortedSystem
 from discrepancy.verdict import GapWindow, Moment
@@ -34,8 +34,8 @@ def gaussian(covariance, readings):
 def evidence(filtered):
     """Return the log evidence of a trial's residuals."""
     trial = filtered.trial
-    found = regression([filtered], [np.concatenate((trial.residual[None], trial.local))])
-    return -0.5 * found.products[0, 0] - found.log_determinant
+    found = sum_regressions([filtered], [np.concatenate((trial.residual[None], trial.local_derivatives))])
+    return -0.5 * found.products[0, 0] - found.half_log_determinant
 
 
 FREQUENCY, RATIO, PARTS = 9.0, 0.05, 8
@@ -57,7 +57,7 @@ def trial_of(time, residual, *, used=None, deviation=None, local=None, coloured=
     used = np.ones(residual.shape, dtype=bool) if used is None else used
     local = np.zeros((0, *residual.shape)) if local is None else local
     fine = (count - 1) * PARTS + 1
-    return SeenTrial(
+    return PortedTrial(
         "one", time, residual * used, used, np.array([0.02, 0.6]) if deviation is None else deviation,
         coloured, np.zeros((0, *residual.shape)), local, np.ones(len(local)), oscillator(), (), PARTS,
         np.zeros((fine, 1)), np.zeros((fine, 1)), False,
@@ -75,12 +75,12 @@ def dense(trial, process, per_second=2000, window=(-np.inf, np.inf)):
     step = 1.0 / per_second
     moments = np.arange(0.0, trial.time[-1] + 0.5 * step, step) + 0.5 * step
     apart = np.abs(moments[:, None] - moments)
-    rate = np.sqrt(3.0) / process.time
-    kernel = process.size**2 * np.exp(-rate * apart)
-    if not process.rough:
+    rate = np.sqrt(3.0) / process.correlation_time
+    kernel = process.standard_deviation**2 * np.exp(-rate * apart)
+    if not process.may_jump:
         kernel *= 1.0 + rate * apart
     else:
-        kernel = process.size**2 * np.exp(-apart / process.time)
+        kernel = process.standard_deviation**2 * np.exp(-apart / process.correlation_time)
     inside = (moments > window[0]) & (moments < window[1])
     kernel *= np.outer(inside, inside)
     answers = np.zeros((len(trial.time), 2, len(moments)))
@@ -119,7 +119,9 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     used = random.uniform(size=(40, 2)) > 0.2
     local, share = random.standard_normal((unknown, 40, 2)) * used, 0.4 * unknown
     process = Process(2.0, 0.15, rough)
-    trial = trial_of(time, residual, used=used, local=local, coloured=((0, share, 12.0),) if share else ())
+    trial = trial_of(
+        time, residual, used=used, local=local, coloured=[ColouredNoise(0, share, 12.0)] if share else ()
+    )
     filtered = ForceFilter(trial, [(0, process)])
     covariance, cross = dense(trial, process)
     at = np.flatnonzero(used.ravel())
@@ -132,17 +134,19 @@ def test_evidence_and_force_are_those_of_dense_conditioning(rough, uneven, unkno
     if unknown:  # trials of one system and grid are filtered together, and tell what each tells
         rows = np.concatenate((residual[None] * used, local))
         both, *each = (
-            regression([filtered] * len(of), of) for of in ([rows, 2.0 * rows], [rows], [2.0 * rows])
+            sum_regressions([filtered] * len(of), of) for of in ([rows, 2.0 * rows], [rows], [2.0 * rows])
         )
         np.testing.assert_allclose(both.products, each[0].products + each[1].products, rtol=1e-9)
-        assert both.log_determinant == pytest.approx(sum(one.log_determinant for one in each), rel=1e-9)
+        assert both.half_log_determinant == pytest.approx(
+            sum(one.half_log_determinant for one in each), rel=1e-9
+        )
         return
-    _, (force,), (deviation, _) = filtered.smoothed(trial.residual)
+    _, (force,), (deviation,), _ = filtered.smooth(trial.residual)
     mean = cross[:, at] @ np.linalg.solve(covariance, readings)
-    np.testing.assert_allclose(force, mean, atol=0.02 * process.size)
+    np.testing.assert_allclose(force, mean, atol=0.02 * process.standard_deviation)
     own = cross[::PARTS, at]
-    variance = process.size**2 - np.einsum("nk,kn->n", own, np.linalg.solve(covariance, own.T))
-    np.testing.assert_allclose(deviation, np.sqrt(variance), atol=0.02 * process.size)
+    variance = process.standard_deviation**2 - np.einsum("nk,kn->n", own, np.linalg.solve(covariance, own.T))
+    np.testing.assert_allclose(deviation, np.sqrt(variance), atol=0.02 * process.standard_deviation)
 
 
 def test_steady_gains_are_those_of_every_step():
@@ -151,19 +155,22 @@ def test_steady_gains_are_those_of_every_step():
     trial = trial_of(time, random.standard_normal((900, 2)))
     filtered = ForceFilter(trial, [(0, PROCESS)])
     jittered = trial_of(time * (1.0 + 1e-12 * np.arange(900)), trial.residual)
-    object.__setattr__(jittered, "steps", (np.full(900, 0.02), np.arange(900)))  # as if each were its own
+    object.__setattr__(
+        jittered, "intervals", SampleIntervals(np.full(900, 0.02), np.arange(900))
+    )  # as if each were its own
     every = ForceFilter(jittered, [(0, PROCESS)])
     late = [states(one)[0][[200, 899]] for one in (filtered, every)]
     assert [np.array_equal(*covers) for covers in late] == [True, False]
     assert evidence(filtered) == pytest.approx(evidence(every), abs=1e-6)
-    for one, other in zip(filtered.smoothed(trial.residual), every.smoothed(trial.residual), strict=True):
+    for one, other in zip(filtered.smooth(trial.residual), every.smooth(trial.residual), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-7)
 
 
 def states(filtered):
     """Return the states of a trial after each of its samples."""
-    steps, which = filtered.steps(filtered.trial.residual[None]), filtered.trial.steps[1]
-    return steps.before(which, 0, steps.begin(filtered.system[3]), np.arange(1, len(which) + 1))
+    record, which = filtered.record_filter(filtered.trial.residual[None]), filtered.trial.intervals[1]
+    begin = record.initial_state(filtered.state_space.initial_covariance)
+    return record.filter_before(which, 0, begin, np.arange(1, len(which) + 1))
 
 
 def test_states_and_noise_by_closed_forms():
@@ -171,26 +178,26 @@ def test_states_and_noise_by_closed_forms():
     trial = trial_of(1.0 * np.arange(20), np.ones((20, 2)))
     filtered = ForceFilter(trial, [(0, Process(1.0, 1e-3))])
     assert np.isfinite(evidence(filtered))
-    assert np.all(np.isfinite(filtered.smoothed(trial.residual)[1]))
+    assert np.all(np.isfinite(filtered.smooth(trial.residual)[1]))
     # a pushed state
     trial = trial_of(0.02 * np.arange(50), np.zeros((50, 2)))
     generator, push = trial.system.generator, -trial.system.actions[0]
     wanted = [np.linalg.solve(generator, (expm(generator * t) - np.eye(2)) @ push) for t in trial.fine_time]
-    np.testing.assert_allclose(trial.pushed(0, np.ones(len(wanted))), wanted, atol=1e-12)
-    still = replace(trial, settled=True).pushed(0, np.ones(len(wanted)))
+    np.testing.assert_allclose(trial.state_under_force(0, np.ones(len(wanted))), wanted, atol=1e-12)
+    still = replace(trial, begins_at_rest=True).state_under_force(0, np.ones(len(wanted)))
     np.testing.assert_allclose(still - np.linalg.solve(generator, -push), 0.0, atol=1e-12)
     # noise of a deviation of one, part of it coloured
     count = 5000
-    told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=((0, 0.4, 12.0),))
+    told = trial_of(0.02 * np.arange(count), np.zeros((count, 2)), coloured=(ColouredNoise(0, 0.4, 12.0),))
     made = _simulated_noise(told)
     np.testing.assert_allclose(made.std(axis=0), 1.0, rtol=0.1)
     assert made[1:, 0] @ made[:-1, 0] / count == pytest.approx(0.4 * np.exp(-12.0 * 0.02), abs=0.1)
     # noise of first order is taken apart
     noise = NoiseModel(1.0, 1.0 / np.sqrt(1.0 - 0.81), np.inf, np.array([0.9]), 0.01, ())
-    assert decaying_part(noise, 0.01) == (
-        pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
+    assert correlated_noise_part(1, noise, 0.01) == (
+        1, pytest.approx(1.0 - 1e-3, abs=2e-3), pytest.approx(-np.log(0.9) / 0.01, rel=1e-6),
     )  # fmt: skip
-    assert decaying_part(noise, 0.02) is None
+    assert correlated_noise_part(1, noise, 0.02) is None
 
 
 def test_evidence_beside_unknowns_is_that_of_their_prior():
@@ -199,7 +206,7 @@ def test_evidence_beside_unknowns_is_that_of_their_prior():
     rows = np.vstack((readings, columns))
     found = Regression(rows @ rows.T, 0.0).solve([0, 1], precision)
     covariance = np.eye(9) + columns.T @ np.diag(1.0 / precision) @ columns
-    assert found.evidence == pytest.approx(gaussian(covariance, readings))
+    assert found.log_evidence == pytest.approx(gaussian(covariance, readings))
 
 
 @pytest.mark.parametrize("end", [0, 1, None], ids=["a sample", "the record", "inside"])
@@ -211,22 +218,26 @@ def test_the_most_probable_process_is_the_top_of_a_grid(end):
         end, 5.0 * np.sin(8.0 * 0.02 * np.arange(count))
     )
     residual[:, 0] += 4.0 if end == 1 else 0.0
-    view = View([trial_of(0.02 * np.arange(count), residual)], np.zeros(0))
+    view = LinearTrials([trial_of(0.02 * np.arange(count), residual)], np.zeros(0))
     about = {0: Process(1.0, 0.2)}
-    found, value = view.most_probable(about, about)
-    times = np.geomspace(*view.times, 16)
-    grid = [view.evidence(about, {0: Process(s, t)}) for s in np.geomspace(1e-2, 1e2, 41) for t in times]
-    assert max(grid) - 1e-6 < value == pytest.approx(view.evidence(about, found), abs=1e-9)
-    near = view.most_probable(about, found, near=True)
+    found, value = view.most_probable_processes(about, about)
+    times = np.geomspace(*view.correlation_time_range, 16)
+    grid = [
+        view.log_evidence_with_prior(about, {0: Process(s, t)})
+        for s in np.geomspace(1e-2, 1e2, 41)
+        for t in times
+    ]
+    assert max(grid) - 1e-6 < value == pytest.approx(view.log_evidence_with_prior(about, found), abs=1e-9)
+    near = view.most_probable_processes(about, found, skip_grid=True)
     assert near[1] == pytest.approx(value, abs=1e-6)
     if end is not None:
-        assert found[0].time == pytest.approx(view.times[end], rel=1e-6)
+        assert found[0].correlation_time == pytest.approx(view.correlation_time_range[end], rel=1e-6)
 
 
 # ---------------------------------------------------------------- forces that act at times
 
 
-EVENT, REST = Process(2.0, 0.15, rough=True), Process(0.5, 0.4, rough=True)
+EVENT, REST = Process(2.0, 0.15, may_jump=True), Process(0.5, 0.4, may_jump=True)
 
 
 @pytest.mark.parametrize("uneven", [False, True], ids=["even", "uneven"])
@@ -238,10 +249,10 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
     residual = random.standard_normal((40, 2)) * [3.0, 1.0]
     local = random.standard_normal((1, 40, 2))
     trial = trial_of(time, residual, local=local)
-    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT)
+    search = EventSearch(LinearTrials([trial], np.zeros(0)), 0, EVENT)
     switched = SwitchedRecord(search, 0, (EVENT, REST))
     starts, ends = np.array([0, 7, 20]), np.array([9, 26, 40])
-    values = switched.evidence_by_ends(np.zeros(40, dtype=bool), starts, ends)
+    values = switched.evidence_of_stretches(np.zeros(40, dtype=bool), starts, ends)
     always = dense(trial, REST)[0] + np.eye(80) + np.outer(local.ravel(), local.ravel())
     for a, start in enumerate(starts):
         for b, end in enumerate(ends):
@@ -253,18 +264,18 @@ def test_the_evidence_of_an_event_is_that_of_dense_conditioning(uneven):
             assert values[a, b] == pytest.approx(gaussian(covariance, residual.ravel()), abs=0.05)
             on = np.zeros(40, dtype=bool)
             on[start:end] = True
-            assert search.evidence([switched.products(on)]) == pytest.approx(values[a, b], abs=1e-7)
+            assert search.log_evidence([switched.products(on)]) == pytest.approx(values[a, b], abs=1e-7)
 
 
 @pytest.mark.parametrize("settled", [False, True], ids=["still", "settled"])
 def test_a_force_that_is_off_throughout_is_none_and_one_that_is_on_a_second_one(settled):
     """Of a settled trial, too, whose state before is what the forces that act make of it."""
     random = np.random.default_rng(3)
-    trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), settled=settled)
-    search = EventSearch(View([trial], np.zeros(0)), 0, EVENT)
+    trial = replace(trial_of(0.02 * np.arange(40), random.standard_normal((40, 2))), begins_at_rest=settled)
+    search = EventSearch(LinearTrials([trial], np.zeros(0)), 0, EVENT)
     for on, forces in ((False, [REST]), (True, [EVENT, REST])):
         wanted = evidence(ForceFilter(trial, [(0, one) for one in forces]))
-        found = search.evidence(search.products((EVENT, REST), [np.full(40, on)]))
+        found = search.log_evidence(search.products((EVENT, REST), [np.full(40, on)]))
         assert found == pytest.approx(wanted, abs=1e-7)
 
 
@@ -313,7 +324,7 @@ def test_a_window_without_a_reading_is_none():
     around = (Moment(value, value, value) for value in (first, third))
     ends = {"first": float(trial.time[0]), "last": float(trial.time[-1]), "size": 1.0}
     windows = [GapWindow(trial.name, trial.channels, *moments, **ends) for moments in (between, around)]
-    (window,) = sized_windows(windows, fitted, fitted)
+    (window,) = add_window_sizes(windows, fitted, fitted)
     assert window.begin.value == first
     assert window.size > 0.0
 
@@ -323,26 +334,26 @@ def test_a_window_of_a_campaign_is_told_and_drawn(monkeypatch):
     event = np.zeros((300, 4))
     event[120:200, 1] = 16.0  # eight noises, from 1.2 s to 2 s
     fitted = Bench(count=300).fit(np.random.default_rng(4), extra={1: event})
-    (window,) = residual_windows(fitted)
+    (window,) = windows_of_residuals(fitted)
     assert (window.trial, window.channels) == ("release 2", ("g2",))
     assert window.begin.low - 0.01 <= 1.2 <= window.begin.high + 0.01
     assert window.end.low - 0.01 <= 2.0 <= window.end.high + 0.01
     assert window.size == pytest.approx(8.0, rel=0.1)
-    assert residual_windows(fitted) == (window,)
+    assert windows_of_residuals(fitted) == (window,)
     assert begins_inside((window,))
     assert when_sentence((window,)).startswith("The gap is there in 'release 2' since 1.")
     (axis, *_) = time_line_figure((window,)).axes
     assert [text.get_text() for text in axis.get_yticklabels()] == ["release 2"]
-    assert residual_windows(Bench(count=300).fit(np.random.default_rng(4))) == ()
+    assert windows_of_residuals(Bench(count=300).fit(np.random.default_rng(4))) == ()
     once = [replace(item, trial=replace(item.trial, time=0.0 * item.trial.time)) for item in fitted.trials]
-    assert residual_windows(replace(fitted, trials=once)) == ()
+    assert windows_of_residuals(replace(fitted, trials=once)) == ()
     assert time_line_figure(()) is None
 
     def broken(*_):
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
-    monkeypatch.setattr("discrepancy.missing_force.windows.events", broken)
-    (window,) = residual_windows(fitted)
+    monkeypatch.setattr("discrepancy.missing_force.windows.find_events", broken)
+    (window,) = windows_of_residuals(fitted)
     assert (window.trial, window.channels, window.begin, window.end) == ("release 2", ("g2",), None, None)
     assert window.size > 1.0
     assert when_sentence((window,)) == "The gap is there throughout the records."
@@ -361,9 +372,9 @@ def test_an_event_on_a_reading_is_looked_for_by_name_in_records_of_other_channel
         trials[1], deviation=trials[1].deviation[::-1],
         system=replace(system, outputs=system.outputs[::-1], through=system.through[:, ::-1]),
     )  # fmt: skip
-    forced = with_most_probable_forces(View(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
-    number, found = _most_probable_place(0, forced, names)
-    shown = [trial.system.through[0] != 0.0 for trial in found.view.trials]
+    forced = fit_missing_forces(LinearTrials(trials, np.zeros(0)), {0: PROCESS}, {0: PROCESS})
+    number, found = _port_or_channel_error(0, forced, names)
+    shown = [trial.system.through[0] != 0.0 for trial in found.linear_trials.trials]
     assert number == 0
     np.testing.assert_array_equal(shown, [[False, True], [True, False]])
 

@@ -20,10 +20,10 @@ from discrepancy.fits.problem import Problem
 from discrepancy.fmu_models.model import FmuModel
 from discrepancy.judgement.conclusion import named_effects
 from discrepancy.missing_force.hypotheses import log_prior
-from discrepancy.missing_force.naming import WIDTHS, ForceSearch
+from discrepancy.missing_force.naming import FOLLOWED_COUNTS, ForceSearch
 from discrepancy.missing_force.port_force import explained_variance, missing_force
 from discrepancy.missing_force.shares import ForceShares
-from discrepancy.missing_force.trial import seen_trial
+from discrepancy.missing_force.trial import ported_trial
 from discrepancy.model_choice import load_model
 from discrepancy.report.figures import missing_force_figure
 from discrepancy.report.text import force_sentence, size_sentence
@@ -100,22 +100,26 @@ def blind(folder, number, seed=1, samples=64):
     ],
 )
 def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypatch, number, effect, port):
-    monkeypatch.setattr("discrepancy.missing_force.naming.WIDTHS", (WIDTHS[0],))  # each law alone
+    monkeypatch.setattr(
+        "discrepancy.missing_force.naming.FOLLOWED_COUNTS", (FOLLOWED_COUNTS[0],)
+    )  # each law alone
     problem = blind(tmp_path, number)
     search = ForceSearch(problem)
-    assert max(search.at, key=lambda name: search.at[name].log_evidence) == port
-    ranked = [item for item in search.name(available(problem)) if item.candidate.terms]
+    assert (
+        max(search.hypothesis_by_port, key=lambda name: search.hypothesis_by_port[name].log_evidence) == port
+    )
+    ranked = [item for item in search.rank_hypotheses(available(problem)) if item.candidate.terms]
     (term,) = ranked[0].candidate.terms
     assert (term.effect.identifier, term.place) == (effect, port)
     families = {ranked[0].candidate.terms[0].effect.family}
     second = next(item for item in ranked if item.candidate.terms[0].effect.family not in families)
     assert ranked[0].log_evidence > second.log_evidence + 10.0
-    assert ranked[0].log_evidence > search.whole.log_evidence + 10.0
+    assert ranked[0].log_evidence > search.hypothesis_of_all_ports.log_evidence + 10.0
     # its values are where a fit that begins there stays
-    again = search.followed(ranked[0], ranked[0].candidate, ranked[0].effect)
+    again = search.fit_along_motion(ranked[0], ranked[0].candidate, ranked[0].effect)
     deviations = np.sqrt(np.diag(ranked[0].effect_covariance))
     np.testing.assert_allclose((again.effect - ranked[0].effect) / deviations, 0.0, atol=0.4)
-    share = ForceShares(search).share_of(ranked[0], held_out=False)
+    share = ForceShares(search).gap_share(ranked[0], held_out=False)
     assert share.value > 0.85
     assert share.interval[0] <= share.value <= share.interval[1]
 
@@ -124,7 +128,7 @@ def test_the_law_of_the_missing_force_is_ahead_of_all_others(tmp_path, monkeypat
 def test_a_law_is_followed_to_where_it_is_however_far(tmp_path, number, effect):
     """A dead zone, whose stiffness first sight does not tell; a drag seven deviations above the median."""
     problem = blind(tmp_path, number, 37)
-    best = ForceSearch(problem).name(chosen(effect))[0]
+    best = ForceSearch(problem).rank_hypotheses(chosen(effect))[0]
     (law,) = at_unit(best.candidate.patch(problem.setting, best.effect))
     for key, value in drawn(number, 37, 64)[2]["values"].items():
         assert getattr(law, key.removeprefix(f"{effect}.")) == pytest.approx(value, rel=0.05)
@@ -144,7 +148,7 @@ def test_a_law_with_a_free_shape_has_the_name_of_its_family(tmp_path):
     port, *_ = problem.model.ports
     free = Candidate((EffectTerm(friction, port, free_shape=True),))
     force = ForceSearch(problem)
-    law = force.followed(force.whole, free, free.terms[0].start())
+    law = force.fit_along_motion(force.hypothesis_of_all_ports, free, free.terms[0].start_values())
     family = f"a law of the family {friction.family}"
     missing = missing_force(force, law)
     assert missing.law == missing.at_port.law == family
@@ -203,7 +207,7 @@ def test_a_rig_without_a_gap_misses_no_force(tmp_path, gain):
         response = gain * every.prediction(number, start, bare)
         data.trial.values[:] = response + random.standard_normal(response.shape) * data.deviation
     search = ForceSearch(problem)
-    assert gain != 1.0 or missing_force(search, search.whole) is None
+    assert gain != 1.0 or missing_force(search, search.hypothesis_of_all_ports) is None
     found = investigate(problem.campaign, problem.model, FEW)
     if gain == 1.0:
         assert found.verdict.kind is VerdictKind.NOTHING_MISSING
@@ -220,7 +224,13 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tm
     with closing(FmuModel.load(fmu_rig(tmp_path, foreign_fmu("rig2")))) as fmu:
         scales = lumped.scales(campaign)
         first, second = (
-            next(iter(ForceSearch(Problem(campaign, item, Setting(campaign, item, scales))).at.values()))
+            next(
+                iter(
+                    ForceSearch(
+                        Problem(campaign, item, Setting(campaign, item, scales))
+                    ).hypothesis_by_port.values()
+                )
+            )
             for item in (lumped, fmu)
         )
         assert second.log_evidence == pytest.approx(first.log_evidence, abs=0.5)
@@ -237,8 +247,9 @@ def test_an_fmu_misses_the_force_that_the_same_lumped_model_does(foreign_fmu, tm
 def drawn_through(search, effect, place):
     """Return an effect along the missing force, from where it is first seen."""
     term = EffectTerm(effect, place)
-    start = next(item for item in search.screened(search.whole, [effect]) if item[1] == term)[2][0]
-    return search.followed(search.whole, Candidate((term,)), start)
+    base = search.hypothesis_of_all_ports
+    start = next(item for item in search.screen_effects(base, [effect]) if item[1] == term)[2][0]
+    return search.fit_along_motion(base, Candidate((term,)), start)
 
 
 @pytest.mark.parametrize("high", [3.0, 1.05])
@@ -260,22 +271,22 @@ def test_a_parameter_that_the_force_pushes_to_the_end_of_its_range_comes_back(hi
 def test_a_parameter_turns_what_a_force_does_as_the_system_itself(tmp_path, number):
     """To first order: a heavier body moves less under the same force, and a reaction shows another part."""
     problem = blind(tmp_path, number)
-    point = problem.start(Candidate())
-    here = seen_trial(problem, 0, point)
-    forces = {0: np.sin(0.7 * np.arange(len(here.fine_time)) / here.parts)}
+    point = problem.prior_mean_point(Candidate())
+    here = ported_trial(problem, 0, point)
+    forces = {0: np.sin(0.7 * np.arange(len(here.fine_time)) / here.substeps)}
 
     def shown(k, step):
         shared = point.shared.copy()
         shared[k] += step
-        trial = seen_trial(problem, 0, Point(shared, point.local, point.effect))
-        return trial.readings(trial.pushed(0, forces[0]), forces)
+        trial = ported_trial(problem, 0, Point(shared, point.local, point.effect))
+        return trial.readings_of_state(trial.state_under_force(0, forces[0]), forces)
 
-    added = here.pushed(0, forces[0])
-    slopes = {k: item for k, item in enumerate(here.slopes) if item is not None}
+    added = here.state_under_force(0, forces[0])
+    slopes = {k: item for k, item in enumerate(here.system_derivatives) if item is not None}
     assert slopes
     for k, slope in slopes.items():
         expected = (shown(k, 1e-3) - shown(k, -1e-3)) / 2e-3
-        found = here.turned(slope, added, forces).readings
+        found = here.change_by_system_parameter(slope, added, forces).readings
         np.testing.assert_allclose(found, expected, atol=3e-3 * np.abs(expected).max())
 
 
@@ -287,8 +298,9 @@ def test_friction_of_a_positioning_drive_is_found_at_its_own_sampling(tmp_path):
     write_drive(tmp_path)
     problem = read(tmp_path)
     search = ForceSearch(problem)
-    found = [search.followed(search.whole, Candidate((term,)), start)
-             for _, term, (start, *_) in search.screened(search.whole, available(problem))[:6]]  # fmt: skip
+    base = search.hypothesis_of_all_ports
+    screened = search.screen_effects(base, available(problem))[:6]
+    found = [search.fit_along_motion(base, Candidate((term,)), start) for _, term, (start, *_) in screened]
     best, *_ = sorted((item for item in found if item is not None), key=lambda item: -item.log_evidence)
     (term,) = best.candidate.terms
     assert term.effect.identifier == "coulomb_friction"
@@ -336,7 +348,7 @@ def test_one_law_stands_where_several_follow_the_jumps_that_an_accelerometer_sho
         Search(found.problem, FEW[:3], found.no_effect),
     )
     begun = replace(alone.point, effect=np.append(alone.effect, 0.0))
-    again.record(fit(found.problem, both, begun), exact=True)  # the other one was found first
+    again.record_fit(fit(found.problem, both, begun), exact=True)  # the other one was found first
     again.search_sets()
     assert again.best().candidate.identifiers == ("coulomb_friction",)
 

@@ -26,6 +26,7 @@ from fmu_asset.ssp.reader import read_ssp
 from scenarios import binding_files
 from tests.refusals import Inputs, refused
 from tests.twin_master.runs import figures_of, loaded_from, patch_record, prepared, table_of, text_of, written
+from twin_master.assets.asset_source import AssetSource, PairedSource
 from twin_master.assets.resolution import Overrides, asset_source, resolve_scenario
 from twin_master.assets.strain_library_source import StrainLibrary, load_strain_library
 from twin_master.assets.system_export import export_scenario
@@ -52,6 +53,27 @@ def content(library_file: Path) -> dict[str, Any]:
 def loaded(folder: Path, content: object) -> StrainLibrary:
     text = content if isinstance(content, str) else json.dumps(content)
     return load_strain_library(written(folder, text, name="UAVconfig.json").parent)
+
+
+class ConstantPredictions(AssetSource):
+    """A model that predicts the same for every draw, state, control and sensor."""
+
+    def observation_table(self, draws: Any, model: Any) -> Any:
+        return np.full((1, 1, 1, 1), 3.0)
+
+
+class DoubledPredictions(PairedSource):
+    """A pair whose twin predicts twice of what its model does."""
+
+    def observation_table(self, draws: Any, model: Any) -> Any:
+        return 2.0 * super().observation_table(draws, model)
+
+
+def test_a_subclass_of_a_pair_changes_what_the_twin_predicts():
+    """As the study of level turns does, which scales the predictions of each gauge."""
+    model = ConstantPredictions(load_scenario("level_turns").scenario)
+    assert PairedSource(model, model).observation_table(None, None).item() == 3.0
+    assert DoubledPredictions(model, model).observation_table(None, None).item() == 6.0
 
 
 def test_a_library_in_the_published_format_is_multilinear_between_its_levels(content, tmp_path):

@@ -163,8 +163,8 @@ def test_the_papers_policy_and_its_reliability():
     assert knowledge.draws.mean == pytest.approx(1.0073, abs=0.002)
     assert knowledge.draws.standard_deviation == pytest.approx(0.0103, abs=0.001)
     study = fly_seeds(knowledge.scenario, source, range(80))
-    assert study.within.value >= 0.95
-    assert study.early.value <= 0.2
+    assert study.prompt_fallbacks.value >= 0.95
+    assert study.early_fallbacks.value <= 0.2
     assert np.all([study.rms[0].value <= 0.045, study.rms[1].value <= 0.13])
 
 

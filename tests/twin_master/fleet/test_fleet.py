@@ -30,12 +30,13 @@ from twin_master.errors import (
     RunFolderError,
 )
 from twin_master.fleet import flight
+from twin_master.fleet.engine import Engine
 from twin_master.fleet.learn import learn_fleet
 from twin_master.fleet.plan import Fleet, Member, ensemble, load_fleet
 from twin_master.fleet.reading import Outcomes, group_figures
 from twin_master.fleet.report import write_fleet_report
-from twin_master.fleet.shard import Engine, unflown
-from twin_master.fleet.store import ENDED, FLOWN, _fallbacks, in_credible_set, outcomes_of
+from twin_master.fleet.shard import result_of_unflown
+from twin_master.fleet.store import ENDED, FLOWN, fallbacks_of, in_credible_set, stored_variables
 from twin_master.fleet_command import choose_engine
 from twin_master.mission.journal import JournalFile
 from twin_master.mission.loop import fly
@@ -76,9 +77,9 @@ def test_a_twin_of_an_ensemble_flies_what_a_run_flies(library_file, whole, tmp_p
     for ours, path in (theirs | {"control_index": "observed/control_index"}).items():
         single = tree[path].values
         assert np.array_equal(group[ours].values[row], single.astype(group[ours].dtype)), ours
-    figures, study = group_figures(group), Outcomes.of(group)
+    figures, study = group_figures(group), Outcomes.from_store(group)
     names = "log evidence of a step", "filtered rms error of z2", "bias of z2"
-    assert [figures[name] for name in names] == [study.evidence, study.rms[1], study.bias[1]]
+    assert [figures[name] for name in names] == [study.log_evidence, study.rms[1], study.bias[1]]
 
 
 def test_shards_and_workers_change_nothing(library_file, whole, tmp_path):
@@ -122,7 +123,7 @@ def test_a_folder_keeps_what_it_holds_and_nothing_is_begun_that_cannot_be_flown(
     library_file, tmp_path, monkeypatch
 ):
     fleet, other, folder = growing(library_file, count=2), growing(library_file, count=3), tmp_path / "fleet"
-    monkeypatch.setattr("twin_master.fleet.shard.CONNECTING", 0.2)
+    monkeypatch.setattr("twin_master.fleet.engine.CONNECTING", 0.2)
     with pytest.raises(FleetError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         fly_fleet(fleet, folder, Engine(cluster="tcp://127.0.0.1:9"))
     assert fly_fleet(fleet, folder).shards_flown == 1
@@ -222,10 +223,11 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
             raise PosteriorError("no posterior.")
         return b"kit"
 
-    monkeypatch.setattr(flight, "prepared", preparing)
-    monkeypatch.setattr(flight, "_check", lambda _fleet: None)
+    monkeypatch.setattr(flight, "prepare_kit", preparing)
+    monkeypatch.setattr(flight, "check_fleet", lambda _fleet: None)
     monkeypatch.setattr(
-        "twin_master.fleet.shard.fly_shard", lambda _kit, members: unflown(members[0], "it was flown")
+        "twin_master.fleet.engine.fly_shard",
+        lambda _kit, members: result_of_unflown(members[0], "it was flown"),
     )
     south = FLEET[FLEET.index('[[group]]\nname = "south"') :]
     fleet = changed(fleet_file, (south, ""), ("count = 3", 'fmus = "*.fmu"'))
@@ -233,7 +235,7 @@ def test_one_calibration_that_fails_costs_its_own_asset(fleet_file, monkeypatch)
     failures = {"north/a": "no posterior.", "north/b": "it was flown"}
     assert outcome.failures == failures
     (outcome.folder / "journal.jsonl").unlink()
-    assert flight.told_of(outcome.folder) == {"failures": failures, "ended": {}}
+    assert flight.endings_of(outcome.folder) == (failures, {})
 
 
 def test_a_fallback_that_was_called_for_in_the_last_steps_is_no_failure():
@@ -243,12 +245,12 @@ def test_a_fallback_that_was_called_for_in_the_last_steps_is_no_failure():
     for twin, (called, left) in enumerate([(1, 9), (4, 9), (5, 9), (5, 6), (9, 9)]):
         flights.state[twin, called:, 0] = 0.8
         flights.control_index[twin, left:7] = 0
-    delay, early = _fallbacks(knowledge, flights)
+    delay, early = fallbacks_of(knowledge, flights)
     np.testing.assert_array_equal(delay, [np.inf, np.inf, np.nan, 1.0, np.nan])
     assert (early == 0).all()
     lost = knowledge.model.states.coordinates.sum(axis=1)
     both = replace(knowledge, policy=np.eye(2)[(lost < 0.5).astype(int)])
-    delay, early = _fallbacks(both, flights)  # by which no state alone calls for a fallback
+    delay, early = fallbacks_of(both, flights)  # by which no state alone calls for a fallback
     assert (np.isnan(delay) & (early == -1)).all()
 
 
@@ -367,7 +369,7 @@ def test_an_asset_that_fails_or_ends_keeps_what_it_has_flown_and_does_not_touch_
         assert np.array_equal(found.filtered[twin, :end], whole.filtered[twin, :end])
         assert np.isnan(found.filtered[twin, end:]).all()
         assert (found.control_index[twin, end:] == -1).all()
-    kept = outcomes_of(knowledge, found, [Member(row, "", row, {}) for row in range(6)])
+    kept = stored_variables(knowledge, found, [Member(row, "", row, {}) for row in range(6)])
     for row, steps in enumerate(flown):
         if ends or steps == 35:
             assert kept["status"][row] == (ENDED if found.ended[row] else FLOWN)
@@ -381,5 +383,5 @@ def test_damage_grows_as_the_model_says(library_file):
     growth, uniform = DamageGrowth(model), (np.arange(2000) + 0.5) / 2000
     for control in (0, 1):
         row = model.transition.row(control, 6)
-        found = growth.next_states(np.full(len(uniform), control), np.full(len(uniform), 6), uniform)
+        found = growth.following(np.full(len(uniform), control), np.full(len(uniform), 6), uniform)
         np.testing.assert_allclose(np.bincount(found, minlength=25) / 2000, row, atol=1.5 / 2000)

@@ -15,19 +15,33 @@ from tests.twin_master.network.decision_oracles import precise_forward_backward
 from tests.twin_master.runs import text_of, written
 from twin_master.assets.resolution import Overrides, resolve_scenario
 from twin_master.errors import MissionInputError
+from twin_master.fleet.configuration import group_folder
 from twin_master.fleet.evidence import (
-    Worsening,
-    node_evidence,
+    TransitionFamily,
+    parameter_evidence,
+    reason_transitions_are_fixed,
     scaled_likelihood,
     transition_evidence,
-    why_transitions_are_kept,
 )
-from twin_master.fleet.flight import group_folder
-from twin_master.fleet.learn import _noisier
+from twin_master.fleet.learn import with_noise_factor
 from twin_master.fleet.plan import Fleet, ensemble, load_fleet
-from twin_master.fleet.posterior import HIGHEST, LOWEST, Grid, population, refined, shared
-from twin_master.fleet.reading import Estimated, Outcomes, attention, leaving, severity
-from twin_master.fleet.report import WORST, fleet_page, write_fleet_report
+from twin_master.fleet.posterior import (
+    HIGHEST,
+    LOWEST,
+    LikelihoodGrid,
+    likelihood_grid,
+    population_posterior,
+    shared_posterior,
+)
+from twin_master.fleet.reading import (
+    Estimated,
+    Outcomes,
+    leaving_probabilities,
+    probability_of_leaving,
+    severity,
+)
+from twin_master.fleet.report import fleet_page, write_fleet_report
+from twin_master.fleet.view import ATTENTION_ROWS
 from twin_master.mission.preparation import load_knowledge, save_knowledge
 from twin_master.network.planner import BeliefPolicy
 from twin_master.network.twin import build_graphical_model
@@ -63,15 +77,15 @@ def tiny(
 def test_evidence_of_a_twin_is_that_of_all_paths(probability, name, success):
     """Also of one that is repaired."""
     scenario = tiny(probability, name=name, success=success)
-    worsening, controls = Worsening.of(scenario), len(scenario.control)
-    assert len(worsening.names) == (controls if probability is EACH else 4)
+    family, controls = TransitionFamily.learnable(scenario), len(scenario.control)
+    assert len(family.names) == (controls if probability is EACH else 4)
     generator = np.random.default_rng(4)
     likelihood = generator.random((2, 4, 9))
     control = generator.permuted(np.tile(np.arange(4 + controls) % controls, (2, 1)), axis=1)[:, :4]
-    points = np.array([worsening.assumed, 0.5 * worsening.assumed + 0.3])
-    found = transition_evidence(worsening, points, likelihood, control)
+    points = np.array([family.assumed, 0.5 * family.assumed + 0.3])
+    found = transition_evidence(family, points, likelihood, control)
     for row, point in enumerate(points):
-        value = dict(zip(worsening.names, point.tolist(), strict=True))
+        value = dict(zip(family.names, point.tolist(), strict=True))
         given = {
             control: {name: value.get(f"{control}, {name}", value.get(control)) for name in ("z1", "z2")}
             for control in scenario.control_names
@@ -84,7 +98,7 @@ def test_evidence_of_a_twin_is_that_of_all_paths(probability, name, success):
 
 def test_evidence_of_a_node_is_that_of_the_filter():
     scenario = tiny(EACH, levels=5)
-    model, worsening = build_graphical_model(scenario), Worsening.of(scenario)
+    model, family = build_graphical_model(scenario), TransitionFamily.learnable(scenario)
     generator = np.random.default_rng(5)
     values = 1e-3 * (1.0 + generator.random((3, 25, 2, 24)))
     interval = 1e-4 * generator.standard_normal((25, 2, 24, 2))
@@ -92,7 +106,7 @@ def test_evidence_of_a_node_is_that_of_the_filter():
     observed[0, 2] = observed[1, :, 5] = np.nan
     control = generator.integers(0, 2, (2, 6))
     sensors = GaussianSensorModel(values, 1e-4, interval=interval)
-    nodes = node_evidence(worsening, worsening.assumed, sensors, observed, control)
+    nodes = parameter_evidence(family, family.assumed, sensors, observed, control)
     for node, twin in product(range(3), range(2)):
         alone = GaussianSensorModel(values[node : node + 1], 1e-4, interval=interval)
         rows = alone.log_likelihood_sequence(observed[twin], control[twin])
@@ -100,10 +114,10 @@ def test_evidence_of_a_node_is_that_of_the_filter():
         assert nodes[twin, node] == pytest.approx(expected.sum(), rel=1e-12)
 
 
-def grid_of(*counts: tuple[int, int]) -> Grid:
+def grid_of(*counts: tuple[int, int]) -> LikelihoodGrid:
     """Return the likelihood of probabilities of which so many were hits, and so many not."""
     hits, misses = np.array(counts, dtype=float).T
-    return refined(lambda points: np.log(points) @ hits + np.log1p(-points) @ misses, len(counts))
+    return likelihood_grid(lambda points: np.log(points) @ hits + np.log1p(-points) @ misses, len(counts))
 
 
 SIMILAR, MANY = ((3, 47), (6, 44), (2, 48), (9, 41), (4, 46)), (22_500, 427_500)
@@ -120,7 +134,8 @@ SIMILAR, MANY = ((3, 47), (6, 44), (2, 48), (9, 41), (4, 46)), (22_500, 427_500)
 )
 def test_groups_share_what_a_dense_sum_says(counts, beside, close):
     """Also beside another probability, which says nothing of it, and one of few twins beside one of many."""
-    (found, *_), groups = shared([grid_of(own, *beside) for own in counts])
+    posterior = shared_posterior([grid_of(own, *beside) for own in counts])
+    found, groups = posterior.hyperparameters[0], posterior.groups
     low, high = logit(np.array([LOWEST, HIGHEST]))
     m, kappa = np.meshgrid(
         expit(np.linspace(low, high, 402)[:-1] + 0.5 * (high - low) / 401),
@@ -145,11 +160,16 @@ def test_a_population_is_what_a_dense_sum_says(members):
     """Of normal members, under a Student's prior of the spread."""
     nodes, blur, scale = np.linspace(0.94, 1.06, 61), 0.004, 0.01
     seen = 1.01 + np.hypot(0.01, blur) * np.random.default_rng(members).standard_normal(members)
-    found = population(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2, scale)
+    found = population_posterior(nodes, -0.5 * ((nodes - seen[:, None]) / blur) ** 2, scale)
     mean, spread = np.linspace(0.94, 1.06, 401)[:, None], np.linspace(1e-5, 0.06, 400)
     density = sum(norm.logpdf(x, mean, np.hypot(spread, blur)) for x in seen) + t.logpdf(spread / scale, 4)
     weight = np.exp(density - density.max()) / np.exp(density - density.max()).sum()
-    for line, values, share in zip(found, (mean[:, 0], spread), (weight.sum(1), weight.sum(0)), strict=True):
+    for line, values, share in zip(
+        (found.mean, found.deviation),
+        (mean[:, 0], spread),
+        (weight.sum(1), weight.sum(0)),
+        strict=True,
+    ):
         middle = share @ values
         deviation = np.sqrt(share @ (values - middle) ** 2)
         assert line.mean == pytest.approx(middle, abs=0.02 * deviation)
@@ -212,10 +232,10 @@ def test_the_store_of_a_fleet_has_the_evidence_that_its_twins_had(tmp_path):
     known = load_knowledge(group_folder(folder, group, 0), group.scenarios[0])
     rows, control = stored["observed"].values, stored["control_index"].values.astype(int)
     assert np.isfinite(rows[:, 0, 24:]).all()
-    worsening = Worsening.of(known.scenario)
-    model = _noisier(known.sensor_model, 1.0)  # as the lessons are learnt with
+    family = TransitionFamily.learnable(known.scenario)
+    model = with_noise_factor(known.sensor_model, 1.0)  # as the lessons are learnt with
     scaled, common = scaled_likelihood(model, rows.astype(float), control)
-    found = transition_evidence(worsening, worsening.assumed[None], scaled, control)[:, 0] + common
+    found = transition_evidence(family, family.assumed[None], scaled, control)[:, 0] + common
     np.testing.assert_allclose(found, stored["log_evidence"].values.sum(axis=1), rtol=1e-5)
 
 
@@ -250,8 +270,11 @@ def test_the_evidence_of_table_transitions_is_that_of_the_tables():
     likelihood = generator.random((2, 4, 9))
     control = generator.integers(0, 2, (2, 4))
     tables = as_tables(assumed)
-    free, fixed = Worsening.of(assumed), Worsening.kept(tables, why_transitions_are_kept(tables))
-    assert (fixed.names, fixed.kept_because) == (
+    free, fixed = (
+        TransitionFamily.learnable(assumed),
+        TransitionFamily.fixed(tables, reason_transitions_are_fixed(tables)),
+    )
+    assert (fixed.names, fixed.reason_fixed) == (
         (),
         "transitions of the kind `independent_tables` have no probability to worsen",
     )
@@ -268,7 +291,7 @@ def test_five_probabilities_are_too_many_to_be_learnt_and_stay_as_assumed():
     table["rewards"]["control"] = dict.fromkeys(names, 0.0)
     table["mission"]["first_control"] = names[0]
     table["planner"]["safest"] = None
-    found = why_transitions_are_kept(parse_scenario(table, "five"))
+    found = reason_transitions_are_fixed(parse_scenario(table, "five"))
     assert "they have 5 probabilities to worsen, and 4 are learnt together" in found
 
 
@@ -310,7 +333,9 @@ def test_assets_with_files_of_their_own_leave_a_control_by_plans_of_their_own(gr
     record = {"name": name, "members": [["a", 3, 0], ["b", 4, 1]], "scenarios": [table, table]}
     two = group.isel(twin=slice(2))
     control = two["control_index"].values[:, -1]
-    np.testing.assert_array_equal(leaving(tmp_path, record, two), [control[0] != 1, control[1] != 0])
+    np.testing.assert_array_equal(
+        leaving_probabilities(tmp_path, record, two), [control[0] != 1, control[1] != 0]
+    )
 
 
 def test_states_of_other_units_count_alike_for_who_is_badly_off():
@@ -326,7 +351,7 @@ def test_figures_of_a_fleet_have_standard_errors():
     error = random.standard_normal((52, 3, 2))
     error[50, 1:] = np.nan
     credible = np.r_[np.zeros(25), np.ones(25), 0.5, 1.0]
-    study = Outcomes.of(
+    study = Outcomes.from_store(
         {
             "status": np.r_[np.ones(50), 3.0, 2.0],
             "delay": np.r_[np.ones(40), np.full(5, np.inf), np.full(6, np.nan), 1.0],
@@ -343,16 +368,16 @@ def test_figures_of_a_fleet_have_standard_errors():
 
     bias, squared = (np.nanmean(error[:51] ** power, axis=1) for power in (1, 2))
     assert study.bias[1] == of_missions(bias[:, 1])
-    assert study.evidence == of_missions(bias[:, 0])
-    assert study.credible == of_missions(credible[:51])
-    assert study.within == Estimated(pytest.approx(40 / 45), pytest.approx(beta(41, 6).std()))
-    assert study.early == Estimated(0.2, pytest.approx(beta(11, 41).std()))
+    assert study.log_evidence == of_missions(bias[:, 0])
+    assert study.credible_coverage == of_missions(credible[:51])
+    assert study.prompt_fallbacks == Estimated(pytest.approx(40 / 45), pytest.approx(beta(41, 6).std()))
+    assert study.early_fallbacks == Estimated(0.2, pytest.approx(beta(11, 41).std()))
     again = [np.sqrt(np.mean(random.choice(squared[:, 0], 51))) for _ in range(4000)]  # the bootstrap
     assert study.rms[0].value == pytest.approx(np.sqrt(squared[:, 0].mean()))
     assert study.rms[0].error == pytest.approx(np.std(again), rel=0.1)
 
 
-def test_the_report_names_who_needs_attention(grown):
+def test_the_report_names_who_needs_probability_of_leaving(grown):
     fleet, folder = grown
     text = write_fleet_report(folder).read_text()
     (group,) = open_fleet(folder).values()
@@ -371,8 +396,11 @@ def test_the_report_names_who_needs_attention(grown):
     model, policy = knowledge.model, knowledge.plan.control_index
     belief = np.eye(model.states.size)
     always = replace(knowledge, policy=BeliefPolicy(np.ones((1, len(belief))), np.array([1])))
-    assert [attention(always, belief, one).tolist() for one in (1, 0)] == [[0.0] * 25, [1.0] * 25]
-    found = attention(knowledge, belief, 1)
+    assert [probability_of_leaving(always, belief, one).tolist() for one in (1, 0)] == [
+        [0.0] * 25,
+        [1.0] * 25,
+    ]
+    found = probability_of_leaving(knowledge, belief, 1)
     assert (found[policy != 1] == 1.0).all()
     kept = policy == 1  # the damage moves under the control in force as long as it is kept
     stays = model.transition.matrix[1][np.ix_(kept, kept)]
@@ -381,14 +409,19 @@ def test_the_report_names_who_needs_attention(grown):
     assert np.ptp(chance) > 0.1
     section = scenario.planner.model_copy(update={"decide_on": "predicted"})
     ahead = replace(knowledge, scenario=scenario.model_copy(update={"planner": section}))
-    np.testing.assert_allclose(attention(ahead, belief, 1), model.transition.matrix[1] @ found, atol=1e-12)
+    np.testing.assert_allclose(
+        probability_of_leaving(ahead, belief, 1), model.transition.matrix[1] @ found, atol=1e-12
+    )
 
     # Who gave an alarm comes first, then who leaves soon; with the same percentage by its state.
     beliefs, alarms = group["belief"].values.astype(float), group["notices"].values[:, 0]
-    soon = [attention(knowledge, own[None], int(u))[0] for own, u in zip(beliefs, control, strict=True)]
+    soon = [
+        probability_of_leaving(knowledge, own[None], int(u))[0]
+        for own, u in zip(beliefs, control, strict=True)
+    ]
     printed = np.rint(100.0 * np.maximum(soon, 0.0))
     worst = np.lexsort((-mean.sum(axis=1), -printed, -alarms))
     assert max(soon) > min(soon) + 0.1
     assert len(set(printed)) < len(set(soon))
-    table = fleet_page(folder, WORST).partition("Who needs attention next")[2]
+    table = fleet_page(folder, ATTENTION_ROWS).partition("Who needs attention next")[2]
     assert re.findall(r"seed-\d+", table) == [f"seed-{row}" for row in worst[:50]]

@@ -16,11 +16,13 @@ from tests.command_line import command, said, seen
 from tests.twin_master.runs import journal, text_of, written
 from tests.twin_master.watch.conftest import Mosquitto, mosquitto, served, wait_until, write_csv
 from twin_master.errors import FleetError, RunFolderError
+from twin_master.fleet.engine import Engine
 from twin_master.fleet.plan import load_fleet
-from twin_master.fleet.reading import group_figures, leaving
-from twin_master.fleet.report import WORST, fleet_page, serve_fleet, write_fleet_report
-from twin_master.fleet.shard import Engine
-from twin_master.fleet.watching import FleetWatch, WatchedAsset
+from twin_master.fleet.reading import group_figures, leaving_probabilities
+from twin_master.fleet.report import fleet_page, write_fleet_report
+from twin_master.fleet.view import ATTENTION_ROWS, serve_fleet
+from twin_master.fleet.watched_asset import WatchedAsset
+from twin_master.fleet.watching import FleetWatch
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.watch.folder import Watch
 from uav_twin import fly_fleet, learn_from_fleet, open_fleet
@@ -84,7 +86,7 @@ def watched(fleet_file: Path, out: Path, stop_after: int | None = None) -> Fleet
 
     def tell(asset: WatchedAsset, _decision: Decision) -> None:
         told.append(asset.name)
-        fleet.asked = len(told) == stop_after
+        fleet.is_end_requested = len(told) == stop_after
 
     fleet = FleetWatch(load_fleet(fleet_file), out, tell, told.append)
     fleet.run()
@@ -170,7 +172,7 @@ def test_an_asset_that_was_lost_is_taken_up_again(fleet_file, alone, tmp_path, m
         at += 1
         for log, content in zip(logs, contents, strict=True) if at == 3 else ():
             log.write_bytes(content)
-        fleet.asked = at == 6
+        fleet.is_end_requested = at == 6
 
     planned = load_fleet(fleet_of(tmp_path, LOGS.replace(".csv", "")))
     fleet = FleetWatch(planned, tmp_path / "out", tell, notes.append, follow=True)
@@ -210,7 +212,7 @@ def test_a_topic_for_each_asset(broker, alone, tmp_path, monkeypatch):
 
     def tell(_asset: WatchedAsset, decision: Decision) -> None:
         told.append(decision["step"])
-        fleet.asked = len(told) in (2, 2 * STEPS + 1)  # one more decision for the late message
+        fleet.is_end_requested = len(told) in (2, 2 * STEPS + 1)  # one more decision for the late message
 
     for wrong in (False, True):
         notes: list[str] = []
@@ -255,7 +257,7 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
     def tell(asset: WatchedAsset, decision: Decision) -> None:
         quiet = any(notice["kind"] == "quiet" for notice in decision["notices"])
         told.append((asset.name, decision["step"], quiet))
-        fleet.asked = told[-1] == ("north/two", 0, True)
+        fleet.is_end_requested = told[-1] == ("north/two", 0, True)
 
     def end() -> None:
         """Ask for it once the silence was published again, which a kill could have kept from the broker."""
@@ -263,14 +265,14 @@ def test_an_asset_that_falls_silent_while_another_is_heard(broker, tmp_path, mon
             publish(client, "one", 999)  # who has all steps is left alone
             further.append(len(states()))
         kinds = [notice["kind"] for one in heard if one.get("step") == 0 for notice in one["notices"]]
-        again.asked = kinds.count("quiet") >= 2 and len(states()) > further[0] + 5
+        again.is_end_requested = kinds.count("quiet") >= 2 and len(states()) > further[0] + 5
 
     def states() -> list[str]:
         return [one["state"] for one in heard if "state" in one]
 
     fleet = FleetWatch(load_fleet(tmp_path / "fleet.toml"), tmp_path / "out", tell, notes.append)
     fleet.run(lambda: send() if notes else None)
-    assert fleet.asked
+    assert fleet.is_end_requested
     assert fleet.failures == {}
     (tmp_path / "out" / "north" / "two" / "published").write_text("?")
     planned = load_fleet(tmp_path / "fleet.toml")
@@ -338,7 +340,9 @@ def leaving_soon(fleet_file: Path, folder: Path) -> Any:
     """Fly the recordings of a fleet; return the folder, and how probably each asset leaves its control."""
     outcome = fly_fleet(load_fleet(fleet_file), folder, Engine(0))
     config = json.loads((outcome.folder / "config.json").read_text())
-    return outcome.folder, leaving(outcome.folder, config["fleet"]["groups"][0], open_fleet(folder)["north"])
+    return outcome.folder, leaving_probabilities(
+        outcome.folder, config["fleet"]["groups"][0], open_fleet(folder)["north"]
+    )
 
 
 def watched_records(fleet_file: Path, folder: Path) -> list[dict[str, Any]]:
@@ -428,4 +432,4 @@ def test_an_asset_is_lost_alone_and_the_page_of_the_fleet_says_so(fleet_file, al
     del asset["last"]["health"]
     file.write_text(json.dumps(state))
     with pytest.raises(FleetError, match="out is damaged or of another version"):
-        fleet_page(tmp_path / "out", WORST)
+        fleet_page(tmp_path / "out", ATTENTION_ROWS)

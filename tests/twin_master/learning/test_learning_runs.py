@@ -17,7 +17,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import changed_scenario, figures_of, flight_of, journal, of_wing, text_of, written
 from twin_master.command import printed_value
 from twin_master.errors import TwinMasterError
-from twin_master.report.model import sensor_rows
+from twin_master.report.learnt import sensor_rows
 from twin_master.report.page import render_page
 from twin_master.report.reading import read_run
 from twin_master.scenario.reading import parse_scenario

@@ -213,7 +213,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_run_with_a_library_keeps_it_and_can_be_resumed(made, tmp_path):
     path = Path(shutil.copy(made, tmp_path / "pump.nc"))
     library = load_observation_library(path)
-    between = library.at_draws("viscosity_factor", np.array([0.955]))[0]
+    between = library.observations_at("viscosity_factor", np.array([0.955]))[0]
     np.testing.assert_allclose(between, 0.5 * (library.values[5] + library.values[6]), rtol=1e-14)
     whole = fly(SMALL, tmp_path / "whole", Overrides(library=path))
     assert not whole.origin.differ

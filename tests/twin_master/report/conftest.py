@@ -64,7 +64,7 @@ def line(axes: Axes, label: str) -> np.ndarray:
 def folder(library_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The paper's mission, with what the FMU of a wing would have monitored."""
     place = tmp_path_factory.mktemp("flown") / "run"
-    steps = flown(library_file, place).steps
+    steps = flown(library_file, place).step_count
     monitored = {
         name: ("step", [value] * steps, {"units": unit})
         for name, value, unit in (("strain_error_bound", 1.2e-6, "1"), ("tip_displacement", 0.18, "m"))

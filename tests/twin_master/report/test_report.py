@@ -21,9 +21,11 @@ from tests.refusals import Inputs, refused
 from tests.twin_master.report.conftest import altered, flown, line, panel, rescripted
 from twin_master.errors import RunFolderError
 from twin_master.report import page as report
+from twin_master.report.calibration import true_value
+from twin_master.report.check import predictive_check
 from twin_master.report.mission import default_now, mission_figure
-from twin_master.report.model import predictive_check, true_value
-from twin_master.report.page import lost_ranges, opening_sentences
+from twin_master.report.opening import opening_sentences
+from twin_master.report.page import lost_ranges
 from twin_master.report.reading import Run
 from twin_master.run_folder import to_json
 from twin_master.scenario.reading import load_scenario
@@ -107,7 +109,7 @@ def test_the_last_sentence_judges_the_scatter_and_what_was_learnt_is_said(run):
     course, name = np.tile([1.02, 0.004, 1.01, 1.03], (50, 1)), "Young modulus factor"
     learnt = LearntQuantity("young_modulus_factor", name, "", course, course[0], np.array(1.025))
     changed = replace(run)
-    vars(changed)["learnt"] = (learnt,)
+    vars(changed)["learnt_quantities"] = (learnt,)
     said = opening_sentences(changed)[1]
     assert said.endswith("; it learnt the Young modulus factor: 1.020 (1.012 to 1.028, truth 1.025).")
 
@@ -176,7 +178,7 @@ def test_short_missions(run, hold, tmp_path, steps, horizon):
 @pytest.mark.usefixtures("no_drawing")
 def test_lost_gauges_are_told_and_marked(run, hold, tmp_path):
     """Also one that never reports, and a run without any observation."""
-    observed = run.observed.copy()
+    observed = run.observations.copy()
     observed[12:19, 16:20] = observed[3:5] = np.nan
     lost = altered(run, observed__strain=observed)
     assert lost_ranges(lost) == "gauges 17, 18, 19, 20 at steps 12–18; all gauges at steps 3–4"
@@ -242,7 +244,7 @@ def test_another_layout_gives_one_sentence(folder, tmp_path, missing):
 
 @pytest.mark.usefixtures("no_drawing")
 def test_the_last_steps_of_a_watch_have_their_numbers_and_what_nobody_knows_is_left_out(run, hold, tmp_path):
-    observed = run.observed.copy()
+    observed = run.observations.copy()
     observed[7], observed[[8, 9], 2] = np.nan, np.nan
     shifted = altered(run, observed__strain=observed, truth=None).tree.map_over_datasets(
         lambda group: group.assign_coords(step=group["step"] + 1000) if "step" in group.coords else group

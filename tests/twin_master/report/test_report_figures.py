@@ -13,14 +13,11 @@ from fe.wing.design import SHIPPED_DESIGN, load_design
 from tests.twin_master.report.conftest import altered, line, panel, rescripted
 from twin_master.assets.design_source import DESIGN_COPY
 from twin_master.report import page as report
-from twin_master.report.mission import (
-    belief_figure,
-    belief_steps,
-    choose_sensors,
-    mission_figure,
-    policy_figure,
-)
-from twin_master.report.model import calibration_figure, measured, predictive_check
+from twin_master.report.belief import belief_figure, belief_steps, policy_figure
+from twin_master.report.calibration import calibration_figure, load_test
+from twin_master.report.captions import assumed_model_error
+from twin_master.report.check import predictive_check
+from twin_master.report.mission import choose_sensors, mission_figure
 from twin_master.report.reading import short_number
 from twin_master.report.structure import planform_figure, planform_of
 from twin_master.scenario.schema import Scenario
@@ -29,7 +26,7 @@ from twin_master.scenario.schema import Scenario
 def test_the_mission_figure_draws_the_stored_arrays(run):
     now, sensors = 18, [16, 3]
     figure = mission_figure(run, now, sensors)
-    belief, truth, observed = run.smoothed_until(now), run.truth, run.observed
+    belief, truth, observed = run.smoothed_until(now), run.true_state, run.observations
     for factor in range(2):
         axes = panel(figure, f"region {factor + 1}")
         assert_allclose(line(axes, "past")[:, 1], 100.0 * (belief @ run.model.states.coordinates)[:, factor])
@@ -92,7 +89,7 @@ def test_states_and_sensors_have_units_and_names_of_their_own(run, hold, tmp_pat
     assert panel(now, "Stiffness loss of region 2").get_ylabel() == "z₂ (%)"
     pressure = panel(now, "Pressure")
     assert pressure.get_ylabel() == "bar"
-    assert_array_equal(line(pressure, "observed")[:, 1], run.observed[:21, 0])
+    assert_array_equal(line(pressure, "observed")[:, 1], run.observations[:21, 0])
     assert panel(now, "Flow 4").get_ylabel() == "L/min"
     assert "in m2.K/W, percent; the past" in figures["mission_now"].caption
     assert "0.0002 bar (pressure), 0.0002 L/min (flow 2)" in figures["check"].caption
@@ -149,10 +146,10 @@ def test_predictive_check_by_hand(run, error, share):
     doubting, mean = rescripted(run, observation={"model_error": error}), run["filtered/quantity_mean"]
     unsaid = np.hypot(125e-6, np.asarray(error) * mean)
     check = predictive_check(altered(doubting, filtered__noise_standard_deviation=unsaid))
-    expected = (run.observed - mean) / np.hypot(unsaid, run["filtered/quantity_standard_deviation"])
+    expected = (run.observations - mean) / np.hypot(unsaid, run["filtered/quantity_standard_deviation"])
     assert_allclose(check.residual, expected)
     assert_allclose(check.coverage, np.mean(np.abs(expected) < 1.959964, axis=0))
-    assert report._check_words(doubting, check)["error"] == share
+    assert assumed_model_error(doubting) == share
     if not share:
         # the gauges have 150 microstrain and the twin assumes 125
         assert 1.0 < check.standard_deviation < 1.25
@@ -163,7 +160,7 @@ def test_predictive_check_by_hand(run, error, share):
 
 
 def test_calibration_shows_draws_posterior_and_measurements(run):
-    assert measured(run) is None
+    assert load_test(run) is None
     assert len(calibration_figure(run).axes) == 1
     grid = np.linspace(0.9, 1.1, 101)
     kept = {
@@ -192,7 +189,7 @@ def test_the_wing_is_coloured_by_belief_and_its_gauges_by_reading_and_residual(r
     assert above[1] - above[2] == pytest.approx(chords.tip_chord)
     assert chords.straight_chord_line * above[2] == pytest.approx((chords.straight_chord_line - 1) * above[1])
     assert_allclose(planform.gauges[:, 0], [span for span, _ in design.gauges.positions])
-    observed = run.observed.copy()
+    observed = run.observations.copy()
     observed[-1, 4] = np.nan
     changed = altered(run, observed__strain=observed)
     residual = predictive_check(changed).residual[-1]

@@ -27,9 +27,10 @@ from twin_master.assets.resolution import Overrides, asset_source, resolve_scena
 from twin_master.errors import MissionInputError, ScenarioError, TwinMasterError
 from twin_master.network.graphical_model import worsening_table
 from twin_master.run_folder import to_json
+from twin_master.scenario.kinds import AssetSection
+from twin_master.scenario.mission import Calibration
 from twin_master.scenario.reading import LoadedScenario, load_scenario, parse_scenario
-from twin_master.scenario.schema import Calibration, Scenario
-from twin_master.scenario.section import AssetSection
+from twin_master.scenario.schema import Scenario
 from uav_twin import fly, load_calibration, prepare_twin
 
 INPUTS = Inputs(__file__)
@@ -259,7 +260,9 @@ def test_what_flies_what_is_believed_and_what_a_run_keeps(folder, name, changes,
     assert files.get("asset/calibration.nc", content) == content
     portable = scenario.portable()
     assert str(folder) not in json.dumps(portable.to_dict())
-    assert {*re.findall('"/there/(.*?)"', json.dumps(portable.moved(Path("/there")).to_dict()))} <= kept
+    assert {
+        *re.findall('"/there/(.*?)"', json.dumps(portable.with_paths_from(Path("/there")).to_dict()))
+    } <= kept
 
 
 def test_what_options_change_and_what_stays_the_scenarios(folder):

@@ -233,7 +233,7 @@ def test_a_watch_that_was_down_takes_up_a_rotated_log(watch, mission, plain, tmp
 @pytest.mark.parametrize("allows_unknown", [False, True])
 def test_a_row_in_the_place_of_the_header_is_no_header(base, tmp_path, allows_unknown):
     """Also where names that are no sensor are passed over."""
-    scenario = base.scenario.having("watch", allow_unknown=allows_unknown)
+    scenario = base.scenario.with_changes("watch", allow_unknown=allows_unknown)
     path = tmp_path / "log.csv"
     path.write_text(row(2))
     with pytest.raises(MissionInputError, match=r"begins with `2,3e-5,1e-4`, .* found with --follow"):
@@ -250,4 +250,4 @@ def test_columns_of_which_none_is_known_are_refused_also_where_names_are_passed_
     path = tmp_path / "log.csv"
     path.write_text("strian_1,battery\n1e-4,3.3\n")
     with pytest.raises(MissionInputError, match="`strian_1` and `battery` are no sensors"):
-        CsvFeed(path, base.scenario.having("watch", allow_unknown=True))
+        CsvFeed(path, base.scenario.with_changes("watch", allow_unknown=True))

@@ -17,7 +17,7 @@ from tests.refusals import Inputs
 from tests.twin_master.runs import of_library
 from twin_master.mission.loop import operate
 from twin_master.mission.preparation import Knowledge
-from twin_master.scenario.schema import WatchSection
+from twin_master.scenario.tables import WatchSection
 from twin_master.watch import feeds
 from twin_master.watch.intake import Feed, Intake
 from twin_master.watch.message import LARGEST_MESSAGE, Message, MessageReader, Refused

@@ -26,7 +26,7 @@ EPOCH = 1_769_940_000
 
 def with_section(watch: Watch, **keys: Any) -> Watch:
     """Return a watch whose scenario has other keys in its table `[watch]`."""
-    watch.scenario = watch.scenario.having("watch", **keys)
+    watch.scenario = watch.scenario.with_changes("watch", **keys)
     return watch
 
 

@@ -1,0 +1,163 @@
+"""Checks of a fleet before its first twin flies; what flies in a fleet."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from twin_master.assets.asset_source import AssetSource
+from twin_master.assets.resolution import asset_source, believed_source
+from twin_master.errors import FleetError
+from twin_master.fleet.plan import Fleet, Group
+from twin_master.fleet.store import dimension_sizes
+from twin_master.mission.side_by_side import FLIGHT_ERRORS
+from twin_master.scenario.schema import Scenario
+from twin_master.watch.feeds import file_feed
+
+_WING_PARAMETER = "young_modulus_factor"
+"""The only parameter that the model of a wing knows."""
+_ROUNDING = 1e-12
+"""Distance of a value beyond a bound that is attributed to rounding."""
+
+
+def flies_model(scenario: Scenario) -> bool:
+    """Return whether the reduced model of a wing is flown itself, without an FMU packed from it.
+
+    This is so if the asset and the belief are of one design.
+    """
+    asset = scenario.asset
+    belief = scenario.belief
+    if (asset.kind, belief.kind) != ("design", "design") or scenario.models_differ:
+        return False
+    return getattr(asset, "design", None) == getattr(belief, "design", None)
+
+
+def source_of(scenario: Scenario, *, is_real: bool = False) -> AssetSource:
+    """Return the source of what flies in a fleet, and of what its twins believe.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario.
+    is_real : bool
+        Whether the assets are real, so that only the twins' belief is needed.
+    """
+    if is_real or flies_model(scenario):
+        return believed_source(scenario)
+    return asset_source(scenario)
+
+
+def with_parameters(scenario: Scenario, parameters: Mapping[str, float]) -> Scenario:
+    """Return a scenario whose asset has these true parameters beside its other ones."""
+    if not parameters:
+        return scenario
+    return scenario.with_changes(
+        "asset", parameters={**scenario.asset.true_parameters, **parameters}
+    )
+
+
+def check_fleet(fleet: Fleet) -> None:
+    """Check that every asset of a fleet can fly.
+
+    Raises
+    ------
+    FleetError
+        If any asset cannot fly; the sentence lists all such assets and the reasons.
+    """
+    objections = []
+    for group in fleet.groups:
+        objections += _objections_to_scenarios(group)
+        objections += _objections_to_recordings(group)
+    if objections:
+        heading = f"{len(objections)} of the assets cannot fly, so none did:"
+        raise FleetError("\n".join([heading, *objections]))
+
+
+def _objections_to_scenarios(group: Group) -> list[str]:
+    """Return why scenarios of a group cannot be flown, a sentence for each."""
+    objections = []
+    mean_parameters = {name: spread.mean for name, spread in group.parameter_spreads.items()}
+    is_real = bool(group.observations)
+    for number, scenario in enumerate(group.scenarios):
+        try:
+            _check_scenario(group, scenario)
+            source_of(with_parameters(scenario, mean_parameters), is_real=is_real).check()
+        except FLIGHT_ERRORS as error:
+            asset = group.name
+            if len(group.scenarios) > 1:
+                asset += f" {group.members[number].name}"
+            objections.append(f"{asset}: {error}")
+    return objections
+
+
+def _objections_to_recordings(group: Group) -> list[str]:
+    """Return why recordings of a group of real assets cannot be read, a sentence for each."""
+    if not group.observations:
+        return []
+    objections = []
+    for member in group.members:
+        try:
+            file_feed(member.file or Path(), group.scenarios[0])
+        except FLIGHT_ERRORS as error:
+            objections.append(f"{group.name}: {error}")
+    return objections
+
+
+def _check_scenario(group: Group, scenario: Scenario) -> None:
+    """Check that a group can fly one of its scenarios.
+
+    Raises
+    ------
+    FleetError
+        If it cannot.
+    """
+    if scenario.observation.role == "modes":
+        raise FleetError(
+            'a fleet keeps values alone, and `role = "modes"` observes each step with its own '
+            "covariance: fly the scenario with `uav-twin run`."
+        )
+    if group.observations:
+        _check_recordings(group)
+        return
+    has_one_life = scenario.truth.kind == "asset" and not getattr(scenario.asset, "seeds", ())
+    if has_one_life and len(group.scenarios) < len(group.members):
+        raise FleetError(
+            "the damage and noise of this asset are its own, so that every seed would fly the "
+            "same life: name its seeds in `asset.seeds`, or fly the scenario with --seed."
+        )
+    if flies_model(scenario):
+        unknown_parameters = sorted({*group.parameter_spreads} - {_WING_PARAMETER})
+        if unknown_parameters:
+            raise FleetError(
+                f"`parameters` names {', '.join(unknown_parameters)}, and the model of a wing "
+                f"knows only {_WING_PARAMETER}."
+            )
+        _check_true_parameters(group, scenario)
+    if dimension_sizes(scenario) != dimension_sizes(group.scenarios[0]):
+        raise FleetError("it has other states or sensors than the first asset of its group.")
+
+
+def _check_recordings(group: Group) -> None:
+    """Check that a group of real assets has recordings, each with a name of its own."""
+    names = {member.name for member in group.members}
+    if not names:
+        raise FleetError(
+            f"no recording fits {group.observations}; "
+            "what is still to come is watched by `fleet watch`."
+        )
+    if len(names) < len(group.members):
+        raise FleetError("two recordings have the same name, and it names the asset.")
+
+
+def _check_true_parameters(group: Group, scenario: Scenario) -> None:
+    """Check that the reduced model of a wing holds at the true parameter of every asset."""
+    from fe.wing.design import wing_structure
+
+    usual_value = scenario.asset.true_parameters.get(_WING_PARAMETER, 1.0)
+    values = [member.parameters.get(_WING_PARAMETER, usual_value) for member in group.members]
+    low, high = wing_structure(scenario.state_names, 0).ranges[_WING_PARAMETER]
+    outside = [value for value in values if not low - _ROUNDING <= value <= high + _ROUNDING]
+    if outside:
+        raise FleetError(
+            f"the true {_WING_PARAMETER} of {len(outside)} of {len(values)} assets is outside of "
+            f"{low:g} to {high:g}, where the model holds, such as {outside[0]:.4g}: "
+            "let it vary less, or fly FMUs."
+        )

@@ -1,0 +1,121 @@
+"""The folder of a fleet and its configuration, which one process uses at a time."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from reporting.folders import closing_lock
+from reporting.former_names import with_present_names
+from reporting.provenance import collect_provenance
+from twin_master import run_folder
+from twin_master.errors import RunFolderError
+from twin_master.fleet.plan import Group
+from twin_master.scenario import reading as scenario_reading
+
+KIND = "uav-twin fleet"
+"""The kind in the configuration of a fleet that is flown."""
+WATCHED_KIND = "uav-twin fleet watch"
+"""The kind in the configuration of a fleet that is watched."""
+GROUPS = "groups"
+"""The folder of what the twins of each group know."""
+
+_SCENARIOS = "fleet.groups.scenarios"
+PRESENT_NAMES = {
+    f"{_SCENARIOS}.{location}": name for location, name in scenario_reading.PRESENT_NAMES.items()
+}
+"""The present name of each key of a fleet's configuration, by its former location."""
+
+
+def _nothing_to_check() -> None:
+    """Accept a fleet without a check."""
+
+
+@contextmanager
+def locked_fleet_folder(
+    folder: Path,
+    kind: str,
+    record: Mapping[str, Any],
+    *,
+    replace_old: bool = False,
+    check: Callable[[], None] = _nothing_to_check,
+) -> Iterator[dict[str, Any]]:
+    """Return a context in which this process alone uses the folder of a fleet.
+
+    The folder is made, or a folder that holds the same fleet is used again.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    kind : str
+        `KIND` or `WATCHED_KIND`.
+    record : mapping
+        The fleet, as the configuration keeps it.
+    replace_old : bool
+        Whether another fleet in the folder is removed.
+    check : callable
+        Called before anything is written; it raises an error if the fleet cannot fly.
+
+    Yields
+    ------
+    dict
+        The configuration.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder holds something else, or if another process uses it.
+    NotResumableError
+        If the fleet was begun with another version of the program.
+    """
+    config = {"kind": kind, "format": 1, "fleet": record}
+    former_config = None if replace_old else run_folder.find_config(folder, kind)
+    if former_config is None:
+        check()
+        provenance = collect_provenance(record["seed"]).as_dict()
+        content = {**config, "provenance": provenance}
+        with run_folder.create_run_folder(folder, content, replace=replace_old):
+            yield config
+        return
+    same_keys = {key: former_config.get(key) for key in config}
+    if same_keys != json.loads(run_folder.to_json(config)):
+        otherwise = ", or give --replace" if kind == KIND else ""
+        raise RunFolderError(
+            f"{folder} holds another fleet, or the same with other files: "
+            f"choose another --out{otherwise}."
+        )
+    run_folder.check_versions(folder, former_config, record["seed"])
+    check()
+    with closing_lock(run_folder.lock_run_folder(folder)):
+        yield config
+
+
+def fleet_config(folder: Path, *kinds: str) -> dict[str, Any]:
+    """Return the configuration in the folder of a fleet.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder.
+    *kinds : str
+        The kinds of fleets that are accepted; by default one that is flown.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder does not hold such a fleet.
+    """
+    config = run_folder.find_config(folder, *(kinds or (KIND,)))
+    if config is None or "fleet" not in config:
+        if folder.exists():
+            raise RunFolderError(f"{folder} is not the folder of a fleet.")
+        raise RunFolderError(f"there is no folder {folder}.")
+    file = str(folder / run_folder.CONFIG_NAME)
+    return with_present_names(config, PRESENT_NAMES, file, RunFolderError)
+
+
+def group_folder(folder: Path, group: Group, scenario_number: int) -> Path:
+    """Return the folder of what the twins of a group know that fly one of its scenarios."""
+    return folder / GROUPS / group.name / str(scenario_number)

@@ -1,0 +1,260 @@
+"""Who flies the shards of a fleet: this process, worker processes of this machine, or a cluster.
+
+Results of workers come back in any order.
+"""
+
+import logging
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from itertools import islice
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
+
+from reporting.files import hash_record
+from reporting.progress import Progress
+from reporting.provenance import collect_provenance
+from twin_master.errors import FleetError
+from twin_master.fleet.plan import Member
+from twin_master.fleet.shard import ShardResult, fly_shard, result_of_unflown
+
+if TYPE_CHECKING:
+    from distributed import Client, Future
+
+WAITING_PER_CORE = 2
+"""Shards that wait at each core beside the one that it flies; the others wait here."""
+CONNECTING = 10.0
+"""Time in which a scheduler must answer [s]."""
+ALLOWED_DEATHS = 2
+"""Number of workers that may die over a shard before its twins fly one by one."""
+
+
+@dataclass(frozen=True)
+class Engine:
+    """The processes that fly a fleet.
+
+    Attributes
+    ----------
+    workers : int
+        The number of worker processes of this machine; with 0 this process flies.
+    cluster : str or None
+        The address of a Dask scheduler, which takes the place of workers of this machine.
+    """
+
+    workers: int = 0
+    cluster: str | None = None
+
+    @property
+    def needs_dask(self) -> bool:
+        """Whether other processes than this one fly."""
+        return self.workers > 0 or self.cluster is not None
+
+
+class Piece(NamedTuple):
+    """A shard, or one twin of a shard that has cost a worker its life.
+
+    Attributes
+    ----------
+    group_number : int
+        The number of its group in the fleet.
+    kit : bytes
+        The packed `Kit` of its twins.
+    members : tuple of Member
+        Its twins.
+    """
+
+    group_number: int
+    kit: bytes
+    members: tuple[Member, ...]
+
+
+class FlownPiece(NamedTuple):
+    """A piece with its result."""
+
+    piece: Piece
+    result: ShardResult
+
+
+def fly_pieces(engine: Engine, pieces: Iterator[Piece], progress: Progress) -> Iterator[FlownPiece]:
+    """Fly pieces, and yield each with its result once it is done.
+
+    Parameters
+    ----------
+    engine : Engine
+        The processes that fly.
+    pieces : iterator of Piece
+        The pieces; they are taken as they are needed.
+    progress : Progress
+        Shows the address of the dashboard of workers.
+
+    Raises
+    ------
+    FleetError
+        If the scheduler does not answer, or if workers run another version of the program.
+    """
+    if not engine.needs_dask:
+        for piece in pieces:
+            yield FlownPiece(piece, fly_shard(piece.kit, piece.members))
+        return
+    with _connected_client(engine) as client:
+        progress.note(f"Dask dashboard: {client.dashboard_link}")
+        yield from _fly_by_workers(client, pieces)
+
+
+def _fly_by_workers(client: "Client", pieces: Iterator[Piece]) -> Iterator[FlownPiece]:
+    """Fly pieces by workers.
+
+    The twins of a piece over which workers died are flown one by one, and the one over which a
+    worker dies again has failed.
+    """
+    from distributed import CancelledError, as_completed
+    from distributed.scheduler import KilledWorker
+
+    piece_of_key: dict[str, Piece] = {}
+
+    def submit(some_pieces: Iterable[Piece]) -> "list[Future]":
+        futures = []
+        for piece in some_pieces:
+            future = client.submit(
+                _fly_on_worker, piece.kit, piece.members, program_version(), pure=False
+            )
+            piece_of_key[future.key] = piece
+            futures.append(future)
+        return futures
+
+    cores = max(1, sum(client.nthreads().values()))
+    running = as_completed(submit(islice(pieces, cores * (1 + WAITING_PER_CORE))))
+    for future in running:
+        piece = piece_of_key.pop(future.key)
+        try:
+            # The scheduler flies a piece again, on another worker, if its worker died.
+            result: ShardResult = future.result()
+        except KilledWorker:
+            if len(piece.members) > 1:
+                single_twins = [piece._replace(members=(member,)) for member in piece.members]
+                running.update(submit(single_twins))
+                continue
+            reason = "its flight ended the worker process: fly an FMU that crashes isolated."
+            result = result_of_unflown(piece.members[0], reason)
+        except CancelledError:
+            raise FleetError(
+                "the scheduler was lost: what was flown is kept, "
+                "repeat the command to go on from there."
+            ) from None
+        yield FlownPiece(piece, result)
+        del future  # lets the workers forget the result
+        running.update(submit(islice(pieces, 1)))
+
+
+@cache
+def program_version() -> str:
+    """Return a hash of this program and of the packages on which its numbers depend."""
+    provenance = collect_provenance().as_dict()
+    python = list(sys.version_info[:2])
+    return hash_record([provenance["versions"], provenance["source_hashes"], python])
+
+
+def _fly_on_worker(kit: bytes, members: Sequence[Member], version: str) -> ShardResult:
+    """Fly a shard in a worker process, if it runs the given version of the program.
+
+    Raises
+    ------
+    FleetError
+        If it runs another version.
+    """
+    if version != program_version():
+        raise FleetError(
+            "a worker of the cluster runs another version of this program, of Python or of a "
+            "package that numbers depend on: install the same lock file there. "
+            "What was flown before is kept."
+        )
+    return fly_shard(kit, members)
+
+
+@contextmanager
+def _connected_client(engine: Engine) -> "Iterator[Client]":
+    """Return a context with a client of the cluster, or of workers that live as long as it."""
+    import dask
+
+    # Importing `distributed` adds its defaults to the configuration. That must happen before the
+    # settings below, which are undone at the end together with all that was added meanwhile.
+    import distributed  # noqa: F401
+
+    quiet_settings = {
+        "distributed.scheduler.allowed-failures": ALLOWED_DEATHS,
+        "distributed.comm.timeouts.connect": CONNECTING,
+        "distributed.worker.memory.terminate": False,
+        "distributed.admin.large-graph-warning-threshold": "1 GiB",
+        "logging.distributed": "critical",
+    }
+    with dask.config.set(quiet_settings):
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
+        if engine.cluster is not None:
+            with _cluster_client(engine.cluster) as client:
+                yield client
+        else:
+            with _local_client(engine.workers) as client:
+                yield client
+
+
+@contextmanager
+def _cluster_client(address: str) -> "Iterator[Client]":
+    """Return a context with a client of the scheduler at an address.
+
+    Raises
+    ------
+    FleetError
+        If the scheduler does not answer, or if it has no workers.
+    """
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=CONNECTING)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise FleetError(
+            f"no Dask scheduler answers at {address}: start one with `dask scheduler` and give "
+            "the address that it prints."
+        ) from error
+    with client:
+        if not client.nthreads():
+            raise FleetError(
+                f"the scheduler at {address} has no workers: "
+                f"start some with `dask worker {address}`."
+            )
+        yield client
+
+
+@contextmanager
+def _local_client(workers: int) -> "Iterator[Client]":
+    """Return a context with a client of worker processes of this machine."""
+    from distributed import Client, LocalCluster
+
+    with (
+        _hidden_main_module(),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=":0",
+            silence_logs=logging.CRITICAL,
+        ) as cluster,
+        Client(cluster) as client,
+    ):
+        yield client
+
+
+@contextmanager
+def _hidden_main_module() -> Iterator[None]:
+    """Return a context in which new processes do not run the caller's script again.
+
+    `multiprocessing` would have them do so, at the start and whenever a worker that died is
+    replaced.
+    """
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main

@@ -1,0 +1,204 @@
+"""What a fleet has taught: as `learnt.toml`, with which scenarios are flown, and as a table."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from reporting.files import atomic_write_text
+from reporting.toml_file import toml_text
+from reporting.words import counted
+from twin_master.fleet.configuration import fleet_config
+
+LESSONS_NAME = "learnt.json"
+"""The file in the folder of a fleet that holds what was learnt from it, for its report."""
+HEADING = """\
+# Learnt by `uav-twin fleet learn`. Fly with it: `uav-twin run SCENARIO --learnt THIS_FILE`, or
+# `learnt = "THIS_FILE"` in a group of a fleet.
+"""
+
+Record = Mapping[str, Any]
+"""A part of the record of what was learnt; see `learn_from_fleet`."""
+
+
+def write_learnt(path: Path, folder: Path, record: Record) -> Path:
+    """Write the tables that replace those of a scenario, for a new asset and for each group.
+
+    A new asset has the mean probabilities that the groups share, and the population of the
+    parameter over the largest group. All numbers are in SI units.
+
+    Parameters
+    ----------
+    path : Path
+        The file to write.
+    folder : Path
+        The folder of the fleet, which knows what was assumed of the sensors.
+    record : mapping
+        What was learnt; see `learn_from_fleet`.
+
+    Returns
+    -------
+    Path
+        The path of the file.
+    """
+    groups = record["groups"]
+    scenarios = {}
+    for group in fleet_config(folder)["fleet"]["groups"]:
+        scenarios[group["name"]] = group["scenarios"][0]
+    largest = max(groups, key=lambda name: groups[name]["twins"])
+    shared_means = record.get("shared", groups[largest]["probability"])
+    content: dict[str, Any] = {
+        "format": 1,
+        "source": record["source"],
+        **_scenario_tables(groups[largest], shared_means, scenarios[largest]),
+    }
+    if len(groups) > 1:
+        content["group"] = {
+            name: _scenario_tables(group, group["probability"], scenarios[name])
+            for name, group in groups.items()
+        }
+    return atomic_write_text(path, HEADING + toml_text(content))
+
+
+def _scenario_tables(group: Record, means: Record, scenario: Record) -> dict[str, Any]:
+    """Return the tables that replace those of a scenario, from what was learnt of a group.
+
+    Parameters
+    ----------
+    group : mapping
+        What was learnt of the group.
+    means : mapping
+        Records with the mean of each probability, of the group or shared by all groups.
+    scenario : mapping
+        The scenario of the group.
+    """
+    tables: dict[str, Any] = {}
+    probability = _mean_probabilities(group, means)
+    if probability:
+        tables["transition"] = {"probability": probability}
+    assumed_noise = np.asarray(scenario["observation"]["standard_deviation"])
+    noise = assumed_noise * group["noise_factor"]["mean"]
+    tables["observation"] = {"standard_deviation": noise.tolist()}
+    population = group.get("population")
+    if population:
+        tables["calibration"] = {
+            "parameter": population["parameter"],
+            "mean": population["mean"]["mean"],
+            "standard_deviation": _deviation_of_new_asset(population),
+        }
+    return tables
+
+
+def _mean_probabilities(group: Record, means: Record) -> dict[str, Any]:
+    """Return the mean probabilities to worsen by control, or by control and factor.
+
+    For a control that never flew nothing was learnt, and its assumed probability is returned.
+    """
+    probabilities: dict[str, Any] = {}
+    for name, learnt in group["probability"].items():
+        mean = means[name]["mean"] if learnt["flown"] else learnt["assumed"]
+        control, _, factor = name.partition(", ")
+        if factor:
+            probabilities.setdefault(control, {})[factor] = mean
+        else:
+            probabilities[control] = mean
+    return probabilities
+
+
+def _deviation_of_new_asset(population: Record) -> float:
+    """Return the standard deviation of the parameter of an asset that nothing was observed of.
+
+    It unites the deviation of the population, and what is uncertain of it and of its mean.
+    """
+    deviation = population["spread"]
+    return float(
+        np.linalg.norm(
+            [
+                deviation["mean"],
+                deviation["standard_deviation"],
+                population["mean"]["standard_deviation"],
+            ]
+        )
+    )
+
+
+class LessonRow(NamedTuple):
+    """A row of the table of what was learnt.
+
+    Attributes
+    ----------
+    group : str
+        The group, in its first row; else empty.
+    quantity : str
+        The quantity that was learnt.
+    assumed, mean, interval : str
+        Its assumed value, its mean and its 95 % interval.
+    """
+
+    group: str
+    quantity: str
+    assumed: str
+    mean: str
+    interval: str
+
+
+def lesson_rows(record: Record) -> list[LessonRow]:
+    """Return what was learnt as rows of a table."""
+    rows = []
+    for name, group in record["groups"].items():
+        first_row, *other_rows = _group_rows(group)
+        rows.append(first_row._replace(group=_group_heading(name, group)))
+        rows += other_rows
+    for control, mean_over_groups in record.get("shared", {}).items():
+        mean = mean_over_groups["mean"]
+        deviation = mean_over_groups["standard_deviation"]
+        title = f"mean over groups, {control}"
+        rows.append(LessonRow("all groups", title, "", f"{mean:.4f} ± {deviation:.2g}", ""))
+    return rows
+
+
+def _group_heading(name: str, group: Record) -> str:
+    """Return the name of a group with its numbers of twins and of twins with an alarm."""
+    heading = f"{name}, {counted(group['twins'], 'twin')}"
+    if group["alarmed"]:
+        heading += f", {group['alarmed']} with an alarm"
+    return heading
+
+
+def _group_rows(group: Record) -> Iterator[LessonRow]:
+    """Yield what was learnt of a group: probabilities, noise, and population."""
+    for control, probability in group["probability"].items():
+        yield _probability_row(control, probability)
+    if "transitions_kept_because" in group:
+        yield LessonRow("", "transitions", "as assumed", "not learnt", "")
+    yield _value_row("noise over the assumed", "1", group["noise_factor"])
+    population = group.get("population")
+    if population:
+        for moment in ("mean", "spread"):
+            title = f"{population['parameter']}, {moment}"
+            yield _value_row(title, "", population[moment])
+
+
+def _probability_row(control: str, probability: Record) -> LessonRow:
+    """Return the row of a probability to worsen, of a control and perhaps of a factor."""
+    title = f"probability to worsen, {control}"
+    assumed = probability["assumed"]
+    if not probability["flown"]:
+        return LessonRow("", title, f"{assumed:.4f}", "", "not flown")
+    low = probability["lower_95"]
+    high = probability["upper_95"]
+    outside = "" if low <= assumed <= high else " (outside)"
+    return LessonRow(
+        group="",
+        quantity=title,
+        assumed=f"{assumed:.4f}{outside}",
+        mean=f"{probability['mean']:.4f}",
+        interval=f"{low:.4f} to {high:.4f}",
+    )
+
+
+def _value_row(title: str, assumed: str, learnt: Record) -> LessonRow:
+    """Return the row of a quantity with its mean and interval."""
+    interval = f"{learnt['lower_95']:.4g} to {learnt['upper_95']:.4g}"
+    return LessonRow("", title, assumed, f"{learnt['mean']:.4g}", interval)

@@ -1,0 +1,98 @@
+"""Figures of a group of assets: a map of their health, and their health over time."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from reporting import figures as style
+from reporting.arrays import Float
+from twin_master.fleet.reading import severity
+from twin_master.report.reading import printed_factors
+from twin_master.scenario.schema import Scenario
+
+_LETTERS = "abcdefgh"
+
+
+@style.publication_style()
+def map_figure(scenario: Scenario, mean: Float, failed: int) -> Figure:
+    """Draw a cell for each asset, coloured by its state, in a panel for each factor of the state.
+
+    The most severely damaged asset comes first; assets that failed in flight are grey.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario with F factors of the state.
+    mean : (B, F) array
+        The last mean states, in SI units; NaN if no state is believed.
+    failed : int
+        The number of assets that failed in flight.
+    """
+    factors = printed_factors(scenario)
+    count = len(mean) + failed
+    columns = max(1, int(np.ceil(np.sqrt(2.0 * count))))
+    rows = -(-count // columns)  # rounded up
+    order = np.argsort(-severity(scenario, mean), kind="stable")
+    is_asset = np.where(np.arange(rows * columns) < count, 1.0, np.nan).reshape(rows, columns)
+    look: dict[str, Any] = {"aspect": "auto", "interpolation": "nearest"}
+    figure, panels = style.panels(
+        len(factors), 1, 0.4 + 1.9 * len(factors), 0.3, 0.1, left=0.07, right=0.99, hspace=0.25
+    )
+    for number, (factor, (axes,)) in enumerate(zip(factors, panels, strict=True)):
+        cells = np.full(rows * columns, np.nan)
+        cells[: len(mean)] = factor.scale * mean[order, number]
+        axes.imshow(is_asset, cmap="Greys", vmin=0.0, vmax=2.0, **look)  # the grey background
+        image = axes.imshow(
+            np.ma.masked_invalid(cells.reshape(rows, columns)),
+            cmap=style.LEVELS,
+            vmin=factor.levels[0],
+            vmax=factor.levels[-1],
+            **look,
+        )
+        axes.set_xticks([])
+        axes.set_yticks([])
+        style.panel_label(axes, _LETTERS[number % len(_LETTERS)], factor.title)
+        # The scale stands on the left, where a narrow screen shows it.
+        style.color_bar(
+            figure, image, factor.unit, ax=axes, location="left", pad=0.02, fraction=0.03
+        )
+    return figure
+
+
+@style.publication_style()
+def course_figure(scenario: Scenario, mean: Float, state: Float) -> Figure:
+    """Draw the states of B assets over T steps: bands of the estimates, and medians.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario with F factors of the state.
+    mean : (B, T, F) array
+        The mean states, in SI units; NaN in steps that were not flown.
+    state : (B, T, F) array
+        The true states, in SI units; NaN where nobody knows them.
+    """
+    factors = printed_factors(scenario)
+    figure, (panels,) = style.panels(1, len(factors), 2.4, 0.3, 0.45, wspace=0.25)
+    steps = np.flatnonzero(~np.isnan(mean).all(axis=(0, 2)))
+    for number, (factor, axes) in enumerate(zip(factors, panels, strict=True)):
+        estimates = factor.scale * mean[:, steps, number]
+        truths = factor.scale * state[:, steps, number]
+        quantiles = np.nanquantile(estimates, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
+        low, lower_quartile, median, upper_quartile, high = quantiles
+        style.band(axes, steps, low, high, style.PRESENT)
+        style.band(axes, steps, lower_quartile, upper_quartile, style.PRESENT)
+        axes.plot(steps, median, color=style.PRESENT, label="median of the filtered means")
+        is_truth_known = ~np.isnan(truths).all(axis=0)  # assets may have ended before
+        true_median = np.nanmedian(truths[:, is_truth_known], axis=0)
+        axes.plot(
+            steps[is_truth_known],
+            true_median,
+            **style.TRUTH_LINE,
+            label="median of the true states",
+        )
+        axes.set_xlabel(scenario.mission.step_name)
+        axes.set_ylabel(f"{factor.title} ({factor.unit})")
+        style.panel_label(axes, _LETTERS[number % len(_LETTERS)])
+    return figure

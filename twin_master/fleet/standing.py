@@ -1,0 +1,140 @@
+"""How the assets of a group stand after their last steps, from the store or from a watch."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from reporting.arrays import Float, Index
+from twin_master.fleet.reading import believed_means, last_steps, notice_counts, severity
+from twin_master.fleet.store import flown_rows
+from twin_master.scenario.schema import Scenario
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How B assets of a group stand after their last steps.
+
+    Attributes
+    ----------
+    group : str
+        The name of the group.
+    scenario : Scenario
+        Its scenario, with F factors of the state.
+    names : list of str
+        The names of the assets.
+    step : (B,) array
+        The last step of each.
+    mean, deviation : (B, F) array
+        Mean and standard deviation of the state, in SI units; NaN if no state is believed.
+    control : list of str
+        The control in force.
+    alarms : (B,) array
+        The number of alarms.
+    leaving : (B,) array
+        The probability that the control is left within the predicted steps; NaN if not known.
+    """
+
+    group: str
+    scenario: Scenario
+    names: list[str]
+    step: Index
+    mean: Float
+    deviation: Float
+    control: list[str]
+    alarms: Index
+    leaving: Float
+
+    @property
+    def severity(self) -> Float:
+        """The severity of the damage of each asset, a (B,) array."""
+        return severity(self.scenario, self.mean)
+
+    @property
+    def most_damaged(self) -> int | None:
+        """The number of the most severely damaged asset; None if no state is believed of any."""
+        if np.isnan(self.severity).all():
+            return None
+        return int(np.nanargmax(self.severity))
+
+
+def standing_of_flown(record: Mapping[str, Any], group: "xr.Dataset") -> Standing:
+    """Return how the twins of a group stood after their last steps.
+
+    The probabilities of leaving a control are NaN; computing them takes what the twins know.
+
+    Parameters
+    ----------
+    record : mapping
+        The group in `config.json`.
+    group : Dataset
+        The group in the store.
+    """
+    scenario = Scenario.model_validate(record["scenarios"][0])
+    flown = flown_rows(group["status"].values)
+    last_step = last_steps(group)[flown]
+    at_last_step = (flown, last_step)
+    control = group["control_index"].values[at_last_step]
+    names = [name for name, _seed, _scenario_number in record["members"]]
+    return Standing(
+        group=record["name"],
+        scenario=scenario,
+        names=[names[row] for row in flown],
+        step=last_step,
+        mean=believed_means(group)[at_last_step],
+        deviation=group["standard_deviation"].values[at_last_step],
+        control=[scenario.control_names[index] for index in control],
+        alarms=notice_counts(group, "alarm")[flown],
+        leaving=np.full(len(flown), np.nan),
+    )
+
+
+def standing_of_watched(record: Mapping[str, Any], assets: Mapping[str, Any]) -> Standing:
+    """Return how the assets of a watched group stand.
+
+    Parameters
+    ----------
+    record : mapping
+        The group in `config.json`.
+    assets : mapping
+        The records of assets with a decision by GROUP/NAME, of all groups; see `read_standing`.
+    """
+    scenario = Scenario.model_validate(record["scenarios"][0])
+    prefix = f"{record['name']}/"
+    names = [name for name in assets if name.startswith(prefix)]
+    records = [assets[name] for name in names]
+    decisions = [asset["last"] for asset in records]
+    healths = [decision["health"] for decision in decisions]
+    return Standing(
+        group=record["name"],
+        scenario=scenario,
+        names=[name.removeprefix(prefix) for name in names],
+        step=np.array([decision["step"] for decision in decisions]),
+        mean=_moments_of_states(scenario, healths, "mean"),
+        deviation=_moments_of_states(scenario, healths, "standard_deviation"),
+        control=[decision["control"] for decision in decisions],
+        alarms=np.array([asset["alarms"] for asset in records], np.int64),
+        leaving=np.array([asset["leaving"] for asset in records], np.float64),
+    )
+
+
+def _moments_of_states(scenario: Scenario, healths: list[dict[str, Any]], moment: str) -> Float:
+    """Return a moment of each factor of the state of B assets, a (B, F) array; NaN for None.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scenario.
+    healths : list of dict
+        For each asset, the moments of each factor by its name.
+    moment : str
+        The name of the moment.
+    """
+    rows = []
+    for health in healths:
+        rows.append([health[name][moment] for name in scenario.state_names])
+    return np.array(rows, np.float64)

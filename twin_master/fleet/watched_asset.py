@@ -1,0 +1,143 @@
+"""One asset of a fleet under watch, and how the assets of a watched fleet stand."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from reporting.former_names import with_present_names
+from reporting.json_file import read_json
+from twin_master.errors import FleetError
+from twin_master.fleet.reading import probability_of_leaving, severity
+from twin_master.watch.folder import Watch
+from twin_master.watch.intake import Feed
+
+STATE_NAME = "watched.json"
+"""The file in the folder of a watched fleet with the state of its assets, for its view."""
+_KEPT_OF_DECISION = ("step", "control", "next_control", "probability", "health")
+"""The entries of an asset's last decision that are kept."""
+
+
+def read_standing(folder: Path) -> dict[str, Any]:
+    """Return how the assets of a watched fleet stand.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of the fleet.
+
+    Returns
+    -------
+    dict
+        `assets` and `failures`, both empty if nothing was watched. For each asset, `last` is its
+        last decision, None before the first one; `alarms` and `refused` are the numbers of alarms
+        and of refused messages; `leaving` is the probability that its control is left within the
+        predicted steps, and `severity` the severity of its damage. The last two are None if no
+        state is believed.
+
+    Raises
+    ------
+    FleetError
+        If the file is damaged.
+    """
+    path = folder / STATE_NAME
+    if not path.is_file():
+        return {"assets": {}, "failures": {}}
+    standing = dict(read_json(path, FleetError))
+    return with_present_names(standing, {"assets.*.last.turn": "step"}, str(path), FleetError)
+
+
+def counts_of(standing: Mapping[str, Any]) -> dict[str, int]:
+    """Return the numbers of assets, steps, alarms, refused messages and failures.
+
+    Parameters
+    ----------
+    standing : mapping
+        The content of `read_standing`.
+    """
+    assets = standing["assets"].values()
+    decisions = [asset["last"] for asset in assets if asset["last"] is not None]
+    return {
+        "assets": len(assets),
+        "steps": sum(decision["step"] + 1 for decision in decisions),
+        "alarms": sum(asset["alarms"] for asset in assets),
+        "messages refused": sum(asset["refused"] for asset in assets),
+        "not watched": len(standing["failures"]),
+    }
+
+
+class WatchedAsset:
+    """An asset under watch.
+
+    Parameters
+    ----------
+    name : str
+        The names of its group and of itself, GROUP/NAME; its folder has the same name.
+    watch : Watch
+        The watch, which has begun.
+    feed : Feed
+        The feed of its observations.
+    previous_record : mapping or None
+        The record of the asset when it was watched last; None if it is new.
+
+    Attributes
+    ----------
+    decision : dict or None
+        The last decision.
+    alarms : set of str
+        The sentences of the alarms that the operator was given since the watch was taken up.
+    first_new_step : int
+        The first step of which the operator was told nothing before.
+    close : callable
+        Releases its folder.
+    """
+
+    close: Callable[[], None]
+
+    def __init__(
+        self,
+        name: str,
+        watch: Watch,
+        feed: Feed,
+        previous_record: Mapping[str, Any] | None,
+    ) -> None:
+        self.name = name
+        self.watch = watch
+        self.feed = feed
+        self._knowledge = watch.models[-1].knowledge
+        self.decision = watch.last_decision()
+        self.first_new_step = 0
+        self._previous_alarms = 0
+        if previous_record is not None and previous_record["last"] is not None:
+            self.first_new_step = previous_record["last"]["step"] + 1
+            self._previous_alarms = previous_record["alarms"]
+        self.alarms: set[str] = set()
+        if self.decision is not None:
+            for _step, notice in watch.told(self.first_new_step):
+                if notice.kind == "alarm":
+                    self.alarms.add(notice.sentence)
+            last_carried = watch.twin.carried[-1:]
+            watch.filtered = watch.twin.estimator.smoothed(last_carried)[0]
+
+    def record(self) -> dict[str, Any]:
+        """Return how the asset stands; see `read_standing`."""
+        record: dict[str, Any] = {
+            "last": None,
+            "alarms": self._previous_alarms + len(self.alarms),
+            "refused": self.watch.intake.counts.rejected,
+            "leaving": None,
+            "severity": None,
+        }
+        if self.decision is None or self.watch.filtered is None:
+            return record
+        record["last"] = {key: self.decision[key] for key in _KEPT_OF_DECISION}
+        if self.decision.get("state_believed", True):
+            scenario = self.watch.scenario
+            control = scenario.control_names.index(self.decision["control"])
+            belief = self.watch.filtered
+            probability = probability_of_leaving(self._knowledge, belief, control)
+            mean = np.array([state["mean"] for state in self.decision["health"].values()])
+            record["leaving"] = float(probability)
+            record["severity"] = float(severity(scenario, mean))
+        return record

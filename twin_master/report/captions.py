@@ -1,0 +1,267 @@
+"""Titles and captions of the figures of a report: the fields of the texts in `words.toml`."""
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from reporting.arrays import Float
+from reporting.page import ReportFigure, Words
+from reporting.words import capital, number, parameter_title, small
+from twin_master.report.calibration import load_test, parameter_unit, true_value
+from twin_master.report.check import PredictiveCheck
+from twin_master.report.reading import Run
+from twin_master.report.structure import StructurePicture
+
+WORDS = Words("twin_master.report")
+"""The texts of the report."""
+
+MISSION_NOW = "mission_now"
+"""The name of the figure of the mission as seen at the present step."""
+MISSION_WHOLE = "mission_whole"
+"""The name of the figure of the mission as seen from its last step."""
+NETWORK = "network"
+"""The name of the drawing of the decision network, which is the same for all runs."""
+
+
+def state_units(run: Run) -> str:
+    """Return the printed units of the factors of the state, each once."""
+    units = ["percent" if factor.unit == "%" else factor.unit for factor in run.factors]
+    return ", ".join(dict.fromkeys(units))
+
+
+def caption_mission(run: Run, figure: Figure, now: int, name: str) -> ReportFigure:
+    """Return the figure of the mission as seen at a step, with its title and caption.
+
+    Parameters
+    ----------
+    run : Run
+        The run.
+    figure : Figure
+        The figure.
+    now : int
+        The row of the present step, from 0 to T - 1.
+    name : str
+        The name of the figure: `MISSION_NOW` or `MISSION_WHOLE`.
+    """
+    is_last = now == run.step_count - 1
+    step_number = run.first_step + now
+    present = f"{run.step_word} {step_number}"
+    if name == MISSION_NOW:
+        title = f"The mission as the twin sees it at {present}"
+    else:
+        title = f"The whole mission, seen from its last {run.step_word}"
+    truth_sentence = "The black line is the truth, which the twin never sees."
+    report_figure = WORDS.figure(
+        "mission",
+        figure,
+        title=title,
+        symbols=", ".join(factor.symbol for factor in run.factors),
+        state_units=state_units(run),
+        evidence="all observations" if is_last else f"the observations up to {present}",
+        step=run.step_word,
+        now=step_number,
+        horizon=run.horizon,
+        sensor_title=capital(run.sensors.word),
+        quantity=run.sensors.quantity,
+        unit=run.sensors.unit or "each in its unit",
+        past="in hindsight" if is_last else "as seen at the time",
+        later_observations="" if is_last else f"hollow: not yet made at {present}; ",
+        later_controls="" if is_last else "; triangles: flown later",
+        decision=_decision_sentence(run, now),
+        truth="" if run.true_state is None else truth_sentence,
+    )
+    return report_figure._replace(name=name)
+
+
+def _decision_sentence(run: Run, now: int) -> str:
+    """Return the sentence on what the twin decided at the end of a step."""
+    probability = run["filtered/decision_probability"][now]
+    chosen = int(np.argmax(probability))
+    if run.decides_on_prediction:
+        state = f"predicted for that {run.step_word}"
+    else:
+        state = "as just observed"
+    return (
+        f"At the end of {run.step_word} {run.first_step + now} the twin decided on "
+        f"{run.controls[chosen]} for the next one: the policy asks for it with probability "
+        f"{probability[chosen]:.2f} in the state {state}."
+    )
+
+
+def caption_belief(run: Run, figure: Figure) -> ReportFigure:
+    """Return the figure of the belief about the state, with its title and caption."""
+    units = state_units(run)
+    is_truth_known = run.true_state is not None
+    if len(run.factors) == 2:
+        first, second = run.factors
+        report_figure = WORDS.figure(
+            "joint_belief",
+            figure,
+            first=first.symbol,
+            second=second.symbol,
+            state_units=units,
+            step=run.step_word,
+            truth="; ring: truth" if is_truth_known else "",
+        )
+    else:
+        report_figure = WORDS.figure(
+            "marginal_belief",
+            figure,
+            state_units=units,
+            step=run.step_word,
+            truth=" Black line: truth." if is_truth_known else "",
+        )
+    return report_figure._replace(name="belief")
+
+
+def caption_learnt(run: Run, figure: Figure) -> ReportFigure:
+    """Return the figure of the learnt quantities, with its title and caption."""
+    sensor_sentence = (
+        f"Of the {run.sensors.word}s on the left: the one named, which departs most from its "
+        "prior, has the band, and grey are the means of the others; on the right all of them, "
+        "and as a blue band their prior."
+    )
+    truth_sentence = "The truth is that of the simulated asset; the twin does not know it."
+    has_sensors = any(quantity.is_per_sensor for quantity in run.learnt_quantities)
+    has_truth = any(quantity.truth is not None for quantity in run.learnt_quantities)
+    return WORDS.figure(
+        "learnt",
+        figure,
+        step=run.step_word,
+        sensors=sensor_sentence if has_sensors else "",
+        truth=truth_sentence if has_truth else "",
+    )
+
+
+def caption_policy(run: Run, figure: Figure) -> ReportFigure:
+    """Return the figure of the policy, with its title and caption."""
+    controls = run.controls
+    if len(controls) == 1:
+        margin = ""
+    elif len(controls) == 2:
+        margin = (
+            f"b: how much more {controls[1]} is worth than {controls[0]} "
+            "(action values, dimensionless)."
+        )
+    else:
+        margin = "b: how much more the chosen control is worth than the next best (dimensionless)."
+    truth = "" if run.true_state is None else " (black: truth)"
+    return WORDS.figure("policy", figure, truth=truth, margin=margin)
+
+
+def caption_check(run: Run, check: PredictiveCheck, figure: Figure) -> ReportFigure:
+    """Return the figure of the posterior predictive check, with its title and caption."""
+    lowest_coverage = ""
+    if len(check.transform):
+        sensor = int(np.nanargmin(check.coverage))
+        title = small(run.sensors.titles[sensor])
+        lowest_coverage = f"Lowest coverage: {title}, {100.0 * check.coverage[sensor]:.0f} %."
+    return WORDS.figure(
+        "check",
+        figure,
+        step=run.step_word,
+        sensor=run.sensors.word,
+        count=len(check.transform),
+        rms=f"{check.standard_deviation:.2f}",
+        coverage=f"{100 * check.overall_coverage:.1f}",
+        lowest_coverage=lowest_coverage,
+        assumptions=_assumptions(run),
+    )
+
+
+def _assumptions(run: Run) -> str:
+    """Return what the twin assumes of the noise of its sensors and of the error of its model."""
+    assumptions = f"a noise of {_assumed_noise(run)}"
+    error = assumed_model_error(run)
+    if error:
+        assumptions += f" and an error of its model of {error} of the predicted value"
+    if run.scenario.learning is not None:
+        assumptions += ", and stands here by what it has learnt of it"
+    return assumptions
+
+
+def _assumed_noise(run: Run) -> str:
+    """Return the assumed noise with its unit; of each sensor if they differ in noise or unit."""
+    sensors = run.sensors
+    noise = np.asarray(run.scenario.observation.standard_deviation)
+    is_common = noise.ndim == 0 and bool(sensors.unit)
+    if is_common:
+        return f"{sensors.scale * float(noise):.4g} {sensors.unit}"
+    noise_of_sensors: Float = np.broadcast_to(noise, run.scenario.observation.count)
+    texts = []
+    for value, unit, title in zip(
+        noise_of_sensors.tolist(), sensors.units, sensors.titles, strict=True
+    ):
+        texts.append(f"{sensors.scale * value:.4g} {unit} ({small(title)})")
+    return ", ".join(texts)
+
+
+def assumed_model_error(run: Run) -> str:
+    """Return the assumed error of the model in percent, or its range; empty if it is zero."""
+    error = 100.0 * np.asarray(run.scenario.observation.model_error)
+    low = float(error.min())
+    high = float(error.max())
+    if high == 0.0:
+        return ""
+    return f"{low:.3g} %" if low == high else f"{low:.3g} to {high:.3g} %"
+
+
+def caption_calibration(run: Run, figure: Figure) -> ReportFigure:
+    """Return the figure of the calibration, with its title and caption."""
+    draws = run["calibration/draw_value"]
+    unit = parameter_unit(run)
+    truth = true_value(run)
+    truth_sentence = ""
+    if truth is not None:
+        truth_sentence = f"The asset flown has {number(truth)}, which the twin does not know."
+    return WORDS.figure(
+        "calibration",
+        figure,
+        before_flight=" before the flight" if run.learnt_quantities else "",
+        load_test=_load_test_sentence(run),
+        parameter=parameter_title(run.scenario.calibration.parameter),
+        unit="dimensionless" if unit == "1" else unit,
+        draw_count=len(draws),
+        mean=number(float(draws.mean())),
+        standard_deviation=number(float(draws.std())),
+        truth=truth_sentence,
+    )
+
+
+def _load_test_sentence(run: Run) -> str:
+    """Return the caption of the measurements of a calibration; empty if it has none."""
+    test = load_test(run)
+    if test is None:
+        return ""
+    return (
+        f"a: {len(test.load)} measured pairs of load and displacement, and the calibrated tip "
+        f"stiffness {test.stiffness:.1f} ± {test.stiffness_deviation:.1f} N/m "
+        "(band: two standard deviations). b:"
+    )
+
+
+def caption_mesh(run: Run, picture: StructurePicture) -> ReportFigure:
+    """Return the picture of a structure's mesh, with its title and caption."""
+    report_figure = WORDS.figure(
+        "mesh",
+        picture.figure,
+        step=run.step_word,
+        scale=f"{picture.scale:.3g}",
+        largest=f"{1e3 * picture.largest:.3g}",
+        sensor=run.sensors.word,
+    )
+    return report_figure._replace(name="structure")
+
+
+def caption_planform(run: Run, figure: Figure) -> ReportFigure:
+    """Return the picture of a wing from above, with its title and caption."""
+    report_figure = WORDS.figure("planform", figure, step=run.step_word, sensor=run.sensors.word)
+    return report_figure._replace(name="structure")
+
+
+def caption_network(run: Run) -> ReportFigure:
+    """Return the title and the caption of the decision network, whose drawing is a file."""
+    if run.decides_on_prediction:
+        deciding_belief = "the belief predicted from its observation"
+    else:
+        deciding_belief = "the belief that its observation updated"
+    return WORDS.figure(NETWORK, None, step=run.step_word, deciding_belief=deciding_belief)

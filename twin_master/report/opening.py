@@ -1,0 +1,276 @@
+"""The opening sentences of a report: on the decisions, the belief, and the model."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import binom
+
+from reporting.words import counted, listing, parameter_title
+from twin_master.network.estimator import is_state_believed
+from twin_master.report.check import PredictiveCheck, predictive_check
+from twin_master.report.reading import Run, moments_of
+from twin_master.store.mission_result import LearntQuantity
+from twin_master.store.summary import Fallback, control_changes, find_fallback
+
+_MOST_FACTORS = 4
+"""Largest number of factors of the state whose estimates are named."""
+_LEAST_DEPARTURE = 0.05
+"""Relative departure of the residuals' deviation from 1 below which it is not mentioned."""
+_DEVIATIONS_OF_CHANCE = 3.3
+"""Standard deviations that chance exceeds once in 1,000 times."""
+_FALSE_ALARM = 1e-3
+"""Probability of a false sentence about the coverage of any sensor."""
+
+
+def opening_sentences(run: Run) -> tuple[str, ...]:
+    """Return at most three sentences that sum up a run; a subject without data has none."""
+    sentences = (
+        _decision_sentence(run),
+        _belief_sentence(run),
+        _agreement_sentence(run, predictive_check(run)),
+    )
+    return tuple(sentence for sentence in sentences if sentence)
+
+
+@dataclass(frozen=True)
+class _Switch:
+    """The level of damage from which on a policy leaves the first control.
+
+    Attributes
+    ----------
+    factor : str
+        The factor of the state on which the policy depends, with its article.
+    level : str
+        The level with its unit.
+    is_always_reached : bool
+        Whether the level is the lowest, so that the policy leaves the first control in every state.
+    """
+
+    factor: str
+    level: str
+    is_always_reached: bool
+
+
+def _decision_sentence(run: Run) -> str:
+    """Return how the control went, and how long after the damage that calls for another one."""
+    first_control = run.controls[int(run.control_index[0])]
+    if len(run.controls) == 1:
+        return f"There was one control, {first_control}, and nothing to decide."
+    fallback = _fallback(run)
+    switch = _switch(run, fallback)
+    fell_back = fallback.fallback_step is not None and fallback.early_step is None
+    if fell_back and switch is not None and not switch.is_always_reached:
+        sentence = _fallback_clause(run, fallback, switch)
+    else:
+        sentence = _control_clause(run) + _switch_clause(run, fallback, switch)
+    unheeded_requests = _unheeded_requests(run)
+    if unheeded_requests:
+        count = _one_or_count(unheeded_requests, run.step_word)
+        sentence += f"; at {count} the twin had asked for another control"
+    return f"{sentence}."
+
+
+def _fallback(run: Run) -> Fallback:
+    """Return how the control fell back to a gentler one; empty if the true state is not known."""
+    if run.true_state is None:
+        return Fallback()
+    return find_fallback(
+        run.model.states,
+        run["policy/control_index"].astype(np.int64),
+        int(run.control_index[0]),
+        run.control_index,
+        run.true_state,
+    )
+
+
+def _switch(run: Run, fallback: Fallback) -> _Switch | None:
+    """Return the level at which the policy leaves the first control; None if there is no such."""
+    if fallback.switch_state is None or fallback.switch_level is None:
+        return None
+    factor = run.factors[run.scenario.state_names.index(fallback.switch_state)]
+    level = factor.scale * fallback.switch_level
+    return _Switch(
+        factor=_with_article(factor.title),
+        level=f"{level:.4g} {factor.unit}".rstrip(),
+        is_always_reached=level <= factor.levels[0],
+    )
+
+
+def _subject(run: Run) -> str:
+    """Return who decides on the control: the operator of a real asset, or the twin."""
+    return "The asset" if run.is_watched else "The twin"
+
+
+def _changes_of_control(run: Run) -> str:
+    """Return in words when which control was left for which."""
+    return control_changes(run.controls, run.control_index, run.step_word, run.first_step)
+
+
+def _fallback_clause(run: Run, fallback: Fallback, switch: _Switch) -> str:
+    """Return when the control fell back, and how long after the damage that calls for it."""
+    row = fallback.fallback_step
+    assert row is not None
+    if np.count_nonzero(np.diff(run.control_index)) == 1:
+        first_control = run.controls[int(run.control_index[0])]
+        new_control = run.controls[int(run.control_index[row])]
+        fell_back = (
+            f"{_subject(run)} fell back from {first_control} to {new_control} "
+            f"at {run.step_word} {run.first_step + row},"
+        )
+    else:
+        fell_back = f"{_subject(run)} {_changes_of_control(run)}; the first change came"
+    delay = fallback.delay
+    time = f"{_one_or_count(delay, run.step_word)} after" if delay else "when"
+    return f"{fell_back} {time} {switch.factor} had reached {switch.level}"
+
+
+def _control_clause(run: Run) -> str:
+    """Return which controls were flown."""
+    if np.any(np.diff(run.control_index)):
+        return f"{_subject(run)} {_changes_of_control(run)}"
+    control = run.controls[int(run.control_index[0])]
+    return f"{_subject(run)} kept {control} at every {run.step_word}"
+
+
+def _switch_clause(run: Run, fallback: Fallback, switch: _Switch | None) -> str:
+    """Return whether the damage called for another control; empty if no level of it does."""
+    if switch is None:
+        return ""
+    first_control = run.controls[int(run.control_index[0])]
+    if switch.is_always_reached:
+        return f"; the policy leaves {first_control} in every state"
+    level = f"the {switch.level} from which the policy leaves {first_control}"
+    if fallback.called_for_step is None:
+        return f"; {switch.factor} never reached {level}"
+    step = run.first_step + fallback.called_for_step
+    return f"; {switch.factor} reached {level} at {run.step_word} {step}"
+
+
+def _unheeded_requests(run: Run) -> int:
+    """Return in how many steps a real asset was not under the control that its twin asked for."""
+    if not run.is_watched:
+        return 0
+    requested_control = np.argmax(run["filtered/decision_probability"][:-1], axis=1)
+    return int(np.count_nonzero(requested_control != run.control_index[1:]))
+
+
+def _belief_sentence(run: Run) -> str:
+    """Return the last estimate of the state, and of the calibrated parameter if it was learnt.
+
+    If no state explains what the sensors measured, the sentence says that instead.
+    """
+    unexplained = run.get("notice/none_of_these")
+    if unexplained is not None and not is_state_believed(unexplained[-1]):
+        return (
+            f"At the end no state is believed: no state of the model explains the "
+            f"{run.sensors.word}s (probability {unexplained[-1]:.3g})."
+        )
+    estimates = [_state_estimate(run, index) for index in range(len(run.factors))]
+    if len(estimates) > _MOST_FACTORS:
+        remaining = len(estimates) - _MOST_FACTORS
+        estimates = estimates[:_MOST_FACTORS]
+        estimates.append(f"{counted(remaining, 'other state')} as the figures below show")
+    sentence = (
+        f"At the end the twin puts {listing(estimates)}; "
+        "in brackets two standard deviations either side"
+    )
+    decided_by = _decided_by(run)
+    if decided_by != "model":
+        sentence += f"; what decides its control is: {decided_by}"
+    for quantity in run.learnt_quantities:
+        if quantity.name == run.scenario.calibration.parameter:
+            sentence += f"; {_parameter_clause(quantity)}"
+    return f"{sentence}."
+
+
+def _decided_by(run: Run) -> str:
+    """Return what decided the last control, by the summary: "model" unless an alarm intervenes."""
+    for figure in run.summary.get("figures", ()):
+        if figure["key"] == "decided_by":
+            return figure["value"] or "model"
+    return "model"
+
+
+def _state_estimate(run: Run, index: int) -> str:
+    """Return the last estimate of one factor of the state, with its interval and the truth."""
+    factor = run.factors[index]
+    mean = factor.scale * run["filtered/mean"][-1, index]
+    deviation = factor.scale * run["filtered/standard_deviation"][-1, index]
+    ends = np.clip(mean + np.array([-2.0, 2.0]) * deviation, factor.levels[0], factor.levels[-1])
+    is_percentage = factor.unit == "%"
+    number_format = ".1f" if is_percentage else ".3g"
+    truth_format = ".0f" if is_percentage else ".3g"
+    low, high = (f"{end:{number_format}}" for end in ends)
+    interval = f"{low} to {high}" if low != high else "no other level is believed"
+    if run.true_state is not None:
+        truth = factor.scale * run.true_state[-1, index]
+        interval += f", truth {truth:{truth_format}}"
+    estimate = f"{mean:{number_format}} {factor.unit}".rstrip()
+    return f"{_with_article(factor.title)} at {estimate} ({interval})"
+
+
+def _parameter_clause(quantity: LearntQuantity) -> str:
+    """Return what was learnt of the calibrated parameter: mean, two deviations, and the truth."""
+    last = moments_of(quantity.posterior[-1])
+    mean = float(last.mean)
+    two_deviations = 2 * float(last.standard_deviation)
+    values = f"{mean:.3f} ({mean - two_deviations:.3f} to {mean + two_deviations:.3f}"
+    if quantity.truth is not None:
+        values += f", truth {float(quantity.truth):.4g}"
+    return f"it learnt {_with_article(parameter_title(quantity.name))}: {values})"
+
+
+def _agreement_sentence(run: Run, check: PredictiveCheck) -> str:
+    """Return whether the observations scatter about the model as the twin assumes.
+
+    Empty if nothing was observed.
+    """
+    count = int(check.count.sum())
+    if count == 0:
+        return ""
+    deviation = check.standard_deviation
+    # The deviation of n residuals has a standard error of 1 / sqrt(2 n).
+    threshold = max(_LEAST_DEPARTURE, _DEVIATIONS_OF_CHANCE / np.sqrt(2.0 * count))
+    coverage = f"{100.0 * check.overall_coverage:.0f} %"
+    scatter = "The observations scatter about the twin's model"
+    within = f"{coverage} of them lie within their 95 % intervals"
+    if deviation > 1.0 + threshold:
+        return (
+            f"{scatter} {deviation:.3g} times as far as it assumes: {within}; "
+            "the noise is larger, or the model is off."
+        )
+    if deviation < 1.0 - threshold:
+        return (
+            f"{scatter} {deviation:.2g} times as far as it assumes: {within}; "
+            "its intervals are wider than they need be."
+        )
+    sensor = _sensor_with_low_coverage(check)
+    if sensor is not None:
+        return (
+            f"Of all observations {coverage} lie within their 95 % intervals, "
+            f"but {100.0 * check.coverage[sensor]:.0f} % of those of {run.sensors.titles[sensor]}."
+        )
+    return f"The twin's model explains the observations within the noise that it assumes: {within}."
+
+
+def _sensor_with_low_coverage(check: PredictiveCheck) -> int | None:
+    """Return the sensor whose coverage is lower than chance explains; None if there is none.
+
+    If the model is right, the number of a sensor's observations within their 95 % intervals is
+    binomial. The limit of its probability is divided by the number of sensors (Bonferroni).
+    """
+    within = np.rint(np.nan_to_num(check.coverage, nan=1.0) * check.count)
+    p_value = binom.cdf(within, np.maximum(check.count, 1), 0.95)
+    p_value = np.where(check.count > 0, p_value, 1.0)
+    sensor = int(np.argmin(p_value))
+    return sensor if p_value[sensor] < _FALSE_ALARM / len(p_value) else None
+
+
+def _with_article(title: str) -> str:
+    """Return a title of several words with an article, and a symbol as it is."""
+    return f"the {title}" if " " in title and not title.startswith("the ") else title
+
+
+def _one_or_count(count: int, noun: str) -> str:
+    """Return a count with its noun; one is written as a word."""
+    return f"one {noun}" if count == 1 else counted(count, noun)

@@ -1,0 +1,175 @@
+"""Figures of plans: the decisions of a policy on beliefs, and a design of sensors."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.tri import Triangulation
+
+from reporting import figures as style
+from reporting.arrays import Float
+from twin_master.network.graphical_model import GraphicalModel
+from twin_master.network.planner import BeliefPolicy
+
+_CONTROL_COLORS = (
+    "#56B4E9",
+    "#E69F00",
+    style.PRESENT,
+    style.DECISION,
+    style.PREDICTION,
+    "#F0E442",
+    style.PAST,
+)
+_POINT_ROWS = 60
+"""Rows of points in a triangle of beliefs."""
+_MOST_FACTORS = 3
+"""Largest number of factors that are drawn, each in its own triangle."""
+_TRIANGLE = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 0.866]])
+"""The corners of a triangle in the picture: lowest level, highest level, level not known."""
+
+
+def corner_beliefs(model: GraphicalModel, factor: int) -> Float:
+    """Return the beliefs at the corners of a factor's triangle, a (3, S) array.
+
+    The factor is at its lowest level, at its highest, or equally probable at all of its levels;
+    the other factors are at their lowest levels.
+
+    Parameters
+    ----------
+    model : GraphicalModel
+        The model of S joint states.
+    factor : int
+        The index of the factor.
+    """
+    levels_of_factor: tuple[int | slice, ...] = (0, -1, slice(None))
+    corners = []
+    for level in levels_of_factor:
+        belief = np.zeros(model.states.shape)
+        possible_levels: list[int | slice] = [0] * belief.ndim
+        possible_levels[factor] = level
+        belief[tuple(possible_levels)] = 1.0
+        corners.append(belief.ravel() / belief.sum())
+    return np.array(corners)
+
+
+@style.publication_style()
+def plan_figure(policy: BeliefPolicy, model: GraphicalModel) -> Figure:
+    """Draw the control that a policy chooses for beliefs between three corners.
+
+    There is one triangle for each of the first factors of the state; see `corner_beliefs`.
+
+    Parameters
+    ----------
+    policy : BeliefPolicy
+        The policy.
+    model : GraphicalModel
+        The model of the states.
+    """
+    names = model.states.names[:_MOST_FACTORS]
+    count = len(model.controls)
+    colors = [_CONTROL_COLORS[number % len(_CONTROL_COLORS)] for number in range(count)]
+    weights = _triangle_weights()
+    x, y = (weights @ _TRIANGLE).T
+    mesh = Triangulation(x, y)
+    cell_weights = weights[mesh.triangles].mean(axis=1)  # (cells, 3), at the centres
+    figure, (row,) = style.panels(1, len(names), 3.2, 0.4, 0.45, left=0.03, right=0.97)
+    for factor, (axes, name) in enumerate(zip(row, names, strict=True)):
+        chosen = policy.decide(cell_weights @ corner_beliefs(model, factor))
+        axes.tripcolor(
+            mesh,
+            facecolors=chosen,
+            edgecolors="face",
+            cmap=ListedColormap(colors),
+            vmin=-0.5,
+            vmax=count - 0.5,
+        )
+        _name_corners(axes)
+        style.panel_label(axes, "abc"[factor], f"Belief of {name}")
+    handles = style.swatches(model.controls, colors)
+    figure.legend(handles=handles, loc="lower center", ncols=count, handlelength=1.4)
+    return figure
+
+
+def _triangle_weights() -> Float:
+    """Return the weights of the three corners at points that fill a triangle, an (N, 3) array."""
+    fractions = []
+    for i in range(_POINT_ROWS + 1):
+        fractions += [(i, j) for j in range(_POINT_ROWS + 1 - i)]
+    weights_of_two = np.array(fractions) / _POINT_ROWS
+    return np.column_stack((1.0 - weights_of_two.sum(axis=1), weights_of_two))
+
+
+def _name_corners(axes: Axes) -> None:
+    """Write below and above a triangle which beliefs its corners are."""
+    axes.text(0.0, -0.06, "lowest", ha="center", va="top")
+    axes.text(1.0, -0.06, "highest", ha="center", va="top")
+    axes.text(0.5, 0.9, "not known", ha="center", va="bottom")
+    axes.set_aspect("equal")
+    axes.set_axis_off()
+
+
+@style.publication_style()
+def design_figure(
+    information: Sequence[float],
+    of_all: float,
+    names: Sequence[str],
+    places: Float | None,
+    chosen: Sequence[int],
+    outlines: Sequence[Float],
+) -> Figure:
+    """Draw the information of chosen sensors, and their positions on the structure.
+
+    Parameters
+    ----------
+    information : sequence of float
+        The expected information of the first chosen sensor, of the first two, and so on [bit].
+    of_all : float
+        The expected information of all candidates together [bit].
+    names : sequence of str
+        The names of the chosen sensors.
+    places : (G, 2) array or None
+        The positions of all sensors [m]; None if they are not known.
+    chosen : sequence of int
+        The indices of the chosen sensors, from 0.
+    outlines : sequence of (N, 2) array
+        The outlines that are drawn below the sensors [m].
+    """
+    figure = style.new_figure(2.6)
+    width_ratios = [1] if places is None else [2, 3]
+    panels = figure.subplots(1, len(width_ratios), squeeze=False, width_ratios=width_ratios)[0]
+    _draw_information(panels[0], information, of_all, names)
+    if places is not None:
+        _draw_chosen_sensors(panels[1], places, chosen, outlines)
+    figure.tight_layout()
+    return figure
+
+
+def _draw_information(
+    axes: Axes, information: Sequence[float], of_all: float, names: Sequence[str]
+) -> None:
+    """Draw the information of the chosen sensors one after the other, beside that of all."""
+    number = np.arange(1, len(information) + 1)
+    axes.plot(number, information, "o-", color=style.PRESENT)
+    axes.axhline(of_all, color=style.REFERENCE, linestyle="--", label="all candidates")
+    axes.set(xlabel="sensors", ylabel="expected information [bit]", ylim=(0.0, None))
+    axes.set_xticks(number, names, rotation=60)
+    axes.legend(loc="lower right")
+
+
+def _draw_chosen_sensors(
+    axes: Axes, positions: Float, chosen: Sequence[int], outlines: Sequence[Float]
+) -> None:
+    """Draw sensors at positions (G, 2) over outlines, the chosen ones with their ranks."""
+    for outline in outlines:
+        x, y = outline.T
+        axes.fill(x, y, facecolor="none", edgecolor=style.REFERENCE, linewidth=0.8)
+    x, y = positions.T
+    axes.plot(x, y, "o", color=style.REFERENCE, markersize=3.5)
+    x, y = positions[list(chosen)].T
+    axes.plot(x, y, "o", color=style.PRESENT, markersize=6)
+    for rank, sensor in enumerate(chosen, start=1):
+        axes.annotate(str(rank), positions[sensor], (3, 3), textcoords="offset points")
+    axes.set_aspect("equal")
+    axes.set_axis_off()

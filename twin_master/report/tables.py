@@ -1,0 +1,291 @@
+"""The tables of a report: their columns and cells; titles and captions are filled in here, too."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from reporting.arrays import Float
+from reporting.page import Page, PageColumn, Table, number_column
+from reporting.templates import in_one_line
+from reporting.words import between, listing, number
+from twin_master.report.captions import WORDS
+from twin_master.report.learnt import (
+    mean_and_interval,
+    quantities_of_asset,
+    quantities_of_sensors,
+    sensor_rows,
+)
+from twin_master.report.reading import Run, moments_of
+from twin_master.store.mission_result import LearntQuantity
+
+_HASH_DIGITS = 12
+_MICROSTRAIN = 1.0e6
+"""Factor from strain to microstrain."""
+
+
+def _add_table(
+    page: Page,
+    name: str,
+    columns: Sequence[PageColumn],
+    rows: Iterable[Sequence[str]],
+    **fields: object,
+) -> None:
+    """Add a table to a page, unless it has no rows.
+
+    Parameters
+    ----------
+    page : Page
+        The page.
+    name : str
+        The name of its title and caption in `words.toml`.
+    columns : sequence of PageColumn
+        The headings.
+    rows : iterable of sequence of str
+        The cells. They may come from files of users: line breaks and repeated blanks become one
+        blank.
+    **fields : object
+        The fields of title and caption.
+    """
+    cells = [[in_one_line(cell) for cell in row] for row in rows]
+    if cells:
+        page.add_table(Table(columns, cells), **WORDS.words("tables", name, **fields))
+
+
+def add_figures_table(page: Page, run: Run) -> None:
+    """Add the figures of the run's summary, beside their references if the scenario has any."""
+    figures = run.summary.get("figures", [])
+    has_references = any(figure["reference"] is not None for figure in figures)
+    columns = [PageColumn("figure"), number_column("this run"), PageColumn("unit")]
+    if has_references:
+        columns += [number_column("reference"), PageColumn("source of the reference")]
+    rows = []
+    for figure in figures:
+        row = [figure["title"], number(figure["value"]), figure["unit"]]
+        if has_references:
+            reference = figure["reference"]
+            row.append("" if reference is None else number(reference))
+            row.append(figure["reference_source"])
+        rows.append(row)
+    percentages = " and ".join(factor.title for factor in run.factors if factor.unit == "%")
+    points = f"Points are percentage points of {percentages}. " if percentages else ""
+    references = ", beside their references" if has_references else ""
+    _add_table(page, "figures", columns, rows, references=references, points=points)
+
+
+def add_learnt_asset_table(page: Page, run: Run) -> None:
+    """Add prior, posterior and truth of the learnt quantities of the whole asset."""
+    quantities = quantities_of_asset(run)
+    has_truth = any(quantity.truth is not None for quantity in quantities)
+    columns = [
+        PageColumn("quantity"),
+        number_column("prior, mean"),
+        number_column("standard deviation"),
+        number_column("learnt, mean"),
+        number_column("standard deviation"),
+        number_column("90 % interval"),
+    ]
+    if has_truth:
+        columns.append(number_column("truth"))
+    rows = []
+    for quantity in quantities:
+        row = _learnt_row(quantity)
+        if has_truth:
+            truth = None if quantity.truth is None else float(quantity.truth)
+            row.append(number(truth))
+        rows.append(row)
+    _add_table(
+        page,
+        "learnt_asset",
+        columns,
+        rows,
+        step=run.step_word,
+        transition_factor=_transition_factor_sentence(run, quantities),
+    )
+
+
+def _learnt_row(quantity: LearntQuantity) -> list[str]:
+    """Return title, prior and last posterior of a learnt quantity as cells."""
+    prior = moments_of(quantity.prior)
+    last = moments_of(quantity.posterior[-1])
+    return [
+        quantity.label,
+        number(float(prior.mean)),
+        number(float(prior.standard_deviation)),
+        number(float(last.mean)),
+        number(float(last.standard_deviation)),
+        between(float(last.lower), float(last.upper)),
+    ]
+
+
+def _transition_factor_sentence(run: Run, quantities: Sequence[LearntQuantity]) -> str:
+    """Return what a learnt factor on the transitions means; empty if there is none."""
+    if not any(quantity.name == "transition_factor" for quantity in quantities):
+        return ""
+    sentence = "The factor multiplies the assumed probabilities to leave a state"
+    probabilities = []
+    for control, probability in run.scenario.transition.probability.items():
+        if isinstance(probability, int | float):  # and not a table with one for each factor
+            probabilities.append(f"{probability:g} in {control}")
+    if probabilities:
+        sentence += f", in a {run.step_word} {listing(probabilities)}"
+    return f"{sentence}."
+
+
+def add_learnt_sensors_table(page: Page, run: Run) -> None:
+    """Add what was learnt of each sensor after the last step."""
+    quantities = quantities_of_sensors(run)
+    columns = [PageColumn(run.sensors.word)]
+    columns += [number_column(quantity.label) for quantity in quantities]
+    priors = []
+    for quantity in quantities:
+        # All sensors have the same prior unless the scenario gives each its own.
+        typical_prior: Float = np.nanmedian(quantity.prior, axis=0)
+        priors.append(f"{quantity.title.lower()} {mean_and_interval(typical_prior)}")
+    _add_table(
+        page,
+        "learnt_sensors",
+        columns,
+        sensor_rows(run),
+        sensor=run.sensors.word,
+        step=run.step_word,
+        prior="; ".join(priors),
+    )
+
+
+def add_calibrated_table(page: Page, run: Run) -> None:
+    """Add the figures that the calibration file has of the wing or the model."""
+    record = run.calibration
+    columns = [
+        PageColumn("figure"),
+        number_column("mean"),
+        number_column("standard deviation"),
+        number_column("95 % interval"),
+        PageColumn("unit"),
+    ]
+    rows = []
+    for figure in calibrated_figures(record):
+        row = [
+            figure["title"],
+            number(figure["mean"]),
+            number(figure["standard_deviation"]),
+            " to ".join(number(end) for end in figure["interval_95"]),
+            "" if figure["unit"] == "1" else figure["unit"],
+        ]
+        rows.append(row)
+    if not rows:
+        return
+    if "campaign" in record:
+        kind = "parameters"
+        origin = f"from the campaign {record['campaign']}"
+    else:
+        kind = "wing"
+        origin = "of the healthy wing"
+    _add_table(page, "calibrated", columns, rows, kind=kind, asset=record["asset"], origin=origin)
+
+
+def calibrated_figures(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the figures in the record of a calibration: parameters first, then quantities.
+
+    Empty if the run was not calibrated from a file.
+    """
+    parameters = record.get("correlation", {}).get("names", ())
+    quantities = record.get("names", {}).get("quantities", ())
+    figures = [record["state"][name] for name in parameters]
+    figures += [record["quantities"][name] for name in quantities]
+    return figures
+
+
+def add_run_table(page: Page, run: Run, seed: object) -> None:
+    """Add what was flown: numbers of steps and states, controls, sensors, seed and models."""
+    sensors = f"{len(run.sensors.titles)}"
+    if run.sensors.named:
+        sensors += f": {', '.join(run.sensors.titles)}"
+    states = run.model.states
+    rows = [
+        (f"{run.step_word}s flown", f"{run.step_count}"),
+        (f"{run.step_word}s predicted", f"{run.horizon}"),
+        ("states", f"{states.size} ({' × '.join(str(length) for length in states.shape)})"),
+        ("controls", ", ".join(run.controls)),
+        (f"{run.sensors.word}s", sensors),
+        ("seed", f"{seed}"),
+        ("asset", f"{run.tree.attrs.get('asset', '')}"),
+        ("model that the twin believes", f"{run.tree.attrs.get('twin_model', '')}"),
+        ("log evidence of the observations", f"{run['filtered/log_evidence'].sum():.2f}"),
+        *_monitor_rows(run),
+    ]
+    _add_table(page, "run", [PageColumn("item"), PageColumn("value")], _with_value(rows))
+
+
+def _with_value(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Return the rows of a table of items whose value is not empty."""
+    return [(item, value) for item, value in rows if value.strip()]
+
+
+class _Monitor(NamedTuple):
+    """A figure that the asset reports of itself in each step.
+
+    Attributes
+    ----------
+    title : str
+        The name in words.
+    values : (T,) array
+        The values in the printed unit; NaN in steps without one.
+    unit : str
+        The printed unit.
+    """
+
+    title: str
+    values: Float
+    unit: str
+
+
+def _monitors(run: Run) -> list[_Monitor]:
+    """Return the figures with a unit that the asset reported of itself."""
+    if run.true_state is None:
+        return []
+    monitors = []
+    for name, variable in run.tree["truth"].data_vars.items():
+        title = str(name).replace("_", " ")
+        values = np.asarray(variable.values)
+        unit = variable.attrs.get("units", "1")
+        if variable.dims != ("step",):
+            continue
+        if name == "strain_error_bound":
+            monitors.append(_Monitor(title, _MICROSTRAIN * values, "µε"))
+        elif unit != "1":
+            monitors.append(_Monitor(title, values, unit))
+    return monitors
+
+
+def _monitor_rows(run: Run) -> list[tuple[str, str]]:
+    """Return the largest value of each figure that the asset reported of itself."""
+    rows = []
+    for monitor in _monitors(run):
+        if np.isfinite(monitor.values).any():
+            largest = float(np.nanmax(monitor.values))
+            rows.append((f"largest {monitor.title}", f"{largest:.3g} {monitor.unit}"))
+    return rows
+
+
+def add_provenance_table(page: Page, run: Run) -> None:
+    """Add the versions of the software, and the hashes of sources and inputs."""
+    provenance = run.config.get("provenance", {})
+    rows = [
+        ("software", _sorted_pairs(provenance.get("versions", {}))),
+        ("sources", _sorted_hashes(provenance.get("source_hashes", {}))),
+        ("inputs", _sorted_hashes(provenance.get("input_hashes", {}))),
+        ("inputs", _sorted_hashes(run.config.get("inputs", {}))),
+    ]
+    columns = [PageColumn("item"), PageColumn("value")]
+    _add_table(page, "provenance", columns, _with_value(rows))
+
+
+def _sorted_pairs(values: Mapping[str, str]) -> str:
+    """Return names with their values, sorted by name, as one text."""
+    return ", ".join(f"{name} {value}" for name, value in sorted(values.items()))
+
+
+def _sorted_hashes(hashes: Mapping[str, str]) -> str:
+    """Return names with the first digits of their hashes, sorted by name, as one text."""
+    return _sorted_pairs({name: value[:_HASH_DIGITS] for name, value in hashes.items()})

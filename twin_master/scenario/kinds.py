@@ -1,0 +1,194 @@
+"""Tables of a scenario that name files, and the two tables whose `kind` decides what they hold.
+
+What flies (`asset`) and what the twin believes (`belief`) are each one of several kinds. A kind is
+one class in one file: a subclass of `AssetSection` or `BeliefSection` in a file whose name ends in
+`_source`, beside `assets/asset_source.py`. Its fields are the keys that a user writes; its method
+`source` makes of them what the mission needs. No other code names the kinds.
+"""
+
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, ClassVar, Self
+
+from pydantic import ModelWrapValidatorHandler, model_validator
+
+from reporting.toml_file import missing_keys, short_repr
+from scenarios import asset_scripts, binding_files, recording_files, structure_files
+from twin_master.scenario.section import Section
+
+KIND_FOLDER = Path(__file__).parents[1] / "assets"
+"""The folder of the modules that define the kinds."""
+KIND_PACKAGE = f"{__package__.rpartition('.')[0]}.{KIND_FOLDER.name}"
+CALIBRATED_DESIGN_NAME = "calibration"
+"""The name, in a scenario, of the wing design that a calibration file holds."""
+
+
+def _shipped_designs() -> dict[str, Path]:
+    """Return the files of the shipped wing designs by their names."""
+    from fe.wing.design import SHIPPED_DESIGN
+
+    return {path.stem: path for path in sorted(SHIPPED_DESIGN.parent.glob("*.toml"))}
+
+
+class FileSection(Section):
+    """A table that names files: a user's own by their paths, or shipped ones by their names."""
+
+    shipped: ClassVar = {
+        "binding": binding_files,
+        "design": _shipped_designs,
+        "observations": recording_files,
+        "script": asset_scripts,
+        "structure": structure_files,
+    }
+    """Function that returns the shipped files by name, by key."""
+
+    copy_paths: ClassVar[Mapping[str, str]] = {}
+    """For each key that names a file, the path of its copy inside a run folder."""
+
+    def copies(self) -> Mapping[str, str]:
+        """Return for each key that names a file the path of its copy inside a run folder."""
+        return self.copy_paths
+
+    def user_files(self) -> dict[str, str]:
+        """Return the paths of the files that are not shipped, by key."""
+        user_files = {}
+        for key in self.copies():
+            name = getattr(self, key)
+            if name and not self._is_shipped(key, name):
+                user_files[key] = name
+        return user_files
+
+    def all_files(self) -> dict[str, Path]:
+        """Return all files, shipped ones too, by the paths of their copies inside a run folder."""
+        files = {}
+        for key, copy in self.copies().items():
+            name = getattr(self, key)
+            if name and name != CALIBRATED_DESIGN_NAME:
+                shipped_files = self.shipped[key]() if key in self.shipped else {}
+                files[copy] = shipped_files.get(name, Path(name))
+        return files
+
+    def with_paths_from(self, folder: Path) -> Self:
+        """Return the table with its relative paths joined to a folder."""
+        paths = {key: str(folder / path) for key, path in self.user_files().items()}
+        return self.model_copy(update=paths)
+
+    def portable(self) -> "FileSection":
+        """Return the table with the paths of the copies inside a run folder."""
+        copies = self.copies()
+        return self.model_copy(update={key: copies[key] for key in self.user_files()})
+
+    def _is_shipped(self, key: str, name: str) -> bool:
+        """Return whether a key holds the name of a shipped file, or of a calibration's design."""
+        if name == CALIBRATED_DESIGN_NAME:
+            return True
+        return key in self.shipped and name in self.shipped[key]()
+
+
+class KindSection(FileSection):
+    """A table whose `kind` decides which subclass it is."""
+
+    kind: str
+    has_unique_model: ClassVar[bool] = False
+    """Whether its observations come from a model that no other kind flies or believes."""
+
+    @property
+    def is_known_to_differ(self) -> bool:
+        """Whether its model is known to differ from that of any other kind."""
+        has_patch = getattr(self, "patch", None) is not None
+        return self.has_unique_model or has_patch
+
+    @classmethod
+    def kinds(cls) -> dict[str, type[Self]]:
+        """Return the subclasses by their kinds."""
+        for module in iter_modules([str(KIND_FOLDER)]):
+            if module.name.endswith("_source"):
+                import_module(f"{KIND_PACKAGE}.{module.name}")
+        kinds = {}
+        for subclass in _all_subclasses(cls):
+            kind = subclass.kind_of_class()
+            if kind is not None:
+                kinds[kind] = subclass
+        return kinds
+
+    @classmethod
+    def kind_of_class(cls) -> str | None:
+        """Return the kind of this class; None for a class of several kinds."""
+        kind = cls.model_fields["kind"].default
+        return kind if isinstance(kind, str) else None
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _validate_as_kind(cls, table: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Return the table as a record of the subclass that its `kind` names."""
+        if cls.kind_of_class() is not None or not isinstance(table, Mapping):
+            return handler(table)
+        kinds = cls.kinds()
+        kind = table.get("kind")
+        if isinstance(kind, str) and kind in kinds:
+            return kinds[kind].model_validate(table)
+        expectation = f"`kind` must be one of {', '.join(sorted(kinds))}"
+        if "kind" not in table:
+            raise missing_keys(["kind"], f"{expectation}, and it is missing")
+        raise ValueError(f"{expectation}, and {short_repr(kind)} came")
+
+
+class BeliefSection(KindSection):
+    """What the twin believes: the model that predicts its observations."""
+
+    @abstractmethod
+    def source(self, scenario: Any, flown: Any) -> Any:
+        """Return the source of the twin's predictions.
+
+        Parameters
+        ----------
+        scenario : Scenario
+            The scenario; its type is defined above this module.
+        flown : AssetSource
+            The source of what flies.
+
+        Returns
+        -------
+        AssetSource
+        """
+
+
+class AssetSection(KindSection):
+    """What flies."""
+
+    is_fmu: ClassVar[bool] = False
+    """Whether one or several FMUs fly; an FMU may carry damage and sensors of its own."""
+
+    @property
+    def true_parameters(self) -> Mapping[str, float]:
+        """The parameters of the true asset that the scenario states, SI."""
+        return dict(getattr(self, "parameters", {}))
+
+    @property
+    def constant_load(self) -> Mapping[str, float]:
+        """The load inputs, which are the same in every step, SI."""
+        return dict(getattr(self, "load", {}))
+
+    @abstractmethod
+    def source(self, scenario: Any) -> Any:
+        """Return what flies.
+
+        Parameters
+        ----------
+        scenario : Scenario
+            The scenario; its type is defined above this module.
+
+        Returns
+        -------
+        AssetSource
+        """
+
+
+def _all_subclasses(cls: type[KindSection]) -> Iterator[type[Any]]:
+    """Yield the subclasses of a class, and theirs."""
+    for subclass in cls.__subclasses__():
+        yield subclass
+        yield from _all_subclasses(subclass)

@@ -1,0 +1,127 @@
+"""The tables of a scenario on the mission, its states and controls, and the calibration."""
+
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from reporting.toml_file import Fault, NotNegative, Number
+from twin_master.scenario.kinds import FileSection
+from twin_master.scenario.section import Count, Name, Probability, Section, Seed
+from twin_master.scenario.tables import ROW_SUM_TOLERANCE
+
+
+class Mission(Section):
+    """What is flown, and for how long."""
+
+    name: Name
+    title: str = ""
+    description: str = ""
+    steps: Count
+    prediction_steps: Count = 10
+    first_control: Name
+    seed: Seed = 0
+    step_name: Name = "step"
+    """The word for a step of the mission in the report."""
+
+
+class StateFactor(Section):
+    """One factor of the hidden state: its levels, and the belief before the first observation."""
+
+    units: ClassVar[Mapping[str, str]] = {"levels": "percent"}
+    name: Name
+    title: str = ""
+    unit: str = "1"
+    """Unit of the levels; a dimensionless level is a fraction, printed in percent."""
+    levels: Annotated[tuple[Number, ...], Field(min_length=1)]
+    prior: Annotated[tuple[Probability, ...], Field(min_length=1)]
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield the possible faults, each with whether it is there: levels and prior."""
+        does_not_increase = any(second <= first for first, second in pairwise(self.levels))
+        listed = ", ".join(str(level) for level in self.levels)
+        yield (
+            does_not_increase,
+            f"`levels` of state `{self.name}` must increase, and {listed} came",
+        )
+        yield (
+            len(self.prior) != len(self.levels),
+            f"`prior` of state `{self.name}` must hold one probability for each of its "
+            f"{len(self.levels)} levels, and {len(self.prior)} came",
+        )
+        total = sum(self.prior)
+        yield (
+            abs(total - 1.0) > ROW_SUM_TOLERANCE,
+            f"`prior` of state `{self.name}` must sum to 1, and sums to {total:.12g}",
+        )
+
+    @property
+    def initial_level(self) -> float:
+        """The most probable level before the first observation."""
+        return self.levels[self.prior.index(max(self.prior))]
+
+
+class Control(Section):
+    """One choice of the twin, with the value of each control input of the asset, SI."""
+
+    name: Name
+    title: str = ""
+    values: Annotated[dict[str, Number], Field(min_length=1)]
+
+
+class Reference(Section):
+    """A value that is printed beside a figure of the summary, and where it comes from."""
+
+    figure: Name
+    value: Number | str
+    source: str
+
+
+CALIBRATION_COPY = "asset/calibration.nc"
+"""Path of the calibration file inside a run folder."""
+
+
+class Calibration(FileSection):
+    """The uncertain parameter of the model, and where its distribution comes from."""
+
+    parameter: Name
+    source: Literal["static_test", "normal", "fixed", "file"]
+    file: str | None = None
+    """A calibration (`calibration.nc`). If `mean` and `standard_deviation` are given, the file is
+    used for everything else in it."""
+    method: Literal["particle_filter", "exact"] = "exact"
+    curve: Literal["published", "design"] = "published"
+    draws: Count = 100
+    mean: Number | None = None
+    standard_deviation: NotNegative | None = None
+
+    copy_paths: ClassVar[Mapping[str, str]] = {"file": CALIBRATION_COPY}
+
+    @property
+    def draw_count(self) -> int:
+        """The number of draws of the parameter; a fixed parameter has one."""
+        return 1 if self.source == "fixed" else self.draws
+
+    def faults(self) -> Iterator[Fault]:
+        """Yield the possible faults, each with whether it is there: keys of the source."""
+        has_file = bool(self.file)
+        yield (
+            self.source == "file" and not has_file,
+            "calibration source `file` needs `file`, the path of a calibration.nc",
+        )
+        yield (
+            has_file and self.source not in ("file", "normal"),
+            "`file` belongs to the calibration sources `file` and `normal`, and the source is "
+            f"`{self.source}`",
+        )
+        needs_mean = self.source in ("normal", "fixed")
+        yield (
+            needs_mean and self.mean is None,
+            f"calibration source `{self.source}` needs `mean`",
+        )
+        needs_deviation = self.source == "normal"
+        yield (
+            needs_deviation and self.standard_deviation is None,
+            f"calibration source `{self.source}` needs `standard_deviation`",
+        )
