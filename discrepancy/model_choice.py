@@ -19,6 +19,7 @@ from fe.runtime.errors import FiniteElementError
 from fe.structure.design import is_structure, load_structure, structure_hash
 from fe.wing.design import SHIPPED_DESIGN, WingDesign
 from fmu_asset.archive.fmu_file import packed_design_hash
+from reporting.choices import did_you_mean
 from reporting.files import hash_file, hash_record
 from reporting.progress import Progress
 from reporting.toml_file import read_toml
@@ -141,11 +142,20 @@ def _chosen(path: Path, progress: Progress | None) -> ModelChoice:
     is_name = not path.exists()
     if is_name and str(path) in structure_files():
         return _structure(structure_files()[str(path)], progress)
+    if is_name and not path.suffix:
+        _refuse_near_structure(str(path))
     model = LumpedModel.load(path)
     if is_name and not path.suffix:
         source_hash = hash_file(SHIPPED_MODELS / f"{path}.toml")
         return ModelChoice(model, ModelKind.LUMPED, path.name, source_hash)
     return ModelChoice(model, ModelKind.LUMPED, path.name, hash_file(path), path=path)
+
+
+def _refuse_near_structure(name: str) -> None:
+    """Refuse a name that is no lumped model, but like that of a shipped structure."""
+    question = did_you_mean(name, structure_files())
+    if question and not (SHIPPED_MODELS / f"{name}.toml").exists():
+        raise ModelError(f"There is no model {name!r}.{question}")
 
 
 def load_model(name: str | Path | None = None, progress: Progress | None = None) -> Model:

@@ -30,15 +30,22 @@ def require_one_of(value: object, allowed: Iterable[object], name: str) -> None:
         if type(value) is type(choice) and value == choice:
             return
     quoted_choices = listing(map(repr, choices), "or")
-    advice = _nearest_word_advice(value, choices)
+    words = [choice for choice in choices if isinstance(choice, str)]
+    nearest = nearest_word(value, words) if isinstance(value, str) else None
+    advice = "" if nearest is None else f"; the nearest is {nearest!r}"
     raise InvalidChoiceError(f"`{name}` must be {quoted_choices}, and {value!r} came{advice}.")
 
 
-def _nearest_word_advice(value: object, choices: list[object]) -> str:
-    if not isinstance(value, str):
-        return ""
-    words = [choice for choice in choices if isinstance(choice, str)]
-    nearest_words = get_close_matches(value.lower(), words, n=1)
-    if not nearest_words:
-        return ""
-    return f"; the nearest is {nearest_words[0]!r}"
+def nearest_word(word: str, known_words: Iterable[str]) -> str | None:
+    """Return the known word that is most like a word; None if no known word is like it."""
+    nearest_words = get_close_matches(word.lower(), list(known_words), n=1)
+    return nearest_words[0] if nearest_words else None
+
+
+def did_you_mean(name: str, known_names: Iterable[str]) -> str:
+    """Return a question with the known name that is most like a name, for the end of a message.
+
+    It begins with a blank; it is empty if no known name is like it.
+    """
+    nearest = nearest_word(name, known_names)
+    return "" if nearest is None else f" Did you mean `{nearest}`?"

@@ -1,39 +1,78 @@
 """Options of commands that had other names in earlier versions, and warnings about former names.
 
 An option is still accepted under the name that it had, but not listed: a hidden parameter of the
-command takes it. `reporting.terminal.as_command` adds these parameters.
+command takes it, which `accepts_former_options` adds.
 """
 
+import functools
 import inspect
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any, ParamSpec, TextIO, TypeVar, get_args
 
 import typer
+from typer.models import OptionInfo
 
 from reporting.former_names import FormerNameWarning, warn_of_former_names
+
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
 
 _FORMER = "former_"
 """Begins the name of the hidden parameter that takes an option under its former name."""
 
 
-def former_option(parameter: inspect.Parameter, settings: Mapping[str, Any]) -> inspect.Parameter:
-    """Return the hidden parameter of a command that takes an option under its former name.
+def accepts_former_options(
+    **former_flags: str,
+) -> Callable[[Callable[_Parameters, _Result]], Callable[_Parameters, _Result]]:
+    """Return a decorator for a command whose options had other names in earlier versions.
+
+    The default of such an option must be None. A value under the former name is passed on with a
+    warning; both names together are refused.
+
+    Parameters
+    ----------
+    **former_flags : str
+        The former name of an option, such as "--turns", by the name of its parameter.
+    """
+
+    def decorate(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+        @functools.wraps(function)
+        def command(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:
+            move_former_options(options, former_flags)
+            return function(*arguments, **options)
+
+        # Typer reads the options of a command from its signature
+        signature = inspect.signature(function)
+        hidden_parameters = [
+            _hidden_parameter(signature.parameters[name], former_flag)
+            for name, former_flag in former_flags.items()
+        ]
+        parameters = [*signature.parameters.values(), *hidden_parameters]
+        vars(command)["__signature__"] = signature.replace(parameters=parameters)
+        return command
+
+    return decorate
+
+
+def _hidden_parameter(parameter: inspect.Parameter, former_flag: str) -> inspect.Parameter:
+    """Return the parameter of a command that takes an option under its former name.
+
+    It has the type and the limits of the option, and does not appear in the help.
 
     Parameters
     ----------
     parameter : inspect.Parameter
-        The parameter of the option.
-    settings : dict of str to object
-        Its entry in `commands.toml`; `former` is the former name, such as "--turns".
+        The parameter of the option, annotated for Typer.
+    former_flag : str
+        The former name, such as "--turns".
     """
-    limits = {key: settings[key] for key in ("min", "max") if key in settings}
-    option = typer.Option(settings["former"], hidden=True, **limits)
+    value_type, *metadata = get_args(parameter.annotation)
+    (present_option,) = [entry for entry in metadata if isinstance(entry, OptionInfo)]
+    option = typer.Option(former_flag, hidden=True, min=present_option.min, max=present_option.max)
     return parameter.replace(
-        name=_FORMER + parameter.name,
-        annotation=Annotated[parameter.annotation, option],
-        default=None,
+        name=_FORMER + parameter.name, annotation=Annotated[value_type, option], default=None
     )
 
 
@@ -57,7 +96,7 @@ def move_former_options(options: dict[str, Any], former_flags: Mapping[str, str]
         if value is None:
             continue
         flag = "--" + name.replace("_", "-")
-        if options[name] is not None:
+        if options.get(name) is not None:
             raise typer.BadParameter(
                 f"is now called {flag}, and both are given.", param_hint=former_flag
             )

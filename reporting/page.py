@@ -21,9 +21,9 @@ from reporting.templates import (
     evaluated,
     fill_template,
     html_environment,
-    in_one_line,
     rendered,
 )
+from reporting.words import in_one_line
 
 if TYPE_CHECKING:  # text is made without figures, too, and matplotlib takes long to import
     from matplotlib.figure import Figure

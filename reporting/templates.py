@@ -14,14 +14,9 @@ _UNIT_SPACE = re.compile(r"(?<=\d) (?=(%|µε|s|ms|µs|Hz|mm|m|kg|N)(?!\w))")
 """The blank between a number and its unit, where no line may break."""
 
 
-def in_one_line(text: str) -> str:
-    """Return a text without line breaks and repeated blanks."""
-    return " ".join(text.split())
-
-
 def fill_template(template: str, /, **values: object) -> str:
     """Return a Jinja2 template filled with values, as one line."""
-    return in_one_line(rendered(template, **values))
+    return words.in_one_line(rendered(template, **values))
 
 
 def rendered(template: str, /, **values: object) -> str:

@@ -6,22 +6,18 @@ same two.
 """
 
 import functools
-import inspect
 import json
 import os
 import re
 import sys
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.resources import files
-from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 import reporting.progress
-from reporting.former_options import former_option, move_former_options
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,9 +25,6 @@ if TYPE_CHECKING:
 
     from reporting.page import Words
     from reporting.progress import Progress
-
-_Parameters = ParamSpec("_Parameters")
-_Result = TypeVar("_Result")
 
 _Command = Any  # Typer does not export the classes of its commands and options.
 _Option = Any
@@ -41,75 +34,6 @@ INTERRUPTED = 130
 
 WIDTH_OF_A_PIPE = 1000
 """Width of a console that is not a terminal, in columns."""
-
-SHARED = {
-    "json": "Print the result as JSON, and nothing else.",
-    "no_report": "Draw no report and no figures.",
-}
-"""Help of options that commands of all packages have, by parameter."""
-
-
-@functools.cache
-def commands_of(package: str) -> dict[str, dict[str, Any]]:
-    """Return the entries of a package's file `commands.toml`, by the words that call a command."""
-    file = files(package).joinpath("commands.toml")
-    return tomllib.loads(file.read_text(encoding="utf-8"))
-
-
-def as_command(
-    words: str, function: Callable[_Parameters, _Result]
-) -> Callable[_Parameters, _Result]:
-    """Return a function as a command of Typer, with the help in its package's `commands.toml`.
-
-    Parameters before `*` become arguments, the others options. The entry of a parameter is its
-    help, or a table of arguments of Typer (`help`, `metavar`, `min`, `show_default`, ...), in which
-    `flags` is the name of an option that is not called like its parameter, and `former` the name
-    that the option had in earlier versions: it is still accepted, and not listed. Entries of the
-    table ``[shared]`` are for all commands that have no entry of their own.
-
-    Parameters
-    ----------
-    words : str
-        The words that call the command, which name its table in the file.
-    function : callable
-        The function that the command runs.
-    """
-    tables = commands_of(function.__module__.partition(".")[0])
-    entries = SHARED | tables["shared"] | tables.get(words, {})
-
-    former_flags: dict[str, str] = {}
-
-    @functools.wraps(function)
-    def command(*arguments: _Parameters.args, **options: _Parameters.kwargs) -> _Result:
-        move_former_options(options, former_flags)
-        return function(*arguments, **options)
-
-    signature = inspect.signature(function)
-    parameters = []
-    for parameter in signature.parameters.values():
-        if parameter.name in entries:
-            entry = entries[parameter.name]
-            if isinstance(entry, dict) and "former" in entry:
-                former_flags[parameter.name] = entry["former"]
-                parameters.append(former_option(parameter, entry))
-            parameter = _as_typer_parameter(parameter, entry)
-        parameters.append(parameter)
-    vars(command)["__signature__"] = signature.replace(parameters=parameters)
-    return command
-
-
-def _as_typer_parameter(
-    parameter: inspect.Parameter, entry: str | Mapping[str, Any]
-) -> inspect.Parameter:
-    """Return a parameter whose annotation tells Typer its help and settings."""
-    settings = {"help": entry} if isinstance(entry, str) else dict(entry)
-    settings.pop("former", None)
-    if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
-        flags = settings.pop("flags", "--" + parameter.name.replace("_", "-"))
-        typer_information = typer.Option(flags, **settings)
-    else:
-        typer_information = typer.Argument(**{"show_default": False, **settings})
-    return parameter.replace(annotation=Annotated[parameter.annotation, typer_information])
 
 
 @dataclass

@@ -13,6 +13,11 @@ MOST_LISTED = 30
 _LISTED_ITEMS = 3  # of a collection in `brief`
 
 
+def in_one_line(text: str) -> str:
+    """Return a text without line breaks and repeated blanks."""
+    return " ".join(text.split())
+
+
 def counted(count: int, noun: str, plural: str | None = None) -> str:
     """Return a count with its noun: "1 trial", "2 trials".
 

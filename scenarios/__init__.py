@@ -1,9 +1,8 @@
 """Scenarios, bindings, models of assets and recordings, shipped as package data."""
 
-from importlib import resources
 from pathlib import Path
 
-SCENARIO_FOLDER = Path(str(resources.files(__name__)))
+SCENARIO_FOLDER = Path(__file__).parent
 BINDING_FOLDER = SCENARIO_FOLDER / "bindings"
 ASSET_FOLDER = SCENARIO_FOLDER / "assets"
 RECORDING_FOLDER = SCENARIO_FOLDER / "recordings"

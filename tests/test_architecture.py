@@ -39,7 +39,7 @@ ROOMS = dict(
 """What the page says of the rooms of each package, from the ground up; a file at its root is a room, too."""
 
 LONGEST_MODULE = 350
-"""Lines of code of a module (docstrings, comments and blank lines left out)."""
+"""Lines of code of a module (docstrings, help of options, comments and blank lines left out)."""
 NO_CODE = (
     tokenize.ENCODING,
     tokenize.COMMENT,
@@ -51,7 +51,7 @@ NO_CODE = (
 )
 """Tokens that make no line of code."""
 LONGEST_FUNCTION = 60
-"""Lines of code of a function (docstring, comments and blank lines left out)."""
+"""Lines of code of a function (docstring, help of options, comments and blank lines left out)."""
 
 LONGER: dict[str, str] = {
     "discrepancy/workflow.py:investigate": "The whole way, one stage after the other.",
@@ -170,13 +170,15 @@ def test_modules_and_functions_are_short_or_say_why_not():
 
 @cache
 def code_lines(path: Path) -> int:
-    """Return the number of lines of a module with code: no docstrings, comments and blank lines."""
+    """Return the number of lines of a module with code: no docstrings, help, comments and blank lines."""
     rows: set[int] = set()
     with path.open("rb") as file:
         for token in tokenize.tokenize(file.readline):
             if token.type not in NO_CODE:
                 rows |= set(range(token.start[0], token.end[0] + 1))
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    tree = ast.parse(path.read_bytes())
+    rows -= lines_of_option_help(tree)
+    for node in ast.walk(tree):
         if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
             rows -= set(range(node.lineno, (node.end_lineno or node.lineno) + 1))
     return len(rows)
@@ -192,7 +194,23 @@ def lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
         if hasattr(part, "lineno")
         for row in (part.lineno, part.end_lineno)
     }
-    return len(rows) + function.body[0].lineno - function.lineno
+    signature = function.body[0].lineno - function.lineno - len(lines_of_option_help(function.args))
+    return len(rows) + signature
+
+
+def lines_of_option_help(tree: ast.AST) -> set[int]:
+    """Return the lines with the help and the limits of a command's options, which are a text for users.
+
+    These are the lines of an `Annotated[...]` after its first one, which holds the name of the parameter.
+    """
+    return {
+        row
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Subscript)
+        and isinstance(node.value, ast.Name)
+        and node.value.id == "Annotated"
+        for row in range(node.lineno + 1, (node.end_lineno or node.lineno) + 1)
+    }
 
 
 def test_the_runtime_imports_numpy_the_standard_library_and_itself_only():

@@ -11,16 +11,27 @@ import webbrowser
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from reporting import terminal
+from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
-from reporting.former_options import former_names_as_lines
+from reporting.former_options import accepts_former_options, former_names_as_lines
 from reporting.words import counted, number
 from scenarios import scenario_files
 from twin_master import parts
+from twin_master.command_options import (
+    CalibrationOption,
+    CertificateOption,
+    ClusterOption,
+    LibraryOption,
+    SeedOption,
+    ViewOption,
+    WorkersOption,
+    complete_scenario,
+)
 from twin_master.errors import TwinMasterError
 from twin_master.fleet_command import choose_engine, fly_and_print_fleet, view_beside
 
@@ -29,29 +40,111 @@ Decision = Mapping[str, Any]
 
 
 def run(
-    scenario: str | None = None,
+    scenario: Annotated[
+        str | None,
+        typer.Argument(
+            show_default=False,
+            metavar="SCENARIO",
+            autocompletion=complete_scenario,
+            help="A shipped scenario (see `uav-twin scenarios`), the path of a TOML file, "
+            "or of an SSP file (with --scenario).",
+        ),
+    ] = None,
     *,
-    out: Path | None = None,
-    seed: int | None = None,
-    resume: Path | None = None,
-    replace: bool = False,
-    fmu: Path | None = None,
-    binding: Path | None = None,
-    strain_library: Path | None = None,
-    calibration: Path | None = None,
-    library: Path | None = None,
-    learnt: Path | None = None,
-    in_process: bool = False,
-    view: bool = False,
-    with_scenario: str | None = None,
-    no_report: bool = False,
-    json: bool = False,
-    seeds: str | None = None,
-    workers: int | None = None,
-    cluster: str | None = None,
-    policy: Path | None = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            show_default="runs/SCENARIO",
+            help="The run folder to make.",
+        ),
+    ] = None,
+    seed: SeedOption = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option(
+            "--resume",
+            help="Continue the interrupted run in this folder.",
+        ),
+    ] = None,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace",
+            help="Replace the run folder if it exists.",
+        ),
+    ] = False,
+    fmu: Annotated[
+        Path | None,
+        typer.Option(
+            "--fmu",
+            help="Fly this FMU; the design of the scenario stays the twin's model.",
+        ),
+    ] = None,
+    binding: Annotated[
+        Path | None,
+        typer.Option(
+            "--binding",
+            help="Which variable of the FMU plays which role; by default as in the scenario.",
+        ),
+    ] = None,
+    strain_library: Annotated[
+        Path | None,
+        typer.Option(
+            "--strain-library",
+            help="Fly the authors' strain library (UAVconfig.json or its folder) as model "
+            "and asset; in a scenario that flies a library, its file.",
+        ),
+    ] = None,
+    calibration: CalibrationOption = None,
+    library: LibraryOption = None,
+    learnt: Annotated[
+        Path | None,
+        typer.Option(
+            "--learnt",
+            help="Fly with what a fleet has learnt, a file of `uav-twin fleet learn`.",
+        ),
+    ] = None,
+    in_process: Annotated[
+        bool,
+        typer.Option(
+            "--in-process",
+            help="Run the FMU in this process instead of a worker.",
+        ),
+    ] = False,
+    view: ViewOption = False,
+    with_scenario: Annotated[
+        str | None,
+        typer.Option(
+            "--scenario",
+            autocompletion=complete_scenario,
+            help="What is flown with the SSP file that SCENARIO names.",
+        ),
+    ] = None,
+    no_report: NoReportOption = False,
+    json: JsonOption = False,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            "--seeds",
+            metavar="FIRST:END",
+            help="Fly one mission for each of these seeds, END left out, into a store; see `uav-twin fleet`.",
+        ),
+    ] = None,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    policy: Annotated[
+        Path | None,
+        typer.Option(
+            "--policy",
+            help="Fly this policy, a file of `uav-twin plan --out`, without planning.",
+        ),
+    ] = None,
 ) -> None:
-    """Fly a scenario: model, reduce, pack, calibrate, fly, report."""
+    """Fly a scenario: model, reduce, pack, calibrate, fly, report.
+
+    Example: `uav-twin run level_turns --seed 3 --out runs/first`
+    """
     scenario, ssp = _scenario_and_ssp(scenario, with_scenario)
     overrides = parts.Overrides(
         seed=seed,
@@ -266,38 +359,131 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
 def main() -> None:
     """Run `python -m twin_master`."""
     application = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    application.command()(terminal.as_command("run", run))
+    application.command()(run)
     run_with_options = terminal.with_common_options(application)
     run_command_line(lambda: run_with_options(prog_name="python -m twin_master"))
 
 
+@accepts_former_options(steps="--turns", from_step="--from-turn")
 def watch(
-    scenario: str | None = None,
+    scenario: Annotated[
+        str | None,
+        typer.Argument(
+            show_default=False,
+            metavar="[SCENARIO]",
+            autocompletion=complete_scenario,
+            help="A shipped scenario, or the path of a TOML file.",
+        ),
+    ] = None,
     *,
-    observations: str | None = None,
-    out: Path | None = None,
-    resume: bool = False,
-    replace: bool = False,
-    follow: bool = False,
-    pace: float = 0.0,
-    steps: int | None = None,
-    model_patch: Path | None = None,
-    from_step: int | None = None,
-    teach: bool = False,
-    allow_unknown: bool = False,
-    ca_file: Path | None = None,
-    seed: int | None = None,
-    calibration: Path | None = None,
-    library: Path | None = None,
-    last: int = 1000,
-    view: bool = False,
-    no_report: bool = False,
+    observations: Annotated[
+        str | None,
+        typer.Option(
+            "--observations",
+            metavar="SOURCE",
+            show_default="the recording of the scenario, else -",
+            help="A CSV or NetCDF file, the folder of a run or watch, `-` for JSON lines "
+            "on standard input, or mqtt://[USER@]HOST[:PORT]/TOPIC (mqtts:// with "
+            "TLS).",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            show_default="runs/SCENARIO",
+            help="The folder of the watch.",
+        ),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Take up the watch in --out.",
+        ),
+    ] = False,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace",
+            help="Replace the folder if it exists.",
+        ),
+    ] = False,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow",
+            help="Wait at the end of a CSV file for more.",
+        ),
+    ] = False,
+    pace: Annotated[
+        float,
+        typer.Option(
+            "--pace",
+            min=0.0,
+            max=3600.0,
+            help="Seconds to wait after each step, to look at a recording.",
+        ),
+    ] = 0.0,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            "--steps",
+            min=0,
+            help="End after so many steps in all.",
+        ),
+    ] = None,
+    model_patch: Annotated[
+        Path | None,
+        typer.Option(
+            "--model-patch",
+            help="Believe this patch (`patch.json` of `discrepancy run`) from --from-step on.",
+        ),
+    ] = None,
+    from_step: Annotated[
+        int | None,
+        typer.Option(
+            "--from-step",
+            min=0,
+            help="The first step that --model-patch is believed in.",
+        ),
+    ] = None,
+    teach: Annotated[
+        bool,
+        typer.Option(
+            "--teach",
+            help="Look for the cause of an alarm, and believe what is named.",
+        ),
+    ] = False,
+    allow_unknown: Annotated[
+        bool,
+        typer.Option(
+            "--allow-unknown",
+            help="Pass over keys and columns that are no sensor.",
+        ),
+    ] = False,
+    ca_file: CertificateOption = None,
+    seed: SeedOption = None,
+    calibration: CalibrationOption = None,
+    library: LibraryOption = None,
+    last: Annotated[
+        int,
+        typer.Option(
+            "--last",
+            min=1,
+            help="Steps, the last ones, in run.nc and report.",
+        ),
+    ] = 1000,
+    view: ViewOption = False,
+    no_report: NoReportOption = False,
 ) -> None:
     """Watch a real asset: observations in, a decision for each step out, as a line of JSON.
 
     The same scenario as for a simulated mission; its tables `asset` and `truth` are not needed.
 
     Everything is kept in the folder after every step. Ctrl-C ends a watch in order; --resume takes it up.
+
+    Example: `uav-twin watch watched_wing --out runs/watched`
     """
     watches: list[parts.Watch] = []
     comes_from_broker = parts.is_broker(observations or "")
@@ -407,8 +593,38 @@ def decision_line(scenario: "parts.Scenario", decision: Decision) -> str:
     return f"{line}; by {hypothesis} ({decision['hypotheses'][hypothesis]:.2f})"
 
 
-def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
-    """Show a flight in the browser, step by step or while it goes on, or a whole fleet."""
+def view(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            show_default=False,
+            metavar="DIR",
+            help="Folder of a run, a watch or a fleet, finished or going on.",
+        ),
+    ],
+    *,
+    port: Annotated[
+        int,
+        typer.Option(
+            "--port",
+            min=0,
+            max=65535,
+            show_default="any that is free",
+            help="Port on the loopback.",
+        ),
+    ] = 0,
+    browser: Annotated[
+        bool,
+        typer.Option(
+            "--browser",
+            help="Open the page in the default browser.",
+        ),
+    ] = False,
+) -> None:
+    """Show a flight in the browser, step by step or while it goes on, or a whole fleet.
+
+    Example: `uav-twin view runs/first --browser`
+    """
 
     def print_address(address: str) -> None:
         typer.echo(f"{folder}: {address} (Ctrl-C ends it)")
@@ -420,7 +636,10 @@ def view(folder: Path, *, port: int = 0, browser: bool = False) -> None:
 
 
 def list_scenarios() -> None:
-    """List the scenarios that are shipped."""
+    """List the scenarios that are shipped.
+
+    Example: `uav-twin scenarios`
+    """
     files = scenario_files()
     rows = []
     for name, path in files.items():
@@ -445,8 +664,24 @@ def _levels_in_words(levels: Mapping[str, int]) -> str:
     return ", ".join(f"{factor} ({count} levels)" for factor, count in levels.items())
 
 
-def check_scenario(file: str, *, calibration: Path | None = None, json: bool = False) -> None:
-    """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it."""
+def check_scenario(
+    file: Annotated[
+        str,
+        typer.Argument(
+            show_default=False,
+            metavar="FILE",
+            autocompletion=complete_scenario,
+            help="A scenario file, or a shipped name.",
+        ),
+    ],
+    *,
+    calibration: CalibrationOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Say what a scenario flies and believes, and what it takes; exit code 1 if anything is wrong with it.
+
+    Example: `uav-twin scenario check level_turns`
+    """
     record = parts.check_scenario(parts.load_scenario(file), {"calibration": calibration})
     if json:
         terminal.print_json(record)

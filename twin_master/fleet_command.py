@@ -1,7 +1,6 @@
 """`uav-twin fleet`, and `uav-twin run --seeds`; the process of `--view` for all commands."""
 
 import json
-import multiprocessing
 import os
 import signal
 import sys
@@ -11,13 +10,23 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
 from reporting import terminal
+from reporting.command_options import JsonOption, NoReportOption
 from reporting.errors import ReportingError
+from reporting.former_options import accepts_former_options
 from twin_master import parts
+from twin_master.command_options import (
+    CertificateOption,
+    ClusterOption,
+    FleetFolderOption,
+    FleetSeedOption,
+    ViewOption,
+    WorkersOption,
+)
 from twin_master.errors import TwinMasterError
 
 WORDS = "twin_master.fleet"
@@ -28,15 +37,35 @@ ROWS = 20
 """The number of assets in the table on the console, the worst first."""
 
 
+@accepts_former_options(steps="--turns")
 def watch(
-    file: Path,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            show_default=False,
+            help="The fleet file, its groups with `observations`.",
+        ),
+    ],
     *,
-    out: Path | None = None,
-    seed: int | None = None,
-    follow: bool = False,
-    steps: int | None = None,
-    ca_file: Path | None = None,
-    view: bool = False,
+    out: FleetFolderOption = None,
+    seed: FleetSeedOption = None,
+    follow: Annotated[
+        bool,
+        typer.Option(
+            "--follow",
+            help="Wait for more at the end of CSV files, and for new files.",
+        ),
+    ] = False,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            "--steps",
+            min=0,
+            help="Leave an asset alone after so many steps.",
+        ),
+    ] = None,
+    ca_file: CertificateOption = None,
+    view: ViewOption = False,
 ) -> None:
     """Watch many real assets: observations in, a decision for each step of each asset out, as a line of JSON.
 
@@ -45,6 +74,8 @@ def watch(
     On a terminal a table shows the worst assets in the place of decisions.
 
     Ctrl-C ends it in order; the command repeated goes on.
+
+    Example: `uav-twin fleet watch fleet.toml --follow`
     """
     fleet = parts.load_fleet(file, seed)
     folder = out if out is not None else Path("runs") / fleet.head.name
@@ -163,26 +194,60 @@ def _table_of_worst_assets(standing: Standing) -> "parts.Table":
 
 
 def run(
-    file: Path,
+    file: Annotated[
+        Path,
+        typer.Argument(
+            show_default=False,
+            help="The fleet file.",
+        ),
+    ],
     *,
-    out: Path | None = None,
-    seed: int | None = None,
-    workers: int | None = None,
-    cluster: str | None = None,
-    replace: bool = False,
-    no_report: bool = False,
-    json: bool = False,
+    out: FleetFolderOption = None,
+    seed: FleetSeedOption = None,
+    workers: WorkersOption = None,
+    cluster: ClusterOption = None,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace",
+            help="Replace another fleet in the folder.",
+        ),
+    ] = False,
+    no_report: NoReportOption = False,
+    json: JsonOption = False,
 ) -> None:
-    """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped."""
+    """Fly the assets of a fleet; repeated after an interruption, it goes on where it stopped.
+
+    Example: `uav-twin fleet run fleet.toml --workers 2`
+    """
     fleet = parts.load_fleet(file, seed)
     engine = choose_engine(workers, cluster)
     fly_and_print_fleet(fleet, out, engine, replace=replace, report=not no_report, json=json)
 
 
 def learn(
-    folder: Path, *, out: Path = Path("learnt.toml"), no_report: bool = False, json: bool = False
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            show_default=False,
+            help="The folder of the fleet.",
+        ),
+    ],
+    *,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            help="The file to write.",
+        ),
+    ] = Path("learnt.toml"),
+    no_report: NoReportOption = False,
+    json: JsonOption = False,
 ) -> None:
-    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ."""
+    """Learn from all twins of a fleet: how fast damage grows, how noisy sensors are, how assets differ.
+
+    Example: `uav-twin fleet learn runs/fleet --out learnt.toml`
+    """
     lessons = parts.learn_from_fleet(folder, out, progress=terminal.progress())
     if not no_report:
         _write_report(folder)
@@ -270,8 +335,21 @@ def _write_report(folder: Path) -> None:
         parts.write_fleet_report(folder)
 
 
-def compare(folders: list[Path], *, json: bool = False) -> None:
-    """Show the figures of several fleets or ensembles side by side."""
+def compare(
+    folders: Annotated[
+        list[Path],
+        typer.Argument(
+            show_default=False,
+            help="Folders of fleets or ensembles.",
+        ),
+    ],
+    *,
+    json: JsonOption = False,
+) -> None:
+    """Show the figures of several fleets or ensembles side by side.
+
+    Example: `uav-twin compare runs/fleet runs/other_fleet`
+    """
     figures = _figures_by_group(folders)
     rows = parts.figure_rows(figures)
     terminal.answer("compare", WORDS, figures, json=json, rows=rows, groups=list(figures))
@@ -334,6 +412,8 @@ def view_beside(wanted: bool, server: ViewServer | None = None) -> Iterator[Call
     if not wanted:
         yield lambda _folder: None
         return
+    import multiprocessing
+
     process: multiprocessing.process.BaseProcess | None = None
 
     def begin(folder: Path) -> None:

@@ -4,12 +4,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from reporting import terminal
+from reporting.command_options import JsonOption
 from reporting.files import atomic_write_bytes
 from reporting.words import comma_list
 from twin_master import parts
+from twin_master.command_options import CalibrationOption, ScenarioArgument, SeedOption
 from twin_master.errors import MissionInputError
 
 Record = dict[str, Any]
@@ -36,16 +40,38 @@ class _PlannedMission:
 
 
 def plan(
-    scenario: str,
+    scenario: ScenarioArgument,
     *,
-    out: Path | None = None,
-    picture: Path | None = None,
-    value_of: str | None = None,
-    seed: int | None = None,
-    calibration: Path | None = None,
-    json: bool = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="Write the policy to this file, for `uav-twin run --policy`.",
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture",
+            help="Draw what is done at which belief, as SVG or PNG.",
+        ),
+    ] = None,
+    value_of: Annotated[
+        str | None,
+        typer.Option(
+            "--value-of",
+            metavar="NAME",
+            help="Say what an action that inspects is worth, or a gauge by its number or title.",
+        ),
+    ] = None,
+    seed: SeedOption = None,
+    calibration: CalibrationOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Plan on the belief: expected return with its bounds, beside simpler rules."""
+    """Plan on the belief: expected return with its bounds, beside simpler rules.
+
+    Example: `uav-twin plan inspected_wing --out policy.npz`
+    """
     knowledge = _prepare(scenario, seed, calibration).knowledge
     without_value_of = None
     if value_of is not None:
@@ -223,18 +249,60 @@ def _write_picture(path: Path, figure: "parts.Figure") -> None:
 
 
 def design(
-    scenario: str,
+    scenario: ScenarioArgument,
     *,
-    sensors: int,
-    among: str | None = None,
-    candidates: str | None = None,
-    picture: Path | None = None,
-    vtu: Path | None = None,
-    worth: bool = False,
-    calibration: Path | None = None,
-    json: bool = False,
+    sensors: Annotated[
+        int,
+        typer.Option(
+            "--sensors",
+            min=1,
+            help="How many to choose.",
+        ),
+    ],
+    among: Annotated[
+        str | None,
+        typer.Option(
+            "--among",
+            metavar="NAMES",
+            help="Candidates, by numbers or titles with commas; all by default.",
+        ),
+    ] = None,
+    candidates: Annotated[
+        str | None,
+        typer.Option(
+            "--candidates",
+            metavar="N|FILE",
+            help="More candidates on a structure: N rosettes spread over its surface, or a file of gauges.",
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None,
+        typer.Option(
+            "--picture",
+            help="Draw the choice, as SVG or PNG.",
+        ),
+    ] = None,
+    vtu: Annotated[
+        Path | None,
+        typer.Option(
+            "--vtu",
+            help="Write the gauges as points with their ranks.",
+        ),
+    ] = None,
+    worth: Annotated[
+        bool,
+        typer.Option(
+            "--worth",
+            help="Plan with the chosen and with all, and compare the returns.",
+        ),
+    ] = False,
+    calibration: CalibrationOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Choose the sensors that tell most of the state, and name what none of them separates."""
+    """Choose the sensors that tell most of the state, and name what none of them separates.
+
+    Example: `uav-twin design level_turns --sensors 6 --picture gauges.svg`
+    """
     prepared = _prepare(scenario, None, calibration, candidates)
     knowledge = prepared.knowledge
     titles = _sensor_titles(knowledge.scenario)

@@ -1,29 +1,115 @@
 """A predictive structural digital twin of a UAV wing: the one name to import.
 
-Each name comes from the package that holds it, and is imported when it is used. `__init__.pyi`
-beside this file lists them; `docs/python.md` shows all of them at work; the command line is
+Each name comes from the package that holds it, and is imported when it is used, so that
+`import uav_twin` takes no time. `docs/python.md` shows all of them at work; the command line is
 `uav-twin`.
 """
 
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 from uav_twin.shadowing import refuse_shadowing
 
+if TYPE_CHECKING:  # the names as type checkers and editors read them
+    from calibration.dynamics.modal_identification import identify_modes as identify_modes
+    from calibration.result.file import load_calibration as load_calibration
+    from calibration.wing.calibrate import calibrate as calibrate
+    from discrepancy.application import apply_verdict as apply_verdict
+    from discrepancy.campaign.reading import read_campaign as read_campaign
+    from discrepancy.files.verdict import read_verdict as read_verdict
+    from discrepancy.model_choice import load_model as load_model
+    from discrepancy.workflow import investigate as investigate
+    from fe.reduction.model_cache import reduced_model as reduced_model
+    from fe.structure.affine import natural_frequencies as natural_frequencies
+    from fe.structure.affine import static_response as static_response
+    from fe.structure.affine import static_responses as static_responses
+    from fe.wing.design import load_design as load_design
+    from fe.wing.operators import assemble as assemble
+    from fe.wing.operators import flapwise_bending_modes as flapwise_bending_modes
+    from fmu_asset.client.session import FmiAsset as FmiAsset
+    from fmu_asset.packing.structure_fmu import build_fmu as build_fmu
+    from scenarios import structure_files as structure_files
+    from twin_master.assets.resolution import Overrides as Overrides
+    from twin_master.environment import ScenarioEnvironment as ScenarioEnvironment
+    from twin_master.fleet.flight import fly_fleet as fly_fleet
+    from twin_master.fleet.learn import learn_from_fleet as learn_from_fleet
+    from twin_master.fleet.reading import open_fleet as open_fleet
+    from twin_master.learning.monitor import WatchfulEstimator as WatchfulEstimator
+    from twin_master.mission.preparation import prepare_twin as prepare_twin
+    from twin_master.network.estimator import Carried as Carried
+    from twin_master.network.estimator import Estimate as Estimate
+    from twin_master.network.estimator import ExactFilter as ExactFilter
+    from twin_master.network.graphical_model import GraphicalModel as GraphicalModel
+    from twin_master.network.inference import filter_sequence as filter_sequence
+    from twin_master.network.planner import value_iteration as value_iteration
+    from twin_master.network.sensor_model import GaussianSensorModel as GaussianSensorModel
+    from twin_master.network.twin import Twin as Twin
+    from twin_master.report.page import report_figures as report_figures
+    from twin_master.report.page import write_report as write_report
+    from twin_master.scenario.reading import load_scenario as load_scenario
+    from twin_master.watch.opening import open_run as open_run
+    from twin_master.watch.opening import watch as watch
+    from twin_master.workflow import fly as fly
+    from twin_master.workflow import resume as resume
 
-def __getattr__(name: str) -> Any:
-    """Return a public name, imported now; `__all__` and `_HOMES` list them and their modules."""
-    if name.startswith("__") and name != "__all__":  # Python itself looks for such names
-        raise AttributeError(name)
-    refuse_shadowing()
-    from reporting.lazy import lazy_getattr, reexported_names
+_HOMES = {
+    "identify_modes": "calibration.dynamics.modal_identification",
+    "load_calibration": "calibration.result.file",
+    "calibrate": "calibration.wing.calibrate",
+    "apply_verdict": "discrepancy.application",
+    "read_campaign": "discrepancy.campaign.reading",
+    "read_verdict": "discrepancy.files.verdict",
+    "load_model": "discrepancy.model_choice",
+    "investigate": "discrepancy.workflow",
+    "reduced_model": "fe.reduction.model_cache",
+    "natural_frequencies": "fe.structure.affine",
+    "static_response": "fe.structure.affine",
+    "static_responses": "fe.structure.affine",
+    "load_design": "fe.wing.design",
+    "assemble": "fe.wing.operators",
+    "flapwise_bending_modes": "fe.wing.operators",
+    "FmiAsset": "fmu_asset.client.session",
+    "build_fmu": "fmu_asset.packing.structure_fmu",
+    "structure_files": "scenarios",
+    "Overrides": "twin_master.assets.resolution",
+    "ScenarioEnvironment": "twin_master.environment",
+    "fly_fleet": "twin_master.fleet.flight",
+    "learn_from_fleet": "twin_master.fleet.learn",
+    "open_fleet": "twin_master.fleet.reading",
+    "WatchfulEstimator": "twin_master.learning.monitor",
+    "prepare_twin": "twin_master.mission.preparation",
+    "Carried": "twin_master.network.estimator",
+    "Estimate": "twin_master.network.estimator",
+    "ExactFilter": "twin_master.network.estimator",
+    "GraphicalModel": "twin_master.network.graphical_model",
+    "filter_sequence": "twin_master.network.inference",
+    "value_iteration": "twin_master.network.planner",
+    "GaussianSensorModel": "twin_master.network.sensor_model",
+    "Twin": "twin_master.network.twin",
+    "report_figures": "twin_master.report.page",
+    "write_report": "twin_master.report.page",
+    "load_scenario": "twin_master.scenario.reading",
+    "open_run": "twin_master.watch.opening",
+    "watch": "twin_master.watch.opening",
+    "fly": "twin_master.workflow",
+    "resume": "twin_master.workflow",
+}
+"""The public names, and the modules that they are imported from (a test compares both lists)."""
 
-    modules_of_names = reexported_names(__file__)
-    if name == "__all__":
-        return sorted(modules_of_names)
-    if name == "_HOMES":
-        return modules_of_names
-    return lazy_getattr(__name__, __file__)(name)
+__all__ = list(_HOMES)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__getattr__("__all__")})
+    return sorted({*globals(), *__all__})
+
+
+if not TYPE_CHECKING:  # so that type checkers report names that do not exist
+
+    def __getattr__(name: str) -> Any:
+        """Return a public name, imported now."""
+        if name not in _HOMES:
+            raise AttributeError(
+                f"module 'uav_twin' has no attribute {name!r}; it has {', '.join(__all__)}"
+            )
+        refuse_shadowing()
+        return getattr(import_module(_HOMES[name]), name)

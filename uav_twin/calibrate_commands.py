@@ -1,48 +1,83 @@
 """`uav-twin calibrate`: all three steps of a wing; `ringdown`, `simulate` and `campaign`."""
 
 import json as json_text
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
-from fe.runtime.state import DigitalState
 from reporting import terminal
+from reporting.command_options import LARGEST_SEED, JsonOption, NoReportOption
 from reporting.files import atomic_write_text, refuse_filled
-from uav_twin import parts
-from uav_twin.discrepancy_commands import one_thread
-from uav_twin.options import show
+from uav_twin.completion import complete_model
+from uav_twin.discrepancy_commands import use_one_thread
+from uav_twin.options import CampaignArgument, DesignOption, SampleSeedOption
+
+if TYPE_CHECKING:
+    from calibration.result.record import Calibration
+    from calibration.virtual_wing import TestBench
+    from fe.runtime.state import DigitalState
+    from fe.wing.design import WingDesign
 
 
 def calibrate_campaign(
-    campaign: Path,
+    campaign: CampaignArgument,
     *,
-    model: str | None = None,
-    out: Path | None = None,
-    asset: str | None = None,
-    samples: int = 1000,
-    seed: int = 0,
-    json: bool = False,
-    no_report: bool = False,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            show_default="the shipped wing",
+            autocompletion=complete_model,
+            help="The model file of an FMU or a structure, a lumped model, a wing design: as of "
+            "`discrepancy run`.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder for calibration.nc and report.")
+    ] = None,
+    asset: Annotated[
+        str | None,
+        typer.Option(
+            "--asset", show_default="that of the campaign", help="Name of what was measured."
+        ),
+    ] = None,
+    samples: Annotated[
+        int,
+        typer.Option("--samples", min=100, max=100000, help="Samples that are kept."),
+    ] = 1000,
+    seed: SampleSeedOption = 0,
+    json: JsonOption = False,
+    no_report: NoReportOption = False,
 ) -> None:
-    """Posterior of the parameters of any model, an FMU or a structure too, from a campaign."""
-    one_thread()
-    data = parts.read_campaign(campaign)
-    name = parts.check_name(data.name if asset is None else asset)
+    """Posterior of the parameters of any model, an FMU or a structure too, from a campaign.
+
+    Example: `uav-twin calibrate campaign measured --model single_mass_rig --out calibrated`
+    """
+    from calibration.result.file import check_folder
+    from calibration.result.folder import write_calibration_folder
+    from calibration.result.record import check_name
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.model_choice import choose_model
+    from discrepancy.parameters.calibration import calibrate_parameters
+
+    use_one_thread()
+    data = read_campaign(campaign)
+    name = check_name(data.name if asset is None else asset)
     if out is not None:
-        parts.check_folder(out, name, wing=False)
-    chosen = parts.choose_model(model)
-    result = parts.calibrate_parameters(data, chosen, asset=name, samples=samples, seed=seed)
+        check_folder(out, name, wing=False)
+    chosen = choose_model(model)
+    result = calibrate_parameters(data, chosen, asset=name, samples=samples, seed=seed)
     written = None
     if out is not None:
-        written = parts.write_calibration_folder(result, out, report=not no_report)
-    conclude(result, written, json=json, report=not no_report)
+        written = write_calibration_folder(result, out, report=not no_report)
+    print_calibration(result, written, json=json, report=not no_report)
 
 
-def conclude(
-    result: "parts.Calibration", written: Path | None, *, json: bool, report: bool
+def print_calibration(
+    result: "Calibration", written: Path | None, *, json: bool, report: bool
 ) -> None:
     """Print the result of a calibration, and where it was written.
 
@@ -59,25 +94,36 @@ def conclude(
     """
     if json:
         file = None if written is None else str(written)
-        terminal.print_json({"calibration": file} | _record(result))
+        terminal.print_json({"calibration": file} | _calibration_record(result))
         return
+    _print_posterior(result)
+    if written is None:
+        terminal.say("Nothing was written: give --out DIR for calibration.nc and the report.")
+        return
+    from calibration.result.folder import REPORT_NAME
+
+    terminal.say(f"Calibration: {written}")
+    if report:
+        terminal.say(f"Report: {written.with_name(REPORT_NAME)}")
+
+
+def _print_posterior(result: "Calibration") -> None:
+    """Print the parameters of a calibration: what was known before, and what is known now."""
     from calibration.result import text
 
-    show(
+    terminal.show(
         "calibration",
         words=text.WORDS,
         result=result,
         headline=text.headline(result),
         correlations=text.correlation_lines(result),
     )
-    report_file = None
-    if report and written is not None:
-        report_file = written.with_name(parts.REPORT_NAME)
-    show("calibration", written=written, report=report_file)
 
 
-def _record(result: "parts.Calibration") -> dict[str, Any]:
-    """Return the calibration as plain data."""
+def _calibration_record(result: "Calibration") -> dict[str, Any]:
+    """Return the calibration as plain data, for JSON."""
+    # a wing, which has a design, is calibrated from a laboratory's folder, all else from a campaign
+    name_of_source = "campaign" if result.design is None else "laboratory"
 
     def posterior(name: str) -> dict[str, Any]:
         return {
@@ -89,7 +135,7 @@ def _record(result: "parts.Calibration") -> dict[str, Any]:
     return {
         "asset": result.asset,
         "model": result.model,
-        "campaign" if result.design is None else "laboratory": result.source,
+        name_of_source: result.source,
         "procedure": result.procedure,
         "explained": result.explained,
         "seed": result.seed,
@@ -108,41 +154,84 @@ def _record(result: "parts.Calibration") -> dict[str, Any]:
 
 def calibrate_wing(
     *,
-    data: Path | None = None,
-    out: Path | None = None,
-    seed: int = 0,
-    asset: str | None = None,
-    procedure: Literal["joint", "paper"] = "joint",
-    design: Path | None = None,
-    measured: bool | None = None,
-    fitted: bool = False,
-    json: bool = False,
-    no_report: bool = False,
+    data: Annotated[
+        Path | None,
+        typer.Option(
+            "--data",
+            help="Lab folder with step1, step2, step3, or some of them; published figures "
+            "otherwise.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder for calibration.nc, report, table and figures."),
+    ] = None,
+    seed: SampleSeedOption = 0,
+    asset: Annotated[
+        str | None,
+        typer.Option("--asset", show_default="that of the design", help="Name of this wing."),
+    ] = None,
+    procedure: Annotated[
+        Literal["joint", "paper"],
+        typer.Option(
+            "--procedure",
+            help="Keep samples of the joint posterior, or of the paper's steps one after another.",
+        ),
+    ] = "joint",
+    design: Annotated[
+        Path | None,
+        typer.Option("--design", help="The wing as drawn; the shipped design by default."),
+    ] = None,
+    measured: Annotated[
+        bool | None,
+        typer.Option(
+            "--measured/--published",
+            show_default="measured where there are records",
+            help="Aim step 3 at the ring-down records of --data or at the published figures.",
+        ),
+    ] = None,
+    fitted: Annotated[
+        bool,
+        typer.Option(
+            "--fitted",
+            help="Fit the frequencies of the records too; spectral peaks by default.",
+        ),
+    ] = False,
+    json: JsonOption = False,
+    no_report: NoReportOption = False,
 ) -> None:
     """Tailor the model to one wing: planform, stiffness, masses and damping, in this order.
 
-    A lab folder may hold one step alone; the sub-commands fit ring-downs, make a lab folder of a
-    virtual wing, and calibrate any model from a campaign.
+    A lab folder may hold one step alone. The sub-commands fit ring-downs,
+    make a lab folder of a virtual wing, and calibrate any model from a campaign.
+
+    Example: `uav-twin calibrate --data laboratory --out calibrated`
     """
+    from calibration.result.file import check_folder
+    from calibration.wing.calibrate import calibrate
+    from calibration.wing.lab_data import published_data, read_lab_folder
+    from calibration.wing.report import write_wing_folder
+    from fe.wing.design import load_design
+
     if measured and data is None:
         raise typer.BadParameter("--measured needs --data with ring-down records.")
     if fitted and (data is None or measured is False):
         raise typer.BadParameter(
             "--fitted needs --data with ring-down records, and no --published."
         )
-    wing_design = parts.load_design(design)
+    wing_design = load_design(design)
     name = wing_design.name if asset is None else asset
     if out is not None:
-        parts.check_folder(out, name, wing=True)
+        check_folder(out, name, wing=True)
     targets: Literal["measured", "published"] = "measured" if measured else "published"
     if data is None:
-        lab = parts.published_data()
+        lab = published_data()
     else:
-        lab = parts.read_lab_folder(data, None if measured is None else targets, free=fitted)
+        lab = read_lab_folder(data, None if measured is None else targets, free=fitted)
     if not json:
         for origin in lab.origins:
             terminal.say(f"Step {origin.step}: {origin.text}.")
-    calibration = parts.calibrate(lab, wing_design, asset=name, procedure=procedure, seed=seed)
+    calibration = calibrate(lab, wing_design, asset=name, procedure=procedure, seed=seed)
     if not json:
         from calibration.paper.figures import WORDS
 
@@ -150,39 +239,77 @@ def calibrate_wing(
         terminal.print_table([column.name for column in columns], rows)
     written = None
     if out is not None:
-        written = parts.write_wing_folder(calibration, out, report=not no_report)
-    conclude(calibration.result, written, json=json, report=not no_report)
+        written = write_wing_folder(calibration, out, report=not no_report)
+    print_calibration(calibration.result, written, json=json, report=not no_report)
 
 
 def calibrate_ringdown(
     *,
-    data: Path,
-    out: Path | None = None,
-    fitted: bool = False,
-    extremes: bool = False,
-    start: float | None = None,
+    data: Annotated[
+        Path,
+        typer.Option("--data", help="Ring-down records: the authors' folder, or one file."),
+    ],
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for table and figures.")] = None,
+    fitted: Annotated[
+        bool,
+        typer.Option(
+            "--fitted",
+            help="Fit the frequencies too; by default those of the spectral peaks.",
+        ),
+    ] = False,
+    extremes: Annotated[
+        bool,
+        typer.Option(
+            "--extremes",
+            help="Fit the extremes of records read off a plot, not the middle.",
+        ),
+    ] = False,
+    start: Annotated[
+        float | None,
+        typer.Option(
+            "--start",
+            min=0.0,
+            help="Where records are cropped [s]; the first peak by default.",
+        ),
+    ] = None,
 ) -> None:
-    """Natural frequencies and damping ratios of two modes from ring-down records."""
-    start = parts.FIRST_PEAK if start is None else start
-    trials = parts.fit_trials(parts.read_records(data), free=fitted, start=start)
+    """Natural frequencies and damping ratios of two modes from ring-down records.
+
+    Example: `uav-twin calibrate ringdown --data laboratory/step3 --out ringdown`
+    """
+    from calibration.dynamics.extremes import refine_by_extremes
+    from calibration.dynamics.figures import ring_down_figure
+    from calibration.dynamics.records import read_records
+    from calibration.dynamics.trials import (
+        FIRST_PEAK,
+        PUBLISHED_DAMPING_RATIOS,
+        PUBLISHED_FREQUENCIES,
+        average,
+        fit_trials,
+    )
+    from reporting.figures import save_figure
+    from reporting.table_file import table_text
+
+    start = FIRST_PEAK if start is None else start
+    trials = fit_trials(read_records(data), free=fitted, start=start)
     if extremes:
-        trials = parts.refine_by_extremes(trials)
+        trials = refine_by_extremes(trials)
     rows = []
     for mode in (0, 1):
         rows.append(
             RingDownRow(
                 f"mode {mode + 1}, natural frequency",
                 "Hz",
-                parts.average(trials, "frequency", mode),
-                parts.PUBLISHED_FREQUENCIES[mode],
+                average(trials, "frequency", mode),
+                PUBLISHED_FREQUENCIES[mode],
             )
         )
         rows.append(
             RingDownRow(
                 f"mode {mode + 1}, damping ratio",
                 "1",
-                parts.average(trials, "damping_ratio", mode),
-                parts.PUBLISHED_DAMPING_RATIOS[mode],
+                average(trials, "damping_ratio", mode),
+                PUBLISHED_DAMPING_RATIOS[mode],
             )
         )
     headings = ("figure", "unit", "found", "between trials", "standard error", "paper")
@@ -190,8 +317,8 @@ def calibrate_ringdown(
     if out is not None:
         columns = zip(*(row.cells(".10g") for row in rows), strict=True)
         table = dict(zip(headings, columns, strict=True))
-        atomic_write_text(out / "ringdown.csv", parts.table_text(table))
-        parts.save_figure(parts.ring_down_figure(trials), out / "figures", "ringdown")
+        atomic_write_text(out / "ringdown.csv", table_text(table))
+        save_figure(ring_down_figure(trials), out / "figures", "ringdown")
 
 
 class RingDownRow(NamedTuple):
@@ -223,21 +350,71 @@ TRUTH_FILE = "truth.json"
 
 def calibrate_simulate(
     *,
-    out: Path,
-    e: float = 1.0073,
-    servo_mass: float = 0.169,
-    pitot_mass: float = 0.134,
-    alpha: float = 1.03,
-    beta: float = 0.000766,
-    seed: int = 0,
-    fmu: Path | None = None,
-    design: Path | None = None,
-    sampling_rate: float = 2000.0,
-    noise: float = 0.0001,
-    quantisation: float | None = None,
-    frequency_error: tuple[float, float] = (0.0, 0.0),
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder to write; it must be empty or not exist.")
+    ],
+    e: Annotated[float, typer.Option("--e", help="True Young's modulus factor.")] = 1.0073,
+    servo_mass: Annotated[
+        float, typer.Option("--servo-mass", help="True mass of each servo [kg].")
+    ] = 0.169,
+    pitot_mass: Annotated[
+        float, typer.Option("--pitot-mass", help="True mass of the pitot tube [kg].")
+    ] = 0.134,
+    alpha: Annotated[
+        float, typer.Option("--alpha", help="True mass-proportional damping [1/s].")
+    ] = 1.03,
+    beta: Annotated[
+        float, typer.Option("--beta", help="True stiffness-proportional damping [s].")
+    ] = 0.000766,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of all errors.")
+    ] = 0,
+    fmu: Annotated[
+        Path | None,
+        typer.Option(
+            "--fmu",
+            help="Do the experiments on this wing FMU, not on the reduced model; of the shipped "
+            "planform.",
+        ),
+    ] = None,
+    design: DesignOption = None,
+    sampling_rate: Annotated[
+        float,
+        typer.Option(
+            "--sampling-rate",
+            help="Samples per second of a ring-down record; the published have 100000.",
+        ),
+    ] = 2000.0,
+    noise: Annotated[
+        float,
+        typer.Option("--noise", min=0.0, help="Noise of a record [V], standard deviation."),
+    ] = 0.0001,
+    quantisation: Annotated[
+        float | None,
+        typer.Option("--quantisation", help="Step of the recorder [V]; none by default."),
+    ] = None,
+    frequency_error: Annotated[
+        tuple[float, float],
+        typer.Option(
+            "--frequency-error",
+            help="Relative differences of the wing's f1 and f2 from its model's; not with --fmu.",
+        ),
+    ] = (0.0, 0.0),
 ) -> None:
-    """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it."""
+    """Measure a virtual wing: a folder as `calibrate` reads it, and truth.json beside it.
+
+    Example: `uav-twin calibrate simulate --out laboratory --e 1.02 --seed 3`
+    """
+    from calibration.virtual_wing import (
+        measure_lengths,
+        measure_load_test,
+        measure_ring_down,
+        weigh,
+    )
+    from calibration.wing.lab_data import write_lab_folder
+    from fe.runtime.state import DigitalState
+    from fe.wing.design import load_design
+
     if fmu is not None and frequency_error != (0.0, 0.0):
         raise typer.BadParameter(
             "--frequency-error needs the reduced model; an FMU has its own frequencies."
@@ -245,9 +422,7 @@ def calibrate_simulate(
     if fmu is not None and design is not None:
         raise typer.BadParameter("--fmu and --design exclude each other: the FMU holds its wing.")
     refuse_filled(out)
-    wing_design = parts.load_design(design)
-    true_values = (e, servo_mass, pitot_mass, alpha, beta)
-    state: dict[str, float] = dict(zip(parts.STATE, true_values, strict=True))
+    wing_design = load_design(design)
     truth = DigitalState(
         wing_design.geometry,
         young_modulus_factor=e,
@@ -256,29 +431,61 @@ def calibrate_simulate(
         damping_alpha=alpha,
         damping_beta=beta,
     )
-    if fmu is not None:
-        test_bench: Any = parts.FmuTestBench(fmu, truth)
+    if fmu is None:
+        test_bench = _bench_of_reduced_model(wing_design, truth, frequency_error)
     else:
-        model = parts.reduced_model(wing_design)
-        test_bench = nullcontext(parts.VirtualWing(model, truth, frequency_error))
+        test_bench = _bench_of_fmu(fmu, truth)
     designed_geometry = None if design is None else wing_design.geometry
     with test_bench as bench:
-        load_test = parts.measure_load_test(bench, seed)
-        records = parts.measure_ring_down(
+        load_test = measure_load_test(bench, seed)
+        records = measure_ring_down(
             bench, seed, sampling_rate=sampling_rate, noise=noise, quantisation=quantisation
         )
-        parts.write_lab_folder(
+        write_lab_folder(
             out,
             load_test=load_test,
             records=records,
-            lengths=parts.measure_lengths(truth.geometry, seed, designed=designed_geometry),
-            total_mass=parts.weigh(truth, seed),
+            lengths=measure_lengths(truth.geometry, seed, designed=designed_geometry),
+            total_mass=weigh(truth, seed),
         )
-    known = asdict(wing_design.geometry) | {
-        **state,
+    bench_name = "reduced model" if fmu is None else fmu.name
+    _write_truth(out / TRUTH_FILE, truth, frequency_error, seed, bench_name)
+    terminal.say(f"Laboratory folder: {out}; its truth: {out / TRUTH_FILE}")
+
+
+def _bench_of_reduced_model(
+    design: "WingDesign", truth: "DigitalState", frequency_error: tuple[float, float]
+) -> "AbstractContextManager[TestBench]":
+    """Return a test bench with the reduced model of a wing, whose true frequencies may differ."""
+    from calibration.virtual_wing import VirtualWing
+    from fe.reduction.model_cache import reduced_model
+
+    return nullcontext(VirtualWing(reduced_model(design), truth, frequency_error))
+
+
+def _bench_of_fmu(fmu: Path, truth: "DigitalState") -> "AbstractContextManager[TestBench]":
+    """Return a test bench with the FMU of a wing."""
+    from twin_master.assets.virtual_experiments import FmuTestBench
+
+    return FmuTestBench(fmu, truth)
+
+
+def _write_truth(
+    path: Path,
+    truth: "DigitalState",
+    frequency_error: tuple[float, float],
+    seed: int,
+    bench_name: str,
+) -> None:
+    """Write the true state of a virtual wing, and how it was measured, as JSON."""
+    record = asdict(truth.geometry) | {
+        "young_modulus_factor": truth.young_modulus_factor,
+        "servo_mass": truth.servo_mass,
+        "pitot_mass": truth.pitot_mass,
+        "damping_alpha": truth.damping_alpha,
+        "damping_beta": truth.damping_beta,
         "frequency_error": list(frequency_error),
         "seed": seed,
-        "bench": "reduced model" if fmu is None else fmu.name,
+        "bench": bench_name,
     }
-    atomic_write_text(out / TRUTH_FILE, json_text.dumps(known, indent=2) + "\n")
-    terminal.say(f"Laboratory folder: {out}; its truth: {out / TRUTH_FILE}")
+    atomic_write_text(path, json_text.dumps(record, indent=2) + "\n")

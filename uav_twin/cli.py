@@ -1,15 +1,27 @@
-"""The command line `uav-twin`: the commands of `commands.toml`, and how it ends."""
+"""The command line `uav-twin`: its commands in the order of the help, and how it ends."""
 
 import inspect
-from collections.abc import Callable, Mapping
-from importlib import import_module
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 
 from discrepancy.errors import DiscrepancyError
 from reporting import terminal
-from twin_master.command import run_command_line
+from twin_master import command, fleet_command, plan_command
+from uav_twin import (
+    calibrate_commands,
+    discrepancy_campaigns,
+    discrepancy_commands,
+    fmu,
+    fmu_simulation,
+    structure,
+    wing_commands,
+)
+
+MISSIONS = "Missions: a twin flies, plans and watches"
+MEASUREMENTS = "Measurements: what a model must be to agree with them"
+MODELS = "Models: wings, structures and FMUs"
 
 
 def _print_version(requested: bool) -> None:
@@ -20,49 +32,6 @@ def _print_version(requested: bool) -> None:
 
     typer.echo(f"uav-twin {version('uav-twin')}")
     raise typer.Exit
-
-
-def _application() -> typer.Typer:
-    """Return the command line with the commands and groups that `commands.toml` lists."""
-    application = typer.Typer(
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-        help=(
-            "A digital twin of a structure that loses stiffness: a wing, a mesh of yours, or any "
-            "FMU."
-        ),
-    )
-    application.callback()(_common_options)
-    groups = {"": application}
-    for words, table in terminal.commands_of("uav_twin").items():
-        is_command = "function" in table
-        if "group" in table:
-            groups[words] = typer.Typer(no_args_is_help=not is_command, help=table["group"])
-            application.add_typer(groups[words], name=words)
-        if is_command:
-            _add_command(groups, words, table["function"])
-    return application
-
-
-def _add_command(groups: Mapping[str, typer.Typer], words: str, location: str) -> None:
-    """Add a command to its group.
-
-    Parameters
-    ----------
-    groups : mapping of str to Typer
-        The groups by the words that call them; the application itself is "".
-    words : str
-        The words that call the command. Those of a group call it without a command of the group.
-    location : str
-        Where the function of the command is, "module:name".
-    """
-    module, _, name = location.partition(":")
-    function = terminal.as_command(words, getattr(import_module(module), name))
-    if words in groups:
-        groups[words].callback(invoke_without_command=True)(_command_of_group(function))
-        return
-    group, _, last_word = words.rpartition(" ")
-    groups[group].command(last_word)(function)
 
 
 def _common_options(
@@ -77,13 +46,18 @@ def _common_options(
 
 
 def _command_of_group(function: Callable[..., None]) -> Callable[..., None]:
-    """Return the command that has the name of a group, such as `calibrate`.
+    """Return a function as the command that the name of a group calls, such as `calibrate`.
 
-    It runs where no command of the group is called. Its own options may not stand before such a
-    command.
+    Typer calls it before each command of the group, too. There it does nothing but refuse options
+    of its own, as in `calibrate --seed 3 simulate`: nothing would take them.
+
+    Parameters
+    ----------
+    function : callable
+        The command, with Typer's annotations.
     """
 
-    def command(context: typer.Context, **options: object) -> None:
+    def command_of_group(context: typer.Context, **options: object) -> None:
         if context.invoked_subcommand is None:
             function(**options)
             return
@@ -95,19 +69,128 @@ def _command_of_group(function: Callable[..., None]) -> Callable[..., None]:
             )
 
     # Typer reads the options of a command from its signature
-    command.__doc__ = function.__doc__
-    context_parameter = inspect.signature(command).parameters["context"]
+    command_of_group.__doc__ = function.__doc__
+    context_parameter = inspect.signature(command_of_group).parameters["context"]
     signature = inspect.signature(function)
     parameters = [context_parameter, *signature.parameters.values()]
-    vars(command)["__signature__"] = signature.replace(parameters=parameters)
-    return command
+    vars(command_of_group)["__signature__"] = signature.replace(parameters=parameters)
+    return command_of_group
 
 
-app = _application()
+app = typer.Typer(
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="A digital twin of a structure that loses stiffness: a wing, a mesh of yours, or any FMU.",
+)
+app.callback()(_common_options)
+
+
+def _add_group(name: str, panel: str, text: str) -> typer.Typer:
+    """Add a group of commands to the command line, and return it.
+
+    Parameters
+    ----------
+    name : str
+        The word that calls the group.
+    panel : str
+        The heading of the help under which it stands.
+    text : str
+        What the help says of it.
+    """
+    group = typer.Typer(no_args_is_help=True, help=text)
+    app.add_typer(group, name=name, rich_help_panel=panel)
+    return group
+
+
+def _add_group_command(
+    name: str, panel: str, text: str, function: Callable[..., None]
+) -> typer.Typer:
+    """Add a group of commands whose name alone calls a command, too, and return the group.
+
+    The text stands in the list of commands; the help of the group is that of the function.
+    """
+    group = typer.Typer()
+    group.callback(invoke_without_command=True)(_command_of_group(function))
+    app.add_typer(group, name=name, short_help=text, rich_help_panel=panel)
+    return group
+
+
+app.command("run", rich_help_panel=MISSIONS)(command.run)
+app.command("plan", rich_help_panel=MISSIONS)(plan_command.plan)
+app.command("design", rich_help_panel=MISSIONS)(plan_command.design)
+app.command("view", rich_help_panel=MISSIONS)(command.view)
+app.command("watch", rich_help_panel=MISSIONS)(command.watch)
+app.command("compare", rich_help_panel=MISSIONS)(fleet_command.compare)
+app.command("scenarios", rich_help_panel=MISSIONS)(command.list_scenarios)
+
+scenario_group = _add_group("scenario", MISSIONS, "Check a scenario before it is flown.")
+scenario_group.command("check")(command.check_scenario)
+
+wing_group = _add_group_command(
+    "wing",
+    MODELS,
+    "Say what a wing weighs and how it vibrates; verify its model.",
+    wing_commands.wing,
+)
+wing_group.command("verify")(wing_commands.verify_wing)
+
+calibrate_group = _add_group_command(
+    "calibrate",
+    MEASUREMENTS,
+    "Tailor the model to one wing: all steps in order, or one of them.",
+    calibrate_commands.calibrate_wing,
+)
+calibrate_group.command("ringdown")(calibrate_commands.calibrate_ringdown)
+calibrate_group.command("simulate")(calibrate_commands.calibrate_simulate)
+calibrate_group.command("campaign")(calibrate_commands.calibrate_campaign)
+
+discrepancy_group = _add_group(
+    "discrepancy",
+    MEASUREMENTS,
+    "Find, name, add and prove what a model lacks beside measured data.",
+)
+discrepancy_group.command("run")(discrepancy_commands.run)
+discrepancy_group.command("apply")(discrepancy_commands.apply)
+discrepancy_group.command("check")(discrepancy_commands.check)
+discrepancy_group.command("effects")(discrepancy_campaigns.effects)
+discrepancy_group.command("example")(discrepancy_campaigns.example)
+discrepancy_group.command("import")(discrepancy_campaigns.import_files)
+discrepancy_group.command("convert")(discrepancy_campaigns.convert)
+
+fleet_group = _add_group("fleet", MISSIONS, "Fly fleets of assets, and learn across them.")
+fleet_group.command("watch")(fleet_command.watch)
+fleet_group.command("run")(fleet_command.run)
+fleet_group.command("learn")(fleet_command.learn)
+
+fmu_group = _add_group("fmu", MODELS, "Build, describe, bind, check and simulate FMUs.")
+fmu_group.command("build")(fmu.build)
+fmu_group.command("info")(fmu.info)
+fmu_group.command("bind")(fmu.bind)
+fmu_group.command("check")(fmu.check)
+fmu_group.command("simulate")(fmu_simulation.simulate)
+
+library_group = _add_group("library", MODELS, "Sample FMUs into observation libraries.")
+library_group.command("sample")(fmu_simulation.sample)
+
+ssp_group = _add_group("ssp", MODELS, "Write, check and simulate systems of FMUs as SSP files.")
+ssp_group.command("export")(fmu.export)
+ssp_group.command("simulate")(fmu_simulation.simulate_system)
+ssp_group.command("check")(fmu.check_system)
+
+structure_group = _add_group(
+    "structure",
+    MODELS,
+    "Look at a structure from a mesh or matrices, verify it against CalculiX, reduce it, pack it.",
+)
+structure_group.command("info")(structure.info)
+structure_group.command("verify")(structure.verify)
+structure_group.command("field")(structure.field)
+structure_group.command("reduce")(structure.reduce)
+structure_group.command("fmu")(structure.fmu)
 
 
 def main() -> None:
     """Run `uav-twin`."""
-    run_command_line(
+    command.run_command_line(
         lambda: terminal.with_common_options(app)(prog_name="uav-twin"), DiscrepancyError
     )

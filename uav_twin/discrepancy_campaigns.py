@@ -6,76 +6,226 @@ import sys
 from collections.abc import Sequence
 from math import isfinite, nan
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from discrepancy.errors import CampaignFileError, CatalogueError
 from reporting import terminal
+from reporting.command_options import LARGEST_SEED
 from reporting.files import refuse_filled
-from reporting.words import comma_list, counted
-from uav_twin import options, parts
+from reporting.words import comma_list, counted, in_one_line
+from uav_twin.completion import complete_effect, complete_model
+from uav_twin.options import EffectFilesOption, ModelOption
+
+if TYPE_CHECKING:
+    from discrepancy.campaign.importing import LaboratoryImport
+    from discrepancy.campaign.records import Campaign
+    from discrepancy.catalogue.entry import Effect, EffectParameter, ShapeParameter
+    from discrepancy.system.interface import Model
+    from fe.runtime.patch import ModelPatch
 
 
 def import_files(
-    files: list[Path],
+    files: Annotated[
+        list[Path],
+        typer.Argument(show_default=False, help="CSV, FILE.xlsx, FILE.xlsx#SHEET or FILE.mat."),
+    ],
     *,
-    out: Path | None = None,
-    column: list[str] | None = None,
-    unit: list[str] | None = None,
-    quantity: list[str] | None = None,
-    scale: list[str] | None = None,
-    zero: list[str] | None = None,
-    gain: list[str] | None = None,
-    hold: list[str] | None = None,
-    kind: list[str] | None = None,
-    release: list[str] | None = None,
-    load_place: list[str] | None = None,
-    decimal: list[str] | None = None,
-    interval: list[str] | None = None,
-    begins: list[str] | None = None,
-    held_out: list[str] | None = None,
-    reference_temperature: str | None = None,
-    model: str | None = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", show_default="as the first file", help="The folder."),
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--column",
+            metavar="HEAD=WHAT",
+            help="The model's output that a column measures; time, force, temperature or "
+            "load_factor; input:NAME; or - to leave it out. May be given several "
+            "times.",
+        ),
+    ] = None,
+    unit: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--unit",
+            metavar="HEAD=UNIT",
+            help="Where the head does not say it. May be given several times.",
+        ),
+    ] = None,
+    quantity: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--quantity",
+            metavar="HEAD=QUANTITY",
+            help="Where a unit is of several, such as V, % and 1. May be given several times.",
+        ),
+    ] = None,
+    scale: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--scale",
+            metavar="HEAD=SCALE",
+            help="What the cells stand for, as 200 N/V; a mere number multiplies them. "
+            "May be given several times.",
+        ),
+    ] = None,
+    zero: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--zero",
+            metavar="[HEAD=]DEVIATION",
+            show_default="1%",
+            help="How well a zero is known: 0.1mm, 1% of the largest reading, exact or "
+            "free. May be given several times.",
+        ),
+    ] = None,
+    gain: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--gain",
+            metavar="[HEAD=]DEVIATION",
+            show_default="2%",
+            help="How well a gain is known: 2%, exact or free. May be given several times.",
+        ),
+    ] = None,
+    hold: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hold",
+            metavar="[HEAD=]HOLD",
+            show_default="linear",
+            help="What a load does between samples: zero_order, linear or smooth. May be "
+            "given several times.",
+        ),
+    ] = None,
+    kind: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--kind",
+            metavar="[FILE=]KIND",
+            help="What was done: static, ringdown, forced, driven or flight; noise: "
+            "samples at rest. May be given several times.",
+        ),
+    ] = None,
+    release: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--release",
+            metavar="[FILE=]SIZE",
+            help="How far the point was held that was let go, as 15.5mm. May be given "
+            "several times.",
+        ),
+    ] = None,
+    load_place: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--load-place",
+            metavar="[FILE=]PLACE",
+            show_default="tip_load",
+            help="Where a force acts. May be given several times.",
+        ),
+    ] = None,
+    decimal: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--decimal",
+            metavar="[FILE=]MARK",
+            help="Point or comma, where 1,234 can be two numbers. May be given several times.",
+        ),
+    ] = None,
+    interval: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--interval",
+            metavar="[FILE=]SECONDS",
+            help="Seconds between rows, where no column is a time. May be given several times.",
+        ),
+    ] = None,
+    begins: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--begins",
+            metavar="[FILE=]START",
+            show_default="settled",
+            help="How a forced or driven trial begins: settled, still or unknown. May be "
+            "given several times.",
+        ),
+    ] = None,
+    held_out: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--held-out",
+            metavar="FILE",
+            help="A file that is kept for proof. May be given several times.",
+        ),
+    ] = None,
+    reference_temperature: Annotated[
+        str | None,
+        typer.Option(
+            "--reference-temperature", metavar="DEGC", help="Where a column is a temperature."
+        ),
+    ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            autocompletion=complete_model,
+            help="As of `discrepancy run`: columns may be called like its outputs.",
+        ),
+    ] = None,
 ) -> None:
-    """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say."""  # noqa: E501
+    """Make a campaign of a laboratory's files: show how they are understood, and ask what they do not say.
+
+    Example: `uav-twin discrepancy import pull.csv --kind static --column F=force --out measured`
+    """  # noqa: E501
+    from discrepancy.campaign.writing import write_campaign
+
     folder = out or Path(files[0].stem)
     refuse_filled(folder)
-    column_options = (column, unit, quantity, scale, zero, gain, hold)
-    held_out_option = [f"{name}=yes" for name in held_out or ()]
-    file_options = (kind, release, load_place, decimal, interval, begins, held_out_option)
-    names = (*parts.OF_COLUMNS, *parts.OF_FILES)
-    answers = {
-        name: _answers_by_subject(texts or ())
-        for name, texts in zip(names, (*column_options, *file_options), strict=True)
+    options = {
+        "column": column,
+        "unit": unit,
+        "quantity": quantity,
+        "scale": scale,
+        "zero": zero,
+        "gain": gain,
+        "hold": hold,
+        "kind": kind,
+        "release": release,
+        "load-place": load_place,
+        "decimal": decimal,
+        "interval": interval,
+        "begins": begins,
+        "held-out": [f"{name}=yes" for name in held_out or ()],
     }
+    answers = {name: _answers_by_subject(texts or ()) for name, texts in options.items()}
     if reference_temperature is not None:
         answers["reference-temperature"] = {"": reference_temperature}
-    sheets = [parts.read_sheet(file) for file in files]
-    understanding = parts.LaboratoryImport(sheets, answers)
-    if model is not None:
-        quantity_of_output = parts.choose_model(model).model.output_quantity
-        understanding = parts.LaboratoryImport(understanding.sheets, answers, quantity_of_output)
-    _show_understanding(understanding)
+    understanding = _understand_files(files, answers, model)
+    _print_understanding(understanding)
     is_interactive = sys.stdin.isatty() and sys.stdout.isatty()
-    if is_interactive and (understanding.questions or understanding.assumptions):
-        while understanding.questions or understanding.assumptions:
-            understanding = _with_answer_of_user(understanding)
-        _show_understanding(understanding)
+    if is_interactive:
+        understanding = _ask_all_questions(understanding)
     campaign = understanding.campaign(folder.resolve().name)
     if is_interactive and not typer.confirm(f"Write {folder}?", default=True):
         terminal.say("Nothing was written.")
         raise typer.Exit(1)
-    parts.write_campaign(
-        campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True
-    )
-    assumptions = []
+    write_campaign(campaign, folder, si=True, units=understanding.units(), left_out_as_empty=True)
+    terminal.say(f"Wrote {folder}: {_campaign_size(campaign)}.")
     if understanding.assumed:
-        assumptions.append(
+        terminal.say(
             f"{understanding.assumed} Where you know better, give --zero and --gain, or correct "
             f"offset_deviation and gain_deviation in {folder / 'campaign.toml'}."
         )
-    arguments = arguments_of(folder, model)
-    options.show("import", folder=folder, campaign=campaign, given=arguments, assumed=assumptions)
+    terminal.say(f"Next: uav-twin discrepancy check {_shell_arguments(folder, model)}")
+
+
+def _campaign_size(campaign: "Campaign") -> str:
+    """Return how many trials and channels a campaign has, as a text."""
+    trials = counted(len(campaign.trials), "trial")
+    return f"{trials}, {counted(len(campaign.channels), 'channel')}"
 
 
 def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
@@ -87,18 +237,55 @@ def _answers_by_subject(texts: Sequence[str]) -> dict[str, str]:
     return answers
 
 
-def _with_answer_of_user(understanding: "parts.LaboratoryImport") -> "parts.LaboratoryImport":
+def _understand_files(
+    files: list[Path], answers: dict[str, dict[str, str]], model: str | None
+) -> "LaboratoryImport":
+    """Return how a laboratory's files are understood.
+
+    Parameters
+    ----------
+    files : list of Path
+        The files.
+    answers : dict of str to (dict of str to str)
+        The answers of the user by option and by subject, a column or a file.
+    model : str or None
+        A model whose outputs name columns; its description is read after the files.
+    """
+    from discrepancy.campaign.importing import LaboratoryImport
+    from discrepancy.campaign.sheet import read_sheet
+    from discrepancy.model_choice import choose_model
+
+    sheets = [read_sheet(file) for file in files]
+    understanding = LaboratoryImport(sheets, answers)
+    if model is None:
+        return understanding
+    quantity_of_output = choose_model(model).model.output_quantity
+    return LaboratoryImport(understanding.sheets, answers, quantity_of_output)
+
+
+def _ask_all_questions(understanding: "LaboratoryImport") -> "LaboratoryImport":
+    """Ask the user what the files do not say, and return the understanding with all answers."""
+    if not understanding.questions and not understanding.assumptions:
+        return understanding
+    while understanding.questions or understanding.assumptions:
+        understanding = _ask_one_question(understanding)
+    _print_understanding(understanding)
+    return understanding
+
+
+def _ask_one_question(understanding: "LaboratoryImport") -> "LaboratoryImport":
     """Ask the user one question, and return the understanding with the answer.
 
     Questions that must be answered come first, then those with a default, which an empty line
     takes. An answer that does not fit is refused, and changes nothing.
     """
-    default = None
     if understanding.questions:
-        (option, expected), (subject, *_) = next(iter(understanding.questions.items()))
+        option, expected = next(iter(understanding.questions))
+        subject = understanding.questions[option, expected][0]
+        default = None
     else:
-        (option, expected), defaults = next(iter(understanding.assumptions.items()))
-        subject, default = next(iter(defaults.items()))
+        option, expected = next(iter(understanding.assumptions))
+        subject, default = next(iter(understanding.assumptions[option, expected].items()))
     question = f"{option} ({expected})"
     if subject:
         question = f"{subject}, {question}"
@@ -110,8 +297,18 @@ def _with_answer_of_user(understanding: "parts.LaboratoryImport") -> "parts.Labo
         return understanding
 
 
-def _show_understanding(understanding: "parts.LaboratoryImport") -> None:
+_DECIMAL_MARKS = {".": "points", ",": "commas"}
+"""What the marks before decimals are called."""
+
+
+def _print_understanding(understanding: "LaboratoryImport") -> None:
     """Print how the columns of files are understood, each with a value that is not zero."""
+    for sheet in understanding.sheets:
+        kind = understanding.kinds[sheet.name] or "?"
+        decimal_mark = _DECIMAL_MARKS.get(understanding.decimals[sheet.name], "?")
+        terminal.say(f"{sheet.name}: {kind}; {sheet.remark}; decimal {decimal_mark}")
+    for sentence in understanding.clock_sentences:
+        terminal.say(sentence)
     rows = []
     for column in understanding.columns:
         sheet = column.sheet
@@ -130,65 +327,148 @@ def _show_understanding(understanding: "parts.LaboratoryImport") -> None:
                 f"{float(si_value):.6g} {column.si}" if si_value else "",
             )
         )
-    options.show("understood", found=understanding, rows=rows)
+    if rows:
+        headings = ("file", "column", "unit", "is", "quantity", "a cell", "in SI")
+        terminal.print_table(headings, rows)
 
 
-def effects(*, show: str | None = None, add: list[Path] | None = None) -> None:
-    """List the effects that can be named."""
-    catalogue = parts.load_catalogue(add or ())
-    if show is None:
-        options.show("effects", effects=catalogue, formula=parts.formula)
-    else:
-        _show_effect(parts.effect_by_identifier(show, catalogue))
+def effects(
+    *,
+    show: Annotated[
+        str | None,
+        typer.Option(
+            "--show",
+            metavar="ID",
+            autocompletion=complete_effect,
+            help="Everything about one effect.",
+        ),
+    ] = None,
+    add: EffectFilesOption = None,
+) -> None:
+    """List the effects that can be named.
+
+    Example: `uav-twin discrepancy effects --show coulomb_friction`
+    """
+    from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
+    from discrepancy.report.text import formula
+
+    catalogue = load_catalogue(add or ())
+    if show is not None:
+        _print_effect(effect_by_identifier(show, catalogue))
+        return
+    rows = []
+    for effect in catalogue:
+        cells = (effect.identifier, effect.name, effect.family, formula(effect.equation))
+        rows.append([in_one_line(cell) for cell in cells])
+    terminal.print_table(("id", "name", "family", "equation"), rows)
+    terminal.say(f"{counted(len(rows), 'effect')}; --show ID tells everything about one.")
 
 
-def _show_effect(effect: "parts.Effect") -> None:
+def _print_effect(effect: "Effect") -> None:
+    """Print everything about an effect: facts, then parameters and exponents of its law."""
+    from discrepancy.report.text import formula
+
     facts = (
         ("name", effect.name),
         ("family", effect.family),
-        ("equation", parts.formula(effect.equation)),
-        ("signature", parts.formula(effect.signature)),
+        ("equation", formula(effect.equation)),
+        ("signature", formula(effect.signature)),
         ("acts on", ", ".join(sorted(kind.value for kind in effect.acts_on))),
         ("confusable with", ", ".join(effect.confusable) or "nothing in general"),
         ("reference", effect.reference),
     )
     terminal.print_table(("id", effect.identifier), facts)
-    options.show("effect", effect=effect, unit_text=parts.unit_text)
+    rows = [_parameter_row(parameter) for parameter in effect.parameters]
+    rows += [_exponent_row(exponent) for exponent in effect.shape]
+    if rows:
+        headings = ("parameter", "symbol", "prior (90 %)", "unit", "meaning")
+        terminal.print_table(headings, rows)
 
 
-def example(
-    kind: str,
-    out: Path,
-    *,
-    model: str | None = None,
-    seed: int = 0,
-    effect: list[str] | None = None,
-) -> None:
-    """Write a simulated campaign, with an effect hidden in it if asked for."""
-    refuse_filled(out, "folder")
-    chosen = parts.choose_model(model).model
-    plan = parts.plan_of(chosen)
-    patch = parts.ModelPatch()
-    if effect:
-        plain = parts.example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # it checks
-        for text in effect:
-            patch = patch + _hidden_effect(text, chosen, plain)
-    campaign = parts.write_example(chosen, out, kind, seed, plan, patch)  # type: ignore[arg-type]
-    hidden = ", ".join(effect) if effect else "nothing"
-    options.show(
-        "example", out=out, campaign=campaign, hidden=hidden, given=arguments_of(out, model)
+def _parameter_row(parameter: "EffectParameter") -> tuple[str, ...]:
+    """Return the cells of a parameter of an effect: name, symbol, prior, unit, meaning."""
+    from discrepancy.report.text import unit_text
+
+    prior = parameter.prior
+    prior_text = f"{prior.low:g} to {prior.high:g}, {prior.shape.replace('_', '-')}"
+    return (
+        parameter.name,
+        parameter.symbol,
+        prior_text,
+        unit_text(parameter.unit),
+        in_one_line(parameter.description),
     )
 
 
-def arguments_of(campaign: Path, model: str | None) -> str:
+def _exponent_row(exponent: "ShapeParameter") -> tuple[str, ...]:
+    """Return the cells of an exponent that is fixed in the named effect and free in its family."""
+    prior = exponent.prior
+    prior_text = f"{exponent.canonical:g}; freed: {prior.low:g} to {prior.high:g}"
+    description = in_one_line(exponent.description)
+    return (exponent.name, exponent.symbol, prior_text, "", description)
+
+
+def example(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            show_default=False, help="static, ringdown, flight, laboratory or complete."
+        ),
+    ],
+    out: Annotated[Path, typer.Argument(show_default=False, help="The folder to write.")],
+    *,
+    model: ModelOption = None,
+    seed: Annotated[
+        int,
+        typer.Option(
+            "--seed",
+            min=0,
+            max=LARGEST_SEED,
+            help="Seed of noise, zeros, gains and releases.",
+        ),
+    ] = 0,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            metavar="ID[@PLACE][:NAME=VALUE,...]",
+            autocompletion=complete_effect,
+            help="Hide an effect; values of its parameters in the catalogue's order, else their "
+            "prior medians. May be given several times.",
+        ),
+    ] = None,
+) -> None:
+    """Write a simulated campaign, with an effect hidden in it if asked for.
+
+    Example: `uav-twin discrepancy example ringdown measured --effect coulomb_friction`
+    """
+    from discrepancy.model_choice import choose_model
+    from discrepancy.sources.examples import example_campaign, plan_of, write_example
+    from fe.runtime.patch import ModelPatch
+
+    refuse_filled(out, "folder")
+    chosen = choose_model(model).model
+    plan = plan_of(chosen)
+    patch = ModelPatch()
+    if effect:
+        plain = example_campaign(chosen, kind, seed, plan)  # type: ignore[arg-type]  # it checks
+        for text in effect:
+            patch = patch + _patch_of_hidden_effect(text, chosen, plain)
+    campaign = write_example(chosen, out, kind, seed, plan, patch)  # type: ignore[arg-type]
+    hidden = ", ".join(effect) if effect else "nothing"
+    arguments = _shell_arguments(out, model)
+    terminal.say(f"Wrote {out}: {_campaign_size(campaign)}; hidden: {hidden}.")
+    terminal.say(f"Next: uav-twin discrepancy check {arguments}")
+    terminal.say(f"Then: uav-twin discrepancy run {arguments}")
+
+
+def _shell_arguments(campaign: Path, model: str | None) -> str:
     """Return a campaign and its model as the arguments of a further command."""
     model_option = [] if model is None else ["--model", model]
     return shlex.join([str(campaign), *model_option])
 
 
-def _hidden_effect(
-    text: str, model: "parts.Model", campaign: "parts.Campaign"
-) -> "parts.ModelPatch":
+def _patch_of_hidden_effect(text: str, model: "Model", campaign: "Campaign") -> "ModelPatch":
     """Return the patch of an effect that is hidden in an example.
 
     Parameters
@@ -206,28 +486,42 @@ def _hidden_effect(
     CatalogueError
         If there is no such effect, place or parameter.
     """
+    from discrepancy.catalogue.entry import Setting
+    from discrepancy.catalogue.library import effect_by_identifier, load_catalogue
+
+    # ID@PLACE stands before the colon; without a colon, before the first equals sign
     has_names = ":" in text
-    head, _, numbers = text.partition(":" if has_names else "=")
-    identifier, at, place = head.partition("@")
-    effect = parts.effect_by_identifier(identifier, parts.load_catalogue())
-    setting = parts.Setting(campaign, model, model.scales(campaign))
+    effect_and_place, _, numbers = text.partition(":" if has_names else "=")
+    identifier, at_sign, place = effect_and_place.partition("@")
+    effect = effect_by_identifier(identifier, load_catalogue())
+    setting = Setting(campaign, model, model.scales(campaign))
     reason = effect.unavailable(setting)
     if reason is not None:
         raise CatalogueError(f"{identifier} cannot be hidden in this example: {reason}")
     places = effect.places(setting)
-    if at and place not in places:
+    if at_sign and place not in places:
         known = ", ".join(repr(name) for name in places)
         raise CatalogueError(f"{identifier} cannot act at {place!r} here; its places are {known}.")
-    values = {}
-    for parameter in effect.parameters:
-        value = parameter.prior.value(0.0)
-        if parameter.magnitude and value == 0.0:
-            # the median of a magnitude of either sign would hide nothing
-            value = parameter.prior.value(1.0)
-        values[parameter.name] = value
+    values = _usual_values(effect)
     if numbers or has_names:
         values |= _parameter_values(text, identifier, numbers.split(","), list(values))
-    return effect.patch(setting, values, place if at else places[0])
+    return effect.patch(setting, values, place if at_sign else places[0])
+
+
+def _usual_values(effect: "Effect") -> dict[str, float]:
+    """Return values of an effect's parameters by name: the medians of their priors.
+
+    A magnitude of either sign has the median zero, which would hide nothing in an example. It has
+    the value one standard deviation above.
+    """
+    values = {}
+    for parameter in effect.parameters:
+        median = parameter.prior.value(0.0)
+        if parameter.magnitude and median == 0.0:
+            values[parameter.name] = parameter.prior.value(1.0)
+        else:
+            values[parameter.name] = median
+    return values
 
 
 def _parameter_values(
@@ -275,7 +569,29 @@ def _parameter_values(
     return values
 
 
-def convert(out: Path, *, data: Path, rig: str = "real_wing") -> None:
-    """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it."""  # noqa: E501
-    campaign = parts.read_campaign(parts.write_rig_campaign(rig, data, out))
-    options.show("convert", campaign=campaign, out=out, modelled=(out / "model.toml").exists())
+def convert(
+    out: Annotated[
+        Path,
+        typer.Argument(show_default=False, help="Folder to write the campaign to."),
+    ],
+    *,
+    data: Annotated[
+        Path,
+        typer.Option("--data", show_default=False, help="The folder of the published data."),
+    ],
+    rig: Annotated[
+        str,
+        typer.Option("--rig", help="real_wing, falling_phone, two_tanks or pendulum."),
+    ] = "real_wing",
+) -> None:
+    """Write published measurements as a campaign; of other rigs than the wing with `model.toml` beside it.
+
+    Example: `uav-twin discrepancy convert measured --data published --rig two_tanks`
+    """  # noqa: E501
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.sources.measured_rigs import write_rig_campaign
+
+    campaign = read_campaign(write_rig_campaign(rig, data, out))
+    model_file = out / "model.toml"
+    model_text = f", its model in {model_file}" if model_file.exists() else ""
+    terminal.say(f"{campaign.name}: {counted(len(campaign.trials), 'trial')} in {out}{model_text}")

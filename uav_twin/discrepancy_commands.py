@@ -6,83 +6,174 @@ are in `discrepancy_campaigns`.
 
 import dataclasses
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from json import loads
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from discrepancy.errors import CampaignFileError, DiscrepancyError
 from reporting import terminal
+from reporting.command_options import LARGEST_SEED, JsonOption, NoReportOption
+from reporting.former_options import accepts_former_options
 from reporting.progress import reporter, stage
-from uav_twin import options, parts
+from uav_twin.completion import complete_model
+from uav_twin.options import CampaignArgument, EffectFilesOption, ModelOption, ReplaceOption
+
+if TYPE_CHECKING:
+    from discrepancy.campaign.records import Campaign
+    from discrepancy.catalogue.entry import Effect
+    from discrepancy.checks.fault import DataFault
+    from discrepancy.document import Origin
+    from discrepancy.judgement.separability import Separability
+    from discrepancy.model_choice import ModelChoice
+    from discrepancy.report.figures import ReportInput
+    from discrepancy.self_calibration import SelfCalibration
+    from discrepancy.system.interface import Model
+    from discrepancy.verdict_so_far import SearchInProgress
+    from discrepancy.workflow import Investigation
 
 
+@accepts_former_options(from_step="--from-turn", to_step="--to-turn")
 def run(
-    campaign: Path | None = None,
+    campaign: Annotated[
+        Path | None, typer.Argument(show_default=False, help="Folder with campaign.toml.")
+    ] = None,
     *,
-    from_run: Path | None = None,
-    from_step: int | None = None,
-    to_step: int | None = None,
-    model: str | None = None,
-    out: Path | None = None,
-    replace: bool = False,
-    seed: int = 0,
-    effects: list[Path] | None = None,
-    calibrate: int | None = None,
-    no_report: bool = False,
-    json: bool = False,
+    from_run: Annotated[
+        Path | None,
+        typer.Option(
+            "--from-run",
+            help="Folder of a mission (uav-twin run): its flight, and by default its twin's model.",
+        ),
+    ] = None,
+    from_step: Annotated[
+        int | None,
+        typer.Option("--from-step", min=0, help="First step of --from-run that is compared."),
+    ] = None,
+    to_step: Annotated[
+        int | None,
+        typer.Option("--to-step", min=0, help="Last step of --from-run that is compared."),
+    ] = None,
+    model: Annotated[
+        str | None,
+        typer.Option(
+            "--model",
+            show_default="the shipped wing",
+            autocompletion=complete_model,
+            help="A calibration.nc, a wing design, a structure, a lumped model or a description of "
+            "an FMU (.toml), one of them patched (.json), or the name of a shipped lumped model.",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", show_default="verdicts/CAMPAIGN", help="Folder of the verdict."),
+    ] = None,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace the folder of an earlier verdict.")
+    ] = False,
+    seed: Annotated[
+        int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of all draws.")
+    ] = 0,
+    effects: EffectFilesOption = None,
+    calibrate: Annotated[
+        int | None,
+        typer.Option(
+            "--calibrate",
+            metavar="N",
+            min=1,
+            max=10000,
+            help="Try the workflow on N simulated campaigns of this geometry; takes minutes.",
+        ),
+    ] = None,
+    no_report: NoReportOption = False,
+    json: JsonOption = False,
 ) -> None:
-    """Find out what the model lacks: verdict, report, patch, residuals."""
-    one_thread()
-    _check_source(campaign, from_run, from_step, to_step)
+    """Find out what the model lacks: verdict, report, patch, residuals.
+
+    Example: `uav-twin discrepancy run measured --model single_mass_rig --out verdict`
+    """
+    from discrepancy.application import packed_beside
+    from discrepancy.catalogue.library import load_catalogue
+    from discrepancy.report.figures import ReportInput
+    from discrepancy.verdict_folder import check_verdict_folder, write_verdict_folder
+    from discrepancy.verdict_so_far import SearchInProgress
+    from discrepancy.workflow import investigate
+
+    use_one_thread()
+    _refuse_unfit_sources(campaign, from_run, from_step, to_step)
     source = campaign or from_run
     assert source is not None
     folder = out if out is not None else Path("verdicts") / source.resolve().name
-    parts.check_verdict_folder(folder, replace_it=replace)
-    catalogue = parts.load_catalogue(effects or ())
-    data, choice = _compared(campaign, from_run, from_step, to_step, model)
-    inputs = {"campaign": data.data_hash, "model": choice.source_hash}
-    inputs |= {f"effects {path.name}": parts.hash_file(path) for path in effects or ()}
+    check_verdict_folder(folder, replace_it=replace)
+    catalogue = load_catalogue(effects or ())
+    data, choice = _read_campaign_and_model(campaign, from_run, from_step, to_step, model)
     options_of_command = {
         "from-step": from_step,
         "to-step": to_step,
         "model": model and choice.file,
         "seed": seed,
+        "calibrate": calibrate,
     }
-    origin = parts.Origin(
-        data.name,
-        choice.model.name,
-        data.data_hash,
-        choice.source_hash,
-        _command(
-            source, effects or [], from_run is not None, **options_of_command, calibrate=calibrate
-        ),
-        parts.collect_provenance(seed, input_hashes=inputs),
-        choice.file,
-    )
-    in_progress = parts.SearchInProgress()
-    with terminal.interruptible(lambda: _keep_so_far(folder, in_progress, origin)):
-        investigation = parts.investigate(
+    command = _repeatable_command(source, effects or [], from_run is not None, options_of_command)
+    origin = _origin_of_verdict(data, choice, effects or [], command, seed)
+    in_progress = SearchInProgress()
+    with terminal.interruptible(lambda: _write_search_so_far(folder, in_progress, origin)):
+        investigation = investigate(
             data, choice.model, catalogue, seed=seed, on_search=in_progress.begin
         )
-    separability, self_calibration = _decidability(
+    separability, self_calibration = _assess_campaign(
         investigation, choice, catalogue, calibrate, seed
     )
-    pack = None if choice.design is None else partial(parts.packed_beside, choice)
-    content = parts.ReportInput(
+    pack = None if choice.design is None else partial(packed_beside, choice)
+    content = ReportInput(
         investigation, origin, separability, self_calibration, choice.design, pack=pack
     )
     with stage("Writing the verdict"):
-        report_file = parts.write_verdict_folder(
+        report_file = write_verdict_folder(
             folder, content, replace_it=replace, report=not no_report
         )
-    _conclude(content, folder, None if no_report else report_file, json=json)
+    _print_conclusion(content, folder, None if no_report else report_file, json=json)
 
 
-def _check_source(
+def _origin_of_verdict(
+    campaign: "Campaign", choice: "ModelChoice", effects: list[Path], command: str, seed: int
+) -> "Origin":
+    """Return what a verdict rests on: campaign, model and further effects, with their hashes.
+
+    Parameters
+    ----------
+    campaign : Campaign
+        The campaign.
+    choice : ModelChoice
+        The model that it is compared with.
+    effects : list of Path
+        Files of further effects.
+    command : str
+        The command that repeats the investigation in any folder.
+    seed : int
+        Seed of all draws.
+    """
+    from discrepancy.document import Origin
+    from reporting.files import hash_file
+    from reporting.provenance import collect_provenance
+
+    inputs = {"campaign": campaign.data_hash, "model": choice.source_hash}
+    inputs |= {f"effects {path.name}": hash_file(path) for path in effects}
+    return Origin(
+        campaign=campaign.name,
+        model=choice.model.name,
+        data_hash=campaign.data_hash,
+        model_hash=choice.source_hash,
+        command=command,
+        provenance=collect_provenance(seed, input_hashes=inputs),
+        model_file=choice.file,
+    )
+
+
+def _refuse_unfit_sources(
     campaign: Path | None, from_run: Path | None, from_step: int | None, to_step: int | None
 ) -> None:
     """Refuse both sources of records or none of them, and steps that are not those of a mission.
@@ -104,30 +195,50 @@ def _check_source(
         )
 
 
-def _decidability(
-    investigation: "parts.Investigation",
-    choice: "parts.ModelChoice",
-    catalogue: "Sequence[parts.Effect]",
+def _assess_campaign(
+    investigation: "Investigation",
+    choice: "ModelChoice",
+    catalogue: "Sequence[Effect]",
     calibrate: int | None,
     seed: int,
-) -> tuple["parts.Separability | None", "parts.SelfCalibration | None"]:
-    """Return what the campaign can decide, and how often the workflow is right on simulated ones.
+) -> tuple["Separability | None", "SelfCalibration | None"]:
+    """Return what a campaign can decide, and how often the workflow is right on simulated ones.
 
-    Both are None where the records could not be compared with the model; the second also where no
-    number of simulated campaigns is given.
+    Parameters
+    ----------
+    investigation : Investigation
+        The investigation of the campaign.
+    choice : ModelChoice
+        The model that the campaign is compared with.
+    catalogue : sequence of Effect
+        All effects that can be named.
+    calibrate : int or None
+        The number of simulated campaigns.
+    seed : int
+        Seed of their draws.
+
+    Returns
+    -------
+    Separability or None, SelfCalibration or None
+        Both are None if the records could not be compared with the model; the second is also None
+        if no number of simulated campaigns is given.
     """
+    from discrepancy.judgement.separability import separability as separability_of_campaign
+    from discrepancy.model_choice import ModelKind
+    from discrepancy.self_calibration import self_calibrate
+
     if investigation.problem is None:
         return None, None
     tested_campaign = investigation.campaign
     with stage("What this campaign can decide"):
-        separability = parts.separability(
+        separability = separability_of_campaign(
             tested_campaign, choice.model, investigation.problem.setting, catalogue
         )
     if calibrate is None:
         return separability, None
-    workers = 1 if choice.kind is parts.ModelKind.FMU else 2  # an FMU is its own process
+    workers = 1 if choice.kind is ModelKind.FMU else 2  # an FMU is its own process
     with stage("Trying the workflow on simulated campaigns", calibrate, "campaigns") as progress:
-        self_calibration = parts.self_calibrate(
+        self_calibration = self_calibrate(
             tested_campaign,
             choice.model,
             catalogue,
@@ -139,19 +250,19 @@ def _decidability(
     return separability, self_calibration
 
 
-def _keep_so_far(
-    folder: Path, in_progress: "parts.SearchInProgress", origin: "parts.Origin"
-) -> str:
+def _write_search_so_far(folder: Path, in_progress: "SearchInProgress", origin: "Origin") -> str:
     """Write the fits of an interrupted search, and return the sentence that says where.
 
     The sentence is empty if there are none yet.
     """
-    path = parts.write_so_far(folder, in_progress.hypotheses(), origin)
+    from discrepancy.verdict_so_far import write_so_far
+
+    path = write_so_far(folder, in_progress.hypotheses(), origin)
     return "" if path is None else f"the hypotheses fitted until then are in {path}"
 
 
-def _conclude(
-    content: "parts.ReportInput", folder: Path, report: Path | None, *, json: bool
+def _print_conclusion(
+    content: "ReportInput", folder: Path, report: Path | None, *, json: bool
 ) -> None:
     """Print the conclusion of an investigation; faulty data end the command with exit code 1.
 
@@ -166,61 +277,68 @@ def _conclude(
     json : bool
         Whether to print JSON.
     """
+    from discrepancy.application import gives
+    from discrepancy.files.verdict import VERDICT_NAME
+    from discrepancy.verdict import VerdictKind
+
     investigation = content.investigation
     verdict = investigation.verdict
-    has_faulty_data = verdict.kind is parts.VerdictKind.DATA_ERROR
+    has_faulty_data = verdict.kind is VerdictKind.DATA_ERROR
     if json:
         record = {"folder": str(folder), "report": None if report is None else str(report)}
-        stored = (folder / parts.VERDICT_NAME).read_text(encoding="utf-8")
+        stored = (folder / VERDICT_NAME).read_text(encoding="utf-8")
         terminal.print_json(record | loads(stored))
     if has_faulty_data:
         further_faults = [fault.sentence for fault in investigation.faults[1:]]
         for sentence in (verdict.sentence, *further_faults):
             typer.secho(sentence, fg="red", err=True)
     elif not json:
-        _show_verdict(content, folder)
+        _print_verdict(content, folder)
     if not json:
         terminal.say(f"Verdict: {folder}" if report is None else f"Report: {report}")
     if has_faulty_data:
         raise typer.Exit(1)
-    if not json and parts.gives(verdict, investigation.proof):
+    if not json and gives(verdict, investigation.proof):
         terminal.say(f"Next: uav-twin discrepancy apply {shlex.quote(str(folder))}")
 
 
-def _compared(
+def _read_campaign_and_model(
     campaign: Path | None,
     from_run: Path | None,
-    first: int | None,
-    last: int | None,
+    first_step: int | None,
+    last_step: int | None,
     model: str | None,
-) -> "tuple[parts.Campaign, parts.ModelChoice]":
+) -> "tuple[Campaign, ModelChoice]":
     """Return the campaign, and the model that it is compared with.
 
     Parameters
     ----------
     campaign, from_run : Path or None
-        The folder of a campaign, or that of a mission's run.
-    first, last : int or None
-        The turns of the run.
+        The folder of a campaign, or that of a mission's run; the other one is None.
+    first_step, last_step : int or None
+        The first and the last step of the run that are compared; all steps by default.
     model : str or None
         The model; by default that of the twin of the run.
     """
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.model_choice import choice_of_run, choose_model
+    from discrepancy.sources.from_run import run_campaign
+    from twin_master.watch.opening import flown
+
     if from_run is None:
         assert campaign is not None
-        return parts.read_campaign(campaign), parts.choose_model(model)
-    with parts.flown(from_run, first, last, reporter()) as folder:
+        return read_campaign(campaign), choose_model(model)
+    with flown(from_run, first_step, last_step, reporter()) as folder:
         try:
-            data = parts.run_campaign(folder, first, last)
+            data = run_campaign(folder, first_step, last_step)
             if model is not None:
-                return data, parts.choose_model(model)
-            return data, dataclasses.replace(
-                parts.choice_of_run(folder), file=str(from_run.resolve())
-            )
+                return data, choose_model(model)
+            return data, dataclasses.replace(choice_of_run(folder), file=str(from_run.resolve()))
         except DiscrepancyError as error:  # a watch is read from a copy that its user does not know
             raise type(error)(str(error).replace(str(folder), str(from_run))) from error
 
 
-def one_thread() -> None:
+def use_one_thread() -> None:
     """Hold the linear algebra of this process to one thread, for good.
 
     Its matrices are small: several threads would wait for each other, and the last bits of a sum
@@ -232,7 +350,9 @@ def one_thread() -> None:
     threadpool_limits(1)
 
 
-def _command(source: Path, effects: list[Path], from_run: bool, **values: str | int | None) -> str:
+def _repeatable_command(
+    source: Path, effects: list[Path], from_run: bool, values: Mapping[str, str | int | None]
+) -> str:
     """Return the command that does the same in any folder, with absolute paths.
 
     Parameters
@@ -243,7 +363,7 @@ def _command(source: Path, effects: list[Path], from_run: bool, **values: str | 
         Files of further effects.
     from_run : bool
         Whether the source is a run.
-    **values : str, int or None
+    values : mapping of str to (str, int or None)
         Values of further options by name; None for an option that was not given.
     """
     words = ["uav-twin", "discrepancy", "run"]
@@ -258,63 +378,87 @@ def _command(source: Path, effects: list[Path], from_run: bool, **values: str | 
     return shlex.join(words)
 
 
-def _show_verdict(content: "parts.ReportInput", folder: Path) -> None:
+def _print_verdict(content: "ReportInput", folder: Path) -> None:
     """Print a verdict, with the intervals of its patch if there is one in the folder."""
+    from discrepancy.files.verdict import PATCH_NAME, read_patch
+    from discrepancy.report.page import said_on_page
     from discrepancy.report.text import WORDS
 
-    patch_file = folder / parts.PATCH_NAME
+    patch_file = folder / PATCH_NAME
     if patch_file.is_file():
-        intervals = [effect.intervals for effect in parts.read_patch(patch_file).effects]
+        intervals = [effect.intervals for effect in read_patch(patch_file).effects]
         content = dataclasses.replace(content, intervals=intervals)
     terminal.say(f"Verdict: {content.investigation.verdict.kind.value}", bold=True)
-    options.show("run", words=WORDS, **parts.said_on_page(content))
+    terminal.show("run", words=WORDS, **said_on_page(content))
 
 
 def check(
-    campaign: Path,
+    campaign: CampaignArgument,
     *,
-    model: str | None = None,
-    effects: list[Path] | None = None,
-    json: bool = False,
+    model: ModelOption = None,
+    effects: EffectFilesOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Say what is wrong with the data, which effects they can show, and which they cannot tell apart."""  # noqa: E501
-    catalogue = parts.load_catalogue(effects or ())
-    chosen = parts.choose_model(model).model
-    data, faults = parts.checked(parts.read_campaign(campaign), chosen)
+    """Say what is wrong with the data, which effects they can show, and which they cannot tell apart.
+
+    Example: `uav-twin discrepancy check measured --model single_mass_rig`
+    """  # noqa: E501
+    from discrepancy.campaign.reading import read_campaign
+    from discrepancy.catalogue.entry import Setting
+    from discrepancy.catalogue.library import load_catalogue
+    from discrepancy.judgement.separability import separability as separability_of_campaign
+    from discrepancy.model_choice import choose_model
+    from discrepancy.workflow import checked
+
+    catalogue = load_catalogue(effects or ())
+    chosen = choose_model(model).model
+    data, faults = checked(read_campaign(campaign), chosen)
     separability = None
     if not any(fault.fatal for fault in faults):
         with stage("What this campaign can decide"):
-            setting = parts.Setting(data, chosen, chosen.scales(data))
-            separability = parts.separability(data, chosen, setting, catalogue)
+            setting = Setting(data, chosen, chosen.scales(data))
+            separability = separability_of_campaign(data, chosen, setting, catalogue)
     if json:
-        terminal.print_json(_record(data, chosen.name, faults, separability))
+        terminal.print_json(_check_record(data, chosen.name, faults, separability))
     else:
-        from discrepancy.report.text import WORDS
-
-        options.show(
-            "check",
-            words=WORDS,
-            able=separability,
-            data=data,
-            model=chosen,
-            faults=faults,
-            catalogue=catalogue,
-            seen_of=parts.seen_of,
-            neighbours=parts.neighbours,
-            group_lines=parts.group_lines,
-            needs=parts.needs,
-        )
+        _print_check(data, chosen, catalogue, faults, separability)
     if separability is None:
         raise terminal.error_exit(
             "Mend the faults first: conclusions from these data would be wrong."
         )
 
 
-def _record(
-    data: "parts.Campaign",
+def _print_check(
+    data: "Campaign",
+    model: "Model",
+    catalogue: "Sequence[Effect]",
+    faults: "Sequence[DataFault]",
+    separability: "Separability | None",
+) -> None:
+    """Print the faults of a campaign, and what it can decide unless a fault prevents that."""
+    from discrepancy.report.decidability_text import group_lines, needs, neighbours, seen_of
+    from discrepancy.report.text import WORDS
+
+    terminal.show(
+        "check",
+        words=WORDS,
+        able=separability,
+        data=data,
+        model=model,
+        faults=faults,
+        catalogue=catalogue,
+        seen_of=seen_of,
+        neighbours=neighbours,
+        group_lines=group_lines,
+        needs=needs,
+    )
+
+
+def _check_record(
+    data: "Campaign",
     model: str,
-    faults: "Sequence[parts.DataFault]",
-    separability: "parts.Separability | None",
+    faults: "Sequence[DataFault]",
+    separability: "Separability | None",
 ) -> dict[str, Any]:
     """Return the faults of a campaign, and what it can decide, as plain data.
 
@@ -357,7 +501,36 @@ def _record(
 
 
 def apply(
-    verdict: Path, *, out: Path | None = None, member: str | None = None, replace: bool = False
+    verdict: Annotated[
+        Path,
+        typer.Argument(show_default=False, help="Folder of a verdict, or its verdict.json."),
+    ],
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            show_default="MODEL_patched",
+            help="The file: .toml (a lumped model), .json (any model) or .fmu (a wing).",
+        ),
+    ] = None,
+    member: Annotated[
+        str | None,
+        typer.Option(
+            "--member",
+            metavar="NAME",
+            help="Of a group: which; the most probable by default.",
+        ),
+    ] = None,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Write the model with the effect that was found and the parameters beside it."""
-    options.show("apply", done=parts.apply_verdict(verdict, out, member=member, replace=replace))
+    """Write the model with the effect that was found and the parameters beside it.
+
+    Example: `uav-twin discrepancy apply verdicts/measured --out patched.json`
+    """
+    from discrepancy.application import apply_verdict
+
+    applied = apply_verdict(verdict, out, member=member, replace=replace)
+    terminal.say(f"{applied.path}: {applied.sentence}")
+    if applied.command:
+        terminal.say(f"Next: {applied.command}")

@@ -2,39 +2,67 @@
 
 import gc
 import re
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from fmu_asset.errors import SspError, visible
 from reporting import terminal
+from reporting.command_options import JsonOption
 from reporting.errors import ReportingError
 from reporting.files import atomic_write_text, refuse_existing
-from reporting.words import counted
+from reporting.words import counted, in_one_line
 from scenarios import asset_scripts
-from uav_twin import parts
-from uav_twin.options import answer, show
+from twin_master.command_options import complete_scenario
+from uav_twin.options import (
+    FmiOption,
+    FmuArgument,
+    FmuKind,
+    FmuKindOption,
+    ReplaceOption,
+    SspArgument,
+    StepSizeOption,
+    StepTimeoutOption,
+)
 from uav_twin.structure import fmu as build_structure
-from uav_twin.structure import names_structure
+from uav_twin.structure import is_structure_file, print_packed_fmu
 
 if TYPE_CHECKING:
-    pass
+    from fmu_asset.archive.declared import VariableInfo
+    from fmu_asset.ssp.check import SspCheck
 
 _SWITCH = re.compile(r"effect\.[A-Za-z0-9_]+\.active")
 """The switch of a missing effect among the variables of an FMU."""
 
+_COLOUR_OF_VERDICT = {"ok": "green", "warning": "yellow", "problem": "red", "skipped": "dim"}
+"""Colours of the rows of `fmu check`."""
+
 
 def bind(
-    file: Path, *, out: Path | None = None, step_size: float | None = None, replace: bool = False
+    file: FmuArgument,
+    *,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="The binding file to write; on the terminal by default."),
+    ] = None,
+    step_size: StepSizeOption = None,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Draft a binding for an FMU: which variable is which role, in which unit."""
+    """Draft a binding for an FMU: which variable is which role, in which unit.
+
+    Example: `uav-twin fmu bind pump.fmu --out pump.toml`
+    """
+    from fmu_asset.archive.fmu_file import read_fmu
+    from fmu_asset.client.draft import draft_binding
+
     refuse_existing(out, replace=replace)
     # nothing of 100,000 variables is garbage, and looking for it takes a third of the time
     gc.disable()
     try:
-        text = parts.draft_binding(parts.read_fmu(file), step_size=step_size)
+        text = draft_binding(read_fmu(file), step_size=step_size)
     finally:
         gc.enable()
     if out is None:
@@ -47,17 +75,44 @@ def bind(
 
 
 def check(
-    file: Path,
+    file: FmuArgument,
     *,
-    binding: Path | None = None,
-    cycles: int = 2000,
-    step_size: float | None = None,
-    step_timeout: float | None = None,
-    memory_limit: float | None = None,
-    json: bool = False,
+    binding: Annotated[
+        Path | None,
+        typer.Option(
+            "--binding", help="A binding file; drafted from the model description by default."
+        ),
+    ] = None,
+    cycles: Annotated[
+        int,
+        typer.Option(
+            "--cycles",
+            min=0,
+            help="Instances to make and free in one process; 0 for none.",
+        ),
+    ] = 2000,
+    step_size: Annotated[
+        float | None,
+        typer.Option(
+            "--step-size",
+            min=0.0,
+            help="Communication step size in seconds of a drafted binding.",
+        ),
+    ] = None,
+    step_timeout: StepTimeoutOption = None,
+    memory_limit: Annotated[
+        float | None,
+        typer.Option("--memory-limit", min=0.0, help="Limit of a worker's memory in MiB."),
+    ] = None,
+    json: JsonOption = False,
 ) -> None:
-    """Check an FMU in every way we know; exit code 1 if anything is wrong with it."""
-    result = parts.check_fmu(
+    """Check an FMU in every way we know; exit code 1 if anything is wrong with it.
+
+    Example: `uav-twin fmu check pump.fmu --binding pump.toml`
+    """
+    from fmu_asset.checks.fmu_check import check_fmu
+
+    result = check_fmu(
         file,
         binding,
         cycles=cycles,
@@ -65,32 +120,88 @@ def check(
         step_timeout=step_timeout,
         memory_limit=memory_limit,
     )
-    findings = [asdict(finding) for finding in result.findings]
-    answer(
-        "fmu check",
-        record={"file": str(file), "passed": result.passed, "findings": findings},
-        json=json,
-    )
+    if json:
+        findings = [asdict(finding) for finding in result.findings]
+        terminal.print_json({"file": str(file), "passed": result.passed, "findings": findings})
+    else:
+        terminal.say(str(file))
+        terminal.print_table(
+            ("check", "verdict", "found"),
+            [
+                (finding.check, finding.verdict, in_one_line(finding.text))
+                for finding in result.findings
+            ],
+            [_COLOUR_OF_VERDICT[finding.verdict] for finding in result.findings],
+        )
+        if result.passed:
+            terminal.say(f"{file}: no problem found.")
     if not result.passed:
         raise terminal.error_exit(f"{file}: {counted(len(result.problems), 'problem')}.")
 
 
+Interface = Literal["co-simulation", "model-exchange"]
+
+
 def build(
     *,
-    out: Path | None = None,
-    design: Path | None = None,
-    kind: Literal["python", "compiled", "source"] = "python",
-    fmi: int = 2,
-    interface: Literal["co-simulation", "model-exchange"] = "co-simulation",
-    windows: bool = False,
-    calibration: Path | None = None,
-    script: str | None = None,
-    patch: Path | None = None,
-    activate: bool = False,
-    replace: bool = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="The file to write: by default uav_wing.fmu, of a structure beside its file.",
+        ),
+    ] = None,
+    design: Annotated[
+        Path | None,
+        typer.Option(
+            "--design",
+            help="Wing design, or a structure file beside its mesh; the shipped wing by default.",
+        ),
+    ] = None,
+    kind: FmuKindOption = "python",
+    fmi: FmiOption = 2,
+    interface: Annotated[
+        Interface,
+        typer.Option(
+            "--interface",
+            help="How it is run; in model exchange a compiled wing has its modes as states.",
+        ),
+    ] = "co-simulation",
+    windows: Annotated[
+        bool,
+        typer.Option("--windows", help="Add a binary for 64-bit Windows to a compiled wing."),
+    ] = False,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibration",
+            help="Tailor it to a wing: the calibration.nc of `uav-twin calibrate`.",
+        ),
+    ] = None,
+    script: Annotated[
+        str | None,
+        typer.Option(
+            "--script", help="Pack this model script instead of a wing: gear_pump, or a file."
+        ),
+    ] = None,
+    patch: Annotated[
+        Path | None,
+        typer.Option(
+            "--patch",
+            help="A patch file: missing effects that the FMU carries as tunable parameters.",
+        ),
+    ] = None,
+    activate: Annotated[
+        bool,
+        typer.Option("--activate", help="Switch the effects of --patch on from the start."),
+    ] = False,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes."""
-    if script is None and calibration is None and design is not None and names_structure(design):
+    """Pack a wing, a structure or a model script as an FMU; equal input gives equal bytes.
+
+    Example: `uav-twin fmu build --kind compiled --out wing.fmu`
+    """
+    if script is None and calibration is None and design is not None and is_structure_file(design):
         if patch is not None or activate or interface != "co-simulation" or windows:
             raise typer.BadParameter(
                 "--patch, --activate, --interface and --windows are for wings; the design is a "
@@ -111,65 +222,147 @@ def build(
                 "for the wing.",
                 param_hint="--script",
             )
-        source = asset_scripts().get(script, Path(script))
-        show("packed", info=parts.build_script_fmu(source, target, replace=replace))
+        _build_script(script, target, replace=replace)
         return
-    target = parts.checked_target(target, replace=replace)
+    _build_wing(
+        target,
+        design,
+        calibration,
+        patch,
+        kind=kind,
+        fmi=fmi,
+        interface=interface,
+        windows=windows,
+        activate=activate,
+        replace=replace,
+    )
+
+
+def _build_script(script: str, target: Path, *, replace: bool) -> None:
+    """Pack a model script, a shipped one or a file, and print what was written."""
+    from fmu_asset.packing.script import build_script_fmu
+
+    source = asset_scripts().get(script, Path(script))
+    print_packed_fmu(build_script_fmu(source, target, replace=replace))
+
+
+def _build_wing(
+    out: Path,
+    design: Path | None,
+    calibration: Path | None,
+    patch: Path | None,
+    *,
+    kind: FmuKind,
+    fmi: int,
+    interface: Interface,
+    windows: bool,
+    activate: bool,
+    replace: bool,
+) -> None:
+    """Pack a wing, and print what was written; the parameters are the options of `fmu build`.
+
+    Everything that can be refused is refused before the wing is reduced, which can take minutes.
+    """
+    from calibration.result.file import load_calibration, tailoring
+    from fe.wing.design import load_design
+    from fmu_asset.packing.contents import checked_target
+    from fmu_asset.packing.patch_file import load_patch
+    from fmu_asset.packing.structure_fmu import check_form, pack_wing
+
+    target = checked_target(out, replace=replace)
     if windows and kind != "compiled":
         raise typer.BadParameter("--windows is for --kind compiled.")
-    form: dict[str, Any] = {
-        "kind": kind,
-        "fmi": fmi,
-        "interface": interface,
-        "platforms": ("linux64", "win64") if windows else ("linux64",),
-    }
-    effects = None if patch is None else parts.load_patch(patch)
-    parts.check_form(**form, patched=effects is not None)
-    asset = None
+    version: Literal[2, 3] = 3 if fmi == 3 else 2
+    platforms: list[Literal["linux64", "win64"]] = ["linux64"]
+    if windows:
+        platforms.append("win64")
+    effects = None if patch is None else load_patch(patch)
+    check_form(kind, version, interface, patched=effects is not None, platforms=platforms)
+    tailored: dict[str, Any] = {}
     if calibration is None:
-        wing_design = parts.load_design(design)
+        wing_design = load_design(design)
     else:
-        calibrated_wing = parts.load_calibration(calibration)
+        calibrated_wing = load_calibration(calibration)
         wing_design = calibrated_wing.wing_design
-        asset = calibrated_wing.asset
-        form |= parts.tailoring(calibrated_wing)
-    packed = parts.pack_wing(
-        wing_design, target, patch=effects, activate=activate, replace=replace, **form
+        tailored = tailoring(calibrated_wing)
+    packed = pack_wing(
+        wing_design,
+        target,
+        kind=kind,
+        fmi=version,
+        interface=interface,
+        platforms=tuple(platforms),
+        patch=effects,
+        activate=activate,
+        replace=replace,
+        **tailored,
     )
-    show("packed", info=packed, asset=asset)
+    if calibration is not None:
+        terminal.say(f"Calibrated for {calibrated_wing.asset}.")
+    print_packed_fmu(packed)
 
 
-def info(file: Path, *, variables: bool = True, json: bool = False) -> None:
-    """Say what an FMU is: version, capabilities, variables with units and ranges."""
-    description, obstacle = parts.inspect_fmu(file)
-    fmu_record = parts.describe_fmu(description)
-    facts = [
+def info(
+    file: FmuArgument,
+    *,
+    variables: Annotated[
+        bool, typer.Option("--variables/--no-variables", help="List the variables.")
+    ] = True,
+    json: JsonOption = False,
+) -> None:
+    """Say what an FMU is: version, capabilities, variables with units and ranges.
+
+    Example: `uav-twin fmu info pump.fmu --no-variables`
+    """
+    from fmu_asset.archive.declared import describe_fmu
+    from fmu_asset.archive.fmu_file import inspect_fmu
+
+    description, obstacle = inspect_fmu(file)
+    fmu_record = describe_fmu(description)
+    if json:
+        terminal.print_json({"file": str(file)} | fmu_record | {"obstacle": obstacle})
+        return
+    if obstacle:
+        terminal.say(f"It cannot be flown here: {obstacle}")
+    terminal.say(str(file))
+    terminal.print_table(("fact", "value"), _fact_rows(fmu_record))
+    if variables and description.variables:
+        headings = ("variable", "causality", "unit", "least", "largest", "start", "description")
+        rows = [_variable_row(variable) for variable in description.variables]
+        terminal.print_table(headings, rows)
+
+
+def _fact_rows(record: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Return name and value of each fact about an FMU, of the record that `describe_fmu` returns.
+
+    The platforms and the missing effects, each with its switch, come last.
+    """
+    rows = [
         (name.replace("_", " "), str(value))
-        for name, value in fmu_record.items()
+        for name, value in record.items()
         if isinstance(value, str | int | float | bool) and value != ""
     ]
-    facts.append(("platforms", ", ".join(fmu_record.get("platforms", ()))))
+    rows.append(("platforms", ", ".join(record.get("platforms", ()))))
     effects = []
-    for row in fmu_record["variables"]:
-        if _SWITCH.fullmatch(row["name"]):
-            _, effect, _ = row["name"].split(".")
-            effects.append(f"{effect} ({'on' if float(row['start']) else 'off'})")
+    for variable in record["variables"]:
+        if _SWITCH.fullmatch(variable["name"]):
+            _, effect, _ = variable["name"].split(".")
+            is_on = bool(float(variable["start"]))
+            effects.append(f"{effect} ({'on' if is_on else 'off'})")
     if effects:
-        facts.append(("effects", ", ".join(effects)))
-    rows = [_variable_row(variable) for variable in description.variables] if variables else []
-    record = {"file": str(file)} | fmu_record | {"obstacle": obstacle}
-    answer("fmu info", record=record, json=json, facts=facts, rows=rows)
+        rows.append(("effects", ", ".join(effects)))
+    return rows
 
 
-def _variable_row(variable: "parts.VariableInfo") -> list[str]:
+def _variable_row(variable: "VariableInfo") -> list[str]:
     """Return the cells of a variable in the table of variables.
 
     The items of an enumeration stand with its description.
     """
-    about = variable.description
+    description = variable.description
     if variable.items:
         items = f"items: {variable.item_list}"
-        about = f"{about}; {items}" if about else items
+        description = f"{description}; {items}" if description else items
     cells = (
         variable.name,
         variable.causality,
@@ -177,40 +370,90 @@ def _variable_row(variable: "parts.VariableInfo") -> list[str]:
         variable.minimum,
         variable.maximum,
         variable.start,
-        about,
+        description,
     )
     return ["" if cell is None else visible(str(cell)) for cell in cells]
 
 
-def export(what: str, *, out: Path, seed: int | None = None, replace: bool = False) -> None:
-    """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs."""  # noqa: E501
-    parts.checked_target(
-        out, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError
-    )
+def export(
+    what: Annotated[
+        str,
+        typer.Argument(
+            show_default=False,
+            metavar="SCENARIO|DESIGN",
+            autocompletion=complete_scenario,
+            help="A shipped scenario, the path of a scenario, `uav_wing`, or the path of a wing "
+            "design.",
+        ),
+    ],
+    *,
+    out: Annotated[Path, typer.Option("--out", show_default=False, help="The file to write.")],
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, help="Seed of the run; by default that of the scenario."),
+    ] = None,
+    replace: ReplaceOption = False,
+) -> None:
+    """Write what a scenario flies, or the wing of a design, as an SSP 1.0 file: SSD, SSV, SSM and FMUs.
+
+    Example: `uav-twin ssp export level_turns --out level_turns.ssp`
+    """  # noqa: E501
+    from fmu_asset.packing.contents import checked_target
+    from twin_master.assets.system_export import export_design, export_scenario
+    from twin_master.scenario.reading import load_scenario
+
+    checked_target(out, replace=replace, file_kind="An SSP file", suffix=".ssp", error=SspError)
     if _is_design(what):
         design = None if what == "uav_wing" else Path(what)
-        path = parts.export_design(design, out, replace_file=replace)
+        path = export_design(design, out, replace_file=replace)
     else:
-        scenario = parts.load_scenario(what)
-        path = parts.export_scenario(scenario, out, seed=seed, replace_file=replace)
+        scenario = load_scenario(what)
+        path = export_scenario(scenario, out, seed=seed, replace_file=replace)
     terminal.say(f"{path}: {path.stat().st_size / 1024:.0f} KiB")
 
 
 def _is_design(what: str) -> bool:
     """Return whether a name or path is that of a wing design: a TOML file without a mission."""
+    from reporting.toml_file import read_toml
+
     try:
-        return what == "uav_wing" or "planform" in parts.read_toml(what, ReportingError)
+        return what == "uav_wing" or "planform" in read_toml(what, ReportingError)
     except ReportingError:
         return False
 
 
-def check_system(file: Path, *, json: bool = False) -> None:
-    """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong."""  # noqa: E501
-    result = parts.check_ssp(file)
+def check_system(file: SspArgument, *, json: JsonOption = False) -> None:
+    """Check an SSP file: archive, schemas, FMUs, connections, one step; exit code 1 if anything is wrong.
+
+    Example: `uav-twin ssp check level_turns.ssp`
+    """  # noqa: E501
+    from fmu_asset.ssp.check import check_ssp
+
+    result = check_ssp(file)
     for problem in result.problems:
         typer.secho(f"problem: {problem}", fg="red", err=True)
-    answer(
-        "ssp check", record={"passed": not result.problems} | asdict(result), json=json, file=file
-    )
+    if json:
+        terminal.print_json({"passed": not result.problems} | asdict(result))
+    else:
+        _print_system(file, result)
     if result.problems:
         raise typer.Exit(1)
+
+
+def _print_system(file: Path, result: "SspCheck") -> None:
+    """Print warnings about a system of FMUs, and what is in it if no problem was found."""
+    if result.left_out:
+        terminal.say(f"warning: {result.left_out}")
+    for loop in result.loops:
+        terminal.say(
+            f"warning: {loop} `uav-twin ssp simulate` does so by --delay, --iterations, "
+            "--algorithm jacobi."
+        )
+    if result.problems:
+        return
+    order = ", ".join(f"{name} ({model})" for name, model in result.components)
+    terminal.say(
+        f"{file}: no problem found; {counted(result.connections, 'connection')}, "
+        f"{counted(result.parameters, 'parameter')}, one step of {result.step:g} s, evaluated in "
+        f"the order {order}."
+    )

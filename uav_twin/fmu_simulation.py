@@ -4,19 +4,32 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from fmu_asset.errors import FmuInputError
 from reporting import terminal
 from reporting.files import atomic_write_bytes, refuse_existing
-from uav_twin import parts
-from uav_twin.options import show
+from twin_master.command_options import complete_scenario
+from uav_twin.options import (
+    FmuArgument,
+    HistoryOption,
+    InProcessOption,
+    InterpolationOption,
+    PlotOption,
+    ReplaceOption,
+    SspArgument,
+    StepSizeOption,
+    StepTimeoutOption,
+)
 
 if TYPE_CHECKING:
     from fe.runtime.arrays import FloatArray
-
+    from fmu_asset.client.binding import Binding
+    from fmu_asset.client.observations import ObservationHistory
+    from fmu_asset.client.session import FmiAsset
+    from twin_master.library.sampling import SamplingOutcome
 
 _MOST_PANELS = 8
 """Largest number of panels of a plot."""
@@ -27,22 +40,61 @@ _MOST_LINES = 10
 
 
 def simulate(
-    file: Path,
+    file: FmuArgument,
     *,
-    binding: Path | None = None,
-    inputs: Path | None = None,
-    out: Path | None = None,
-    stop_time: float | None = None,
-    step_size: float | None = None,
-    values: list[str] | None = None,
-    plot: Path | None = None,
-    interpolation: str | None = None,
-    in_process: bool = False,
-    step_timeout: float | None = None,
-    replace: bool = False,
+    binding: Annotated[
+        Path | None,
+        typer.Option(
+            "--binding",
+            help="Its binding file; without one, all outputs in the FMU's units.",
+        ),
+    ] = None,
+    inputs: Annotated[
+        Path | None,
+        typer.Option(
+            "--inputs",
+            help="CSV: `time` (s, where each step begins) and the inputs by the binding's names.",
+        ),
+    ] = None,
+    out: HistoryOption = None,
+    stop_time: Annotated[
+        float | None,
+        typer.Option(
+            "--stop-time",
+            help="End in seconds; the FMU's own by default, or 1 s after the start.",
+        ),
+    ] = None,
+    step_size: StepSizeOption = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="A parameter (of any kind) or input of the FMU.",
+        ),
+    ] = None,
+    plot: PlotOption = None,
+    interpolation: InterpolationOption = None,
+    in_process: InProcessOption = False,
+    step_timeout: StepTimeoutOption = None,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Simulate an FMU: its default experiment, or with --binding and --inputs under histories."""
-    _refuse_files(out, plot, replace=replace)
+    """Simulate an FMU: its default experiment, or with --binding and --inputs under histories.
+
+    Example: `uav-twin fmu simulate pump.fmu --stop-time 10 --set speed=120 --out pump.csv`
+    """
+    from fmu_asset.archive.fmu_file import read_fmu
+    from fmu_asset.client.binding import load_binding
+    from fmu_asset.client.experiment import (
+        default_experiment,
+        ending_with_histories,
+        run_experiment,
+        run_histories,
+    )
+    from fmu_asset.client.history_files import read_histories
+    from fmu_asset.client.session import FmiAsset
+
+    _refuse_unwritable_files(out, plot, replace=replace)
     if (binding is None) != (inputs is None):
         raise FmuInputError(
             "--binding and --inputs go together: one names the columns of the other."
@@ -58,44 +110,86 @@ def simulate(
         )
     isolated = not in_process
     if binding is None:
-        experiment = parts.default_experiment(
-            parts.read_fmu(file),
+        experiment = default_experiment(
+            read_fmu(file),
             stop_time=stop_time,
             step_size=step_size,
             values=_values_by_name(values or ()),
         )
         with closing(
-            parts.FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
+            FmiAsset(file, experiment.binding, isolated=isolated, step_timeout=step_timeout)
         ) as asset:
-            _finish(asset, parts.run_experiment(asset, experiment), file, out, plot)
+            _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
         return
     assert inputs is not None  # they go with a binding
-    fmu_binding = _interpolated(parts.load_binding(binding), interpolation)
-    steps, histories = parts.read_histories(inputs, fmu_binding)
-    fmu_binding = parts.ending_with_histories(fmu_binding, steps)
+    fmu_binding = _with_interpolation(load_binding(binding), interpolation)
+    steps, histories = read_histories(inputs, fmu_binding)
+    fmu_binding = ending_with_histories(fmu_binding, steps)
     with closing(
-        parts.FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
+        FmiAsset(file, fmu_binding, isolated=isolated, step_timeout=step_timeout)
     ) as asset:
-        _finish(asset, parts.run_histories(asset, steps, histories), file, out, plot)
+        _write_and_print_history(asset, run_histories(asset, steps, histories), file, out, plot)
 
 
 def simulate_system(
-    file: Path,
+    file: SspArgument,
     *,
-    out: Path | None = None,
-    stop_time: float | None = None,
-    step_size: float | None = None,
-    values: list[str] | None = None,
-    plot: Path | None = None,
-    algorithm: str = "gauss_seidel",
-    iterations: int = 1,
-    delay: list[str] | None = None,
-    interpolation: str | None = None,
-    in_process: bool = False,
-    replace: bool = False,
+    out: HistoryOption = None,
+    stop_time: Annotated[
+        float | None,
+        typer.Option("--stop-time", help="End in seconds; by default that of the file, or 1 s."),
+    ] = None,
+    step_size: Annotated[
+        float | None,
+        typer.Option("--step-size", min=0.0, help="Communication step size in seconds."),
+    ] = None,
+    values: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="A connector of the system, or component.variable.",
+        ),
+    ] = None,
+    plot: PlotOption = None,
+    algorithm: Annotated[
+        str,
+        typer.Option(
+            "--algorithm",
+            help="How values are passed on within a step: gauss_seidel or jacobi.",
+        ),
+    ] = "gauss_seidel",
+    iterations: Annotated[
+        int,
+        typer.Option(
+            "--iterations",
+            min=1,
+            help="How often a step of a circle of components is made at most.",
+        ),
+    ] = 1,
+    delay: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--delay",
+            metavar="END",
+            help="Delay the connection to this end by a step: it breaks a loop there.",
+        ),
+    ] = None,
+    interpolation: InterpolationOption = None,
+    in_process: InProcessOption = False,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Simulate the system of an SSP file from its start; all outputs of the system and its components."""  # noqa: E501
-    _refuse_files(out, plot, replace=replace)
+    """Simulate the system of an SSP file from its start; all outputs of the system and its components.
+
+    Example: `uav-twin ssp simulate level_turns.ssp --stop-time 10 --out history.csv`
+    """  # noqa: E501
+    from fmu_asset.client.experiment import default_experiment, run_experiment
+    from fmu_asset.coupling.asset import CoupledAsset
+    from fmu_asset.coupling.system import system_description
+    from fmu_asset.ssp.check import join_ssp, left_out_sentence
+    from fmu_asset.ssp.reader import read_ssp
+
+    _refuse_unwritable_files(out, plot, replace=replace)
     start_values = _values_by_name(values or ())
     for name, value in start_values.items():
         count = len(value.split(","))
@@ -104,28 +198,28 @@ def simulate_system(
                 f"--set {name} has {count} values; ends of a system take one number."
             )
     with tempfile.TemporaryDirectory() as folder:
-        wiring = parts.join_ssp(parts.read_ssp(file, folder), delay or ())
-        warning = parts.left_out_sentence(wiring, file)
+        wiring = join_ssp(read_ssp(file, folder), delay or ())
+        warning = left_out_sentence(wiring, file)
         if warning:
             terminal.say(f"warning: {warning}")
-        experiment = parts.default_experiment(
-            parts.system_description(wiring),
+        experiment = default_experiment(
+            system_description(wiring),
             stop_time=stop_time,
             step_size=step_size,
             values=start_values,
         )
-        with parts.CoupledAsset(
+        with CoupledAsset(
             wiring,
-            _interpolated(experiment.binding, interpolation),
+            _with_interpolation(experiment.binding, interpolation),
             algorithm=algorithm,  # type: ignore[arg-type]  # said by itself
             iterations=iterations,
             isolated=not in_process,
             parameters=experiment.parameters,
         ) as asset:
-            _finish(asset, parts.run_experiment(asset, experiment), file, out, plot)
+            _write_and_print_history(asset, run_experiment(asset, experiment), file, out, plot)
 
 
-def _refuse_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
+def _refuse_unwritable_files(out: Path | None, plot: Path | None, *, replace: bool) -> None:
     """Refuse files that cannot be written, before anything is simulated."""
     targets = (("--out", out, (".csv", ".nc")), ("--plot", plot, (".png", ".svg")))
     for option, path, suffixes in targets:
@@ -150,7 +244,7 @@ def _values_by_name(texts: Sequence[str]) -> dict[str, str]:
     return values
 
 
-def _interpolated(binding: "parts.Binding", kind: str | None) -> "parts.Binding":
+def _with_interpolation(binding: "Binding", kind: str | None) -> "Binding":
     """Return a binding whose inputs are interpolated as `--interpolation` says, if it is given."""
     if kind is None:
         return binding
@@ -159,9 +253,9 @@ def _interpolated(binding: "parts.Binding", kind: str | None) -> "parts.Binding"
     return binding.with_header(interpolation=kind)
 
 
-def _finish(
-    asset: "parts.FmiAsset",
-    history: "parts.ObservationHistory",
+def _write_and_print_history(
+    asset: "FmiAsset",
+    history: "ObservationHistory",
     file: Path,
     out: Path | None,
     plot: Path | None,
@@ -179,22 +273,25 @@ def _finish(
     out, plot : Path or None
         Files for the history and for its picture.
     """
+    from fmu_asset.client.history_files import write_history
+    from reporting.files import hash_file
+
     if out is not None:
-        parts.write_history(out, asset, (file.name, parts.hash_file(file)), history)
+        write_history(out, asset, (file.name, hash_file(file)), history)
     columns = _history_columns(asset, history)
     if plot is not None:
-        _draw(plot, history, columns)
-    show(
-        "simulated",
-        asset=asset,
-        history=history,
-        written=[path for path in (out, plot) if path is not None],
-        file=file,
-        end=history.time[-1] if len(history.time) else asset.time,
-        # the start may be a row of its own
-        steps=int((history.time > asset.binding.binding.start_time).sum()),
-        columns=columns,
-    )
+        _draw_history(plot, history, columns)
+    end = history.time[-1] if len(history.time) else asset.time
+    # the start may be a row of its own
+    steps = int((history.time > asset.binding.binding.start_time).sum())
+    written = [str(path) for path in (out, plot) if path is not None]
+    files = ", ".join(written) or file
+    terminal.say(f"{files}: {steps} steps to t = {end:g} s, every {asset.binding.interval:g} s.")
+    if history.ended:
+        terminal.say(history.ended)
+    if columns and not written:
+        headings = ("output", "first", "least", "largest", "last", "unit")
+        terminal.print_table(headings, [column.cells() for column in columns])
 
 
 class HistoryColumn(NamedTuple):
@@ -204,10 +301,14 @@ class HistoryColumn(NamedTuple):
     unit: str
     values: "FloatArray"
 
+    def cells(self) -> tuple[str, ...]:
+        """Return the cells of a table: name, first, least, largest and last value, unit."""
+        values = self.values
+        figures = (values[0], values.min(), values.max(), values[-1])
+        return (self.name, *(f"{figure:.6g}" for figure in figures), self.unit)
 
-def _history_columns(
-    asset: "parts.FmiAsset", history: "parts.ObservationHistory"
-) -> list[HistoryColumn]:
+
+def _history_columns(asset: "FmiAsset", history: "ObservationHistory") -> list[HistoryColumn]:
     """Return the observed outputs of an asset over time, then what is recorded beside them."""
     binding = asset.binding
     units = [unit for vector in binding.observation.values() for unit in vector.units]
@@ -222,16 +323,18 @@ def _history_columns(
     return columns
 
 
-def _draw(
-    path: Path, history: "parts.ObservationHistory", columns: Sequence[HistoryColumn]
+def _draw_history(
+    path: Path, history: "ObservationHistory", columns: Sequence[HistoryColumn]
 ) -> None:
     """Draw the outputs over time, those of one unit in one panel, and write the picture."""
+    from reporting.figures import FULL_WIDTH, new_figure, publication_style, to_png, to_svg
+
     columns_of_unit: dict[str, list[HistoryColumn]] = {}
     for column in columns:
         columns_of_unit.setdefault(column.unit, []).append(column)
     panels = list(columns_of_unit.items())[:_MOST_PANELS]
-    with parts.publication_style():
-        figure = parts.new_figure(0.5 + 1.5 * len(panels), parts.FULL_WIDTH)
+    with publication_style():
+        figure = new_figure(0.5 + 1.5 * len(panels), FULL_WIDTH)
         axes = figure.subplots(len(panels), squeeze=False, sharex=True).ravel()
         for panel_axes, (unit, lines) in zip(axes, panels, strict=True):
             for line in lines[:_MOST_LINES]:
@@ -245,32 +348,84 @@ def _draw(
             panel_axes.legend(title=title, loc="center left", bbox_to_anchor=(1.0, 0.5))
         axes[-1].set_xlabel("time [s]")
         figure.tight_layout()
-        to_bytes = parts.to_svg if path.suffix == ".svg" else parts.to_png
+        to_bytes = to_svg if path.suffix == ".svg" else to_png
         atomic_write_bytes(path, to_bytes(figure))
 
 
 def sample(
-    scenario: str | None = None,
+    scenario: Annotated[
+        str | None,
+        typer.Argument(
+            show_default=False,
+            autocompletion=complete_scenario,
+            help="A scenario, whose FMU is sampled at its states, controls and draws.",
+        ),
+    ] = None,
     *,
-    out: Path,
-    fmu: Path | None = None,
-    binding: Path | None = None,
-    grid: list[str] | None = None,
-    role: str | None = None,
-    seed: int | None = None,
-    settle: int = 0,
-    workers: int | None = None,
-    resume: bool = False,
-    replace: bool = False,
+    out: Annotated[
+        Path, typer.Option("--out", show_default=False, help="The NetCDF file to write.")
+    ],
+    fmu: Annotated[
+        Path | None, typer.Option("--fmu", show_default=False, help="The FMU to sample.")
+    ] = None,
+    binding: Annotated[
+        Path | None, typer.Option("--binding", show_default=False, help="Its binding.")
+    ] = None,
+    grid: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--grid",
+            show_default=False,
+            help="NAME=VALUES with a name of the binding, such as wear=0,0.2,0.4 or "
+            "wear=0:0.4:3; repeated.",
+        ),
+    ] = None,
+    role: Annotated[
+        str | None,
+        typer.Option(
+            "--role",
+            show_default=False,
+            help="Observation of the binding, where it has several.",
+        ),
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, help="Seed of the draws of a scenario."),
+    ] = None,
+    settle: Annotated[
+        int,
+        typer.Option(
+            "--settle",
+            min=0,
+            help="Steps from a fresh start at every point, for an FMU with memory.",
+        ),
+    ] = 0,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, show_default="one for each processor", help="Processes."),
+    ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the blocks of an interrupted sampling."),
+    ] = False,
+    replace: ReplaceOption = False,
 ) -> None:
-    """Ask an FMU for its observation at every draw, state and control; write an observation library."""  # noqa: E501
+    """Ask an FMU for its observation at every draw, state and control; write an observation library.
+
+    Example: `uav-twin library sample pump_wear --out pump_wear.nc`
+    """  # noqa: E501
+    from twin_master.assets.resolution import Overrides
+    from twin_master.library.grid import grid_of_fmu, grid_of_scenario
+    from twin_master.library.sampling import blocks_folder, sample_library
+    from twin_master.scenario.reading import load_scenario
+
     if resume and replace:
         raise typer.BadParameter("give either --resume or --replace.", param_hint="--resume")
     if scenario is not None and role is not None:
         raise typer.BadParameter("the scenario says what is observed.", param_hint="--role")
 
     def sentence_when_interrupted() -> str:
-        if parts.blocks_folder(out).is_dir():
+        if blocks_folder(out).is_dir():
             return "finished blocks are kept: go on with the same command and --resume"
         return "finished blocks are kept: nothing was sampled yet"
 
@@ -279,11 +434,11 @@ def sample(
         tempfile.TemporaryDirectory(prefix="uav_twin_library_") as folder,
     ):
         if scenario is not None:
-            library_grid = parts.grid_of_scenario(
-                parts.load_scenario(scenario),
+            library_grid = grid_of_scenario(
+                load_scenario(scenario),
                 Path(folder),
                 grid or (),
-                overrides=parts.Overrides(seed=seed, fmu=fmu, binding=binding),
+                overrides=Overrides(seed=seed, fmu=fmu, binding=binding),
                 settling_steps=settle,
             )
         elif fmu is None or binding is None:
@@ -291,10 +446,21 @@ def sample(
                 "give a scenario, or --fmu and --binding.", param_hint="SCENARIO"
             )
         else:
-            library_grid = parts.grid_of_fmu(
-                fmu, binding, grid or (), role=role, settling_steps=settle
-            )
-        sampled = parts.sample_library(
+            library_grid = grid_of_fmu(fmu, binding, grid or (), role=role, settling_steps=settle)
+        sampled = sample_library(
             library_grid, out, workers=workers, resume=resume, replace_existing=replace
         )
-    show("library", found=sampled, library=sampled.library)
+    _print_library(sampled)
+
+
+def _print_library(sampled: "SamplingOutcome") -> None:
+    """Print the file of an observation library, its shape, and what the sampling took."""
+    library = sampled.library
+    shape = " x ".join(map(str, library.values.shape))
+    kept_blocks = ""
+    if sampled.kept_blocks:
+        kept_blocks = f", {sampled.kept_blocks} of {sampled.block_count} blocks kept"
+    terminal.say(
+        f"{sampled.path}: {shape} (draws, states, controls, sensors), {sampled.workers} processes, "
+        f"{sampled.seconds:.1f} s{kept_blocks}, FMU {library.fmu_hash[:12]}"
+    )

@@ -1,10 +1,96 @@
-"""How the commands of this package print their results."""
+"""Arguments and options that several commands share, as annotations of parameters for Typer."""
 
-from functools import partial
+from pathlib import Path
+from typing import Annotated, Literal
 
-from reporting import terminal
+import typer
 
-show = partial(terminal.show, words="uav_twin")
-"""Prints what a command found, see `terminal.show`; by default in the words of this package."""
-answer = partial(terminal.answer, words="uav_twin")
-"""Prints a record as JSON, or as `show` does."""
+from reporting.command_options import LARGEST_SEED
+from uav_twin.completion import complete_model, complete_structure
+
+CampaignArgument = Annotated[
+    Path, typer.Argument(show_default=False, help="Folder with campaign.toml.")
+]
+FmuArgument = Annotated[Path, typer.Argument(show_default=False, help="An FMU.")]
+SspArgument = Annotated[Path, typer.Argument(show_default=False, help="An SSP file.")]
+StructureArgument = Annotated[
+    Path,
+    typer.Argument(
+        show_default=False,
+        autocompletion=complete_structure,
+        help="A structure file (TOML) beside its mesh or matrices, or a shipped one.",
+    ),
+]
+
+DesignOption = Annotated[
+    Path | None, typer.Option("--design", help="Wing design; the shipped one by default.")
+]
+EffectFilesOption = Annotated[
+    list[Path] | None,
+    typer.Option("--effects", help="A TOML file of further effects; may be given several times."),
+]
+FmiOption = Annotated[
+    int,
+    typer.Option("--fmi", min=2, max=3, help="Version of FMI: 3 for compiled and source."),
+]
+FmuKind = Literal["python", "compiled", "source"]
+FmuKindOption = Annotated[
+    FmuKind,
+    typer.Option(
+        "--kind", help="Run by Python, compiled C, or C sources to be compiled elsewhere."
+    ),
+]
+InProcessOption = Annotated[
+    bool,
+    typer.Option("--in-process", help="Faster, without protection from crashes and endless steps."),
+]
+InterpolationOption = Annotated[
+    str | None,
+    typer.Option(
+        "--interpolation",
+        help="How inputs go on between communication points: zero-order or linear; by default as "
+        "the binding says, and zero-order in a system.",
+    ),
+]
+MemoryLimitOption = Annotated[
+    float | None,
+    typer.Option(
+        "--memory-limit",
+        min=0.1,
+        help="GiB that it may take; what the machine has left by default.",
+    ),
+]
+ModelOption = Annotated[
+    str | None,
+    typer.Option(
+        "--model",
+        show_default="the shipped wing",
+        autocompletion=complete_model,
+        help="As of `discrepancy run`.",
+    ),
+]
+ModeCountOption = Annotated[int, typer.Option("--modes", min=1, max=50, help="Number of modes.")]
+HistoryOption = Annotated[
+    Path | None,
+    typer.Option("--out", help="The file to write: CSV, or NetCDF (.nc) with units."),
+]
+PlotOption = Annotated[
+    Path | None,
+    typer.Option("--plot", help="A picture of the outputs to write: .png or .svg."),
+]
+ReplaceOption = Annotated[bool, typer.Option("--replace", help="Replace a file that exists.")]
+SampleSeedOption = Annotated[
+    int, typer.Option("--seed", min=0, max=LARGEST_SEED, help="Seed of all samples.")
+]
+StepSizeOption = Annotated[
+    float | None,
+    typer.Option(
+        "--step-size",
+        min=0.0,
+        help="Communication step size in seconds; the FMU's own by default.",
+    ),
+]
+StepTimeoutOption = Annotated[
+    float | None,
+    typer.Option("--step-timeout", min=0.0, help="Wall-clock limit of a step in seconds."),
+]

@@ -1,248 +1,161 @@
-"""`uav-twin structure ...`, and how the checks of wings and structures end."""
+"""`uav-twin structure info`, `verify`, `field`, `reduce` and `fmu`."""
 
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from math import inf, nan
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from math import inf, isnan, nan
 from os.path import relpath
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from fe.runtime.errors import DesignFileError
 from reporting import terminal
+from reporting.choices import did_you_mean
+from reporting.command_options import JsonOption
 from reporting.errors import FileNotWrittenError
 from reporting.files import atomic_write_text, refuse_existing, refuse_filled
 from reporting.progress import stage
 from reporting.words import comma_list
 from scenarios import structure_files
-from uav_twin import parts
-from uav_twin.options import answer, show
+from uav_twin.options import (
+    FmiOption,
+    FmuKindOption,
+    MemoryLimitOption,
+    ModeCountOption,
+    ReplaceOption,
+    StructureArgument,
+)
+
+if TYPE_CHECKING:
+    from fe.reduction.reduced_basis import MeasuredErrors
+    from fe.runtime.reduced import ReducedModel
+    from fe.structure.affine import AffineStructure
+    from fe.structure.operators import Structure
+    from fmu_asset.packing.contents import FmuInfo
+
+RESPONSE_LIMIT = 1e-5
+"""Largest difference of a response to that of CalculiX, relative to the largest of its kind."""
+FREQUENCY_LIMIT = 1e-6
+"""Largest relative difference of a natural frequency to that of CalculiX."""
 
 
-def end_with(checks: "Sequence[parts.Check]") -> None:
-    """End with 1, and say which limits are broken, if any is."""
-    broken = [f"{check.group}, {check.name}" for check in checks if not check.passed]
-    if broken:
-        raise terminal.error_exit(
-            f"{len(broken)} of {len(checks)} checks broke their limit: {'; '.join(broken)}."
-        )
+def find_structure(file: Path) -> Path:
+    """Return a structure file; that of a shipped structure if no file, but one of these is named.
+
+    If there is neither, the path is returned as it is; who reads it refuses it.
+
+    Raises
+    ------
+    DesignFileError
+        If there is neither, but the name of a shipped structure is like the path.
+    """
+    if file.exists():
+        return file
+    shipped = structure_files()
+    if str(file) in shipped:
+        return shipped[str(file)]
+    question = did_you_mean(str(file), shipped)
+    if question:
+        raise DesignFileError(f"There is no structure file {file}.{question}")
+    return file
 
 
-RESPONSE_LIMIT, FREQUENCY_LIMIT = 1e-5, 1e-6
-"""Largest differences to CalculiX, each relative to the largest of its kind."""
+def is_structure_file(design: Path) -> bool:
+    """Return whether a design file is that of a structure, and not of a wing."""
+    from fe.structure.design import is_structure
+    from reporting.toml_file import read_toml
+
+    return is_structure(read_toml(find_structure(design), DesignFileError, what="wing design"))
 
 
-def located(file: Path) -> Path:
-    """Return a structure file, or the shipped one of that name where there is no such file."""
-    return file if file.exists() else structure_files().get(str(file), file)
-
-
-def names_structure(design: Path) -> bool:
-    """Return whether a design is that of a structure, and not of a wing."""
-    return parts.is_structure(parts.read_toml(located(design), DesignFileError, what="wing design"))
-
-
-def in_bytes(gibibytes: float | None) -> float | None:
-    """Return a limit that is typed in GiB."""
+def _in_bytes(gibibytes: float | None) -> float | None:
+    """Return a limit of memory in bytes, given in GiB; None if there is none."""
     return None if gibibytes is None else 2.0**30 * gibibytes
 
 
-def assembled(
+def _assemble_mesh(
     file: Path, memory_limit: float | None, *, mass_as_stiffness: bool = False
-) -> "parts.Structure":
-    """Return the full model of a mesh."""
+) -> "Structure":
+    """Return the full model of a structure with a mesh."""
+    from fe.structure.operators import load_and_assemble
+
     with stage("Reading the mesh and assembling"):
-        limit = in_bytes(memory_limit)
-        return parts.load_and_assemble(located(file), limit, mass_as_stiffness=mass_as_stiffness)
+        return load_and_assemble(
+            find_structure(file), _in_bytes(memory_limit), mass_as_stiffness=mass_as_stiffness
+        )
 
 
-def assembled_of_any(file: Path, memory_limit: float | None) -> "parts.AffineStructure":
-    """Return the full model of a mesh or of matrices."""
+def _assemble(file: Path, memory_limit: float | None) -> "AffineStructure":
+    """Return the full model of a structure with a mesh or with matrices."""
+    from fe.structure.operators import assemble_structure
+
     with stage("Reading and assembling"):
-        return parts.assemble(located(file), in_bytes(memory_limit))
+        return assemble_structure(find_structure(file), _in_bytes(memory_limit))
 
 
 def info(
-    file: Path, *, modes: int = 6, memory_limit: float | None = None, json: bool = False
+    file: StructureArgument,
+    *,
+    modes: ModeCountOption = 6,
+    memory_limit: MemoryLimitOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it."""  # noqa: E501
-    structure = assembled_of_any(file, memory_limit)
+    """Say what a structure is made of, what it weighs, how it vibrates and what its loads do to it.
+
+    Example: `uav-twin structure info bracket --modes 3`
+    """
+    from uav_twin.structure_facts import print_structure, structure_record
+
+    structure = _assemble(file, memory_limit)
     with stage("Solving the loads and the modes"):
         record = structure_record(structure, modes)
-    answer("structure info", record=record, json=json)
     if json:
-        return
-    for load in record["loads"]:
-        strains = [
-            ("gauge", name, 1e6 * value, "microstrain") for name, value in load["strain"].items()
-        ]
-        displacements = [
-            ("displacement", name, 1e3 * value, "mm") for name, value in load["output"].items()
-        ]
-        show("load of a structure", load=load, outputs=strains + displacements)
-
-
-def structure_record(structure: "parts.AffineStructure", modes: int) -> dict[str, Any]:
-    """Return the facts about a structure without damage, at nominal values, by name.
-
-    Lengths carry the unit of the mesh where `length_unit` stands beside them; everything else is in
-    SI units.
-    """
-    design = structure.design
-    if isinstance(structure, parts.Structure):
-        facts_of_kind = _mesh_facts(structure)
+        terminal.print_json(record)
     else:
-        facts_of_kind = {"matrices": [*design.files]}
-    frequencies: list[float] = []
-    if structure.mass().diagonal().any():
-        frequencies = parts.natural_frequencies(structure, modes).frequency.tolist()
-    responses = parts.static_responses(structure)
-    return {
-        "name": design.name,
-        "design_hash": structure.design_hash,
-        "unknowns": structure.unknowns,
-        "length_unit": design.length_unit,
-        "remarks": [],
-        "parts": [],
-        **facts_of_kind,
-        "frequencies": frequencies,
-        "loads": [_load_facts(structure, name, response) for name, response in responses.items()],
-    }
-
-
-def _load_facts(
-    structure: "parts.AffineStructure", name: str, response: "parts.AffineResponse"
-) -> dict[str, Any]:
-    """Return the facts about a load and the response to it alone, by name."""
-    strains = response.strain.tolist()
-    displacements = response.output.tolist()
-    return {
-        "name": name,
-        "control": structure.loads[name],
-        "value": structure.control_value_alone(name),
-        "largest_displacement": response.largest,
-        "strain": dict(zip(structure.gauges, strains, strict=True)),
-        "output": dict(zip(structure.displacements, displacements, strict=True)),
-    }
-
-
-def _mesh_facts(structure: "parts.Structure") -> dict[str, Any]:
-    """Return the facts about a structure from a mesh, by name."""
-    mesh = structure.mesh
-    mass, centre = parts.mass_and_centre(structure)
-    return {
-        "mesh": structure.design.mesh,
-        "remarks": list(mesh.remarks),
-        "kind": mesh.kind.name,
-        "linear_elements": not mesh.kind.edges,
-        "elements": len(mesh.cells),
-        "nodes": len(mesh.points),
-        "loose_nodes": mesh.loose.tolist(),
-        "held": mesh.unknowns - structure.unknowns,
-        "memory": parts.memory_estimate(mesh),
-        "mass": mass,
-        "centre_of_gravity": (centre / mesh.unit).tolist(),
-        "lower": (mesh.points.min(axis=0) / mesh.unit).tolist(),
-        "upper": (mesh.points.max(axis=0) / mesh.unit).tolist(),
-        "parts": [asdict(part) for part in _structure_parts(structure)],
-    }
-
-
-@dataclass(frozen=True)
-class StructurePart:
-    """A part of a structure, as it is listed.
-
-    Attributes
-    ----------
-    what : str
-        The kind of part.
-    name : str
-        Its name.
-    set : str or None
-        The set of the mesh that it is on.
-    count : int
-        How many elements, nodes or faces it has.
-    of : str
-        Which of these are counted.
-    note : str
-        A remark.
-    """
-
-    what: str
-    name: str
-    set: str | None
-    count: int
-    of: str
-    note: str = ""
-
-
-def _structure_parts(structure: "parts.Structure") -> Iterator[StructurePart]:
-    """Yield materials, damage regions, supports, loads, ports and gauges of a structure."""
-    design = structure.design
-    mesh = structure.mesh
-    for number, material in enumerate(design.material):
-        count = int((structure.material_of == number).sum())
-        note = f"scaled by {material.scaled_by}" if material.scaled_by else ""
-        yield StructurePart("material", material.name, material.set, count, "elements", note)
-    for number, damage in enumerate(design.damage):
-        count = int((structure.region_of == number).sum())
-        yield StructurePart("damage region", damage.name, damage.set, count, "elements")
-    for number, support in enumerate(design.support, start=1):
-        count = len(mesh.nodes_of(support.set, f"support[{number}]"))
-        notes = []
-        if support.rigid_about is not None:
-            notes.append("rigid")
-        if support.hold:
-            notes.append(f"holds {', '.join(support.hold)}")
-        if support.springs:
-            notes.append("springs")
-        yield StructurePart("support", str(number), support.set, count, "nodes", ", ".join(notes))
-    for load in design.load:
-        if load.set is not None:
-            nodes = mesh.nodes_of(load.set, load.name)
-            faces = len(mesh.faces_between(load.set, nodes))
-            count, counted = (faces, "faces") if faces else (len(nodes), "nodes")
-            yield StructurePart("load", load.name, load.set, count, counted)
-    for port in design.port:
-        if port.set is not None:
-            count = len(mesh.nodes_of(port.set, port.name))
-            yield StructurePart("port", port.name, port.set, count, "nodes")
-    for gauge, distance in zip(design.gauge, structure.gauges_moved.tolist(), strict=True):
-        note = ""
-        if distance > 1e-6 * mesh.size:
-            note = f"put onto the surface, {distance / mesh.unit:.3g} {mesh.unit_name} away"
-        yield StructurePart("gauge", gauge.name, "", 1, "place", note)
+        print_structure(record)
 
 
 def verify(
-    file: Path,
+    file: StructureArgument,
     *,
-    out: Path | None = None,
-    modes: int = 6,
-    memory_limit: float | None = None,
-    json: bool = False,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out", help="Folder for the decks and results of CalculiX; it must be empty."
+        ),
+    ] = None,
+    modes: ModeCountOption = 6,
+    memory_limit: MemoryLimitOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Solve the loads and the modes by CalculiX on the same mesh, and compare."""
-    parts.required_calculix()
+    """Solve the loads and the modes by CalculiX on the same mesh, and compare.
+
+    Example: `uav-twin structure verify bracket --out calculix`
+    """
+    from fe.verification.calculix_comparison import agreement as compare_with_calculix
+    from fe.verification.calculix_deck import structure_deck
+    from fe.verification.calculix_run import required_calculix
+    from fe.verification.wing_checks import Check
+    from uav_twin.check_table import exit_if_broken, print_checks
+
+    required_calculix()
     refuse_filled(out)
-    structure = assembled(file, memory_limit, mass_as_stiffness=True)
+    structure = _assemble_mesh(file, memory_limit, mass_as_stiffness=True)
     with (
         tempfile.TemporaryDirectory(prefix="uav-twin-") as scratch,
         stage("CalculiX on the same mesh"),
     ):
-        agreement = parts.agreement(parts.structure_deck(structure), out or Path(scratch), modes)
+        agreement = compare_with_calculix(structure_deck(structure), out or Path(scratch), modes)
     checks = []
     for load, differences in agreement.loads.items():
         for response, difference in differences.items():
-            checks.append(parts.Check(f"load {load}", response, difference, RESPONSE_LIMIT))
+            checks.append(Check(f"load {load}", response, difference, RESPONSE_LIMIT))
     mode_count = len(agreement.ours)
-    checks.append(
-        parts.Check(f"{mode_count} modes", "frequencies", agreement.modal, FREQUENCY_LIMIT)
-    )
-    record = {
-        "checks": [
+    checks.append(Check(f"{mode_count} modes", "frequencies", agreement.modal, FREQUENCY_LIMIT))
+    if json:
+        check_records = [
             {
                 "of": check.group,
                 "what": check.name,
@@ -250,33 +163,43 @@ def verify(
                 "limit": check.limit,
             }
             for check in checks
-        ],
-        "frequencies": {
-            "ours": agreement.ours.tolist(),
-            "calculix": agreement.calculix.tolist(),
-        },
-        "passed": all(check.passed for check in checks),
-    }
-    answer("checks", record=record, json=json, checks=checks)
-    if out is not None and not json:
-        terminal.say(f"Wrote the decks and results of CalculiX to {out}")
-    end_with(checks)
+        ]
+        frequencies = {"ours": agreement.ours.tolist(), "calculix": agreement.calculix.tolist()}
+        passed = all(check.passed for check in checks)
+        terminal.print_json({"checks": check_records, "frequencies": frequencies, "passed": passed})
+    else:
+        print_checks(checks)
+        if out is not None:
+            terminal.say(f"Wrote the decks and results of CalculiX to {out}")
+    exit_if_broken(checks)
 
 
 def field(
-    file: Path,
+    file: StructureArgument,
     *,
-    out: Path,
-    at: list[str] | None = None,
-    replace: bool = False,
-    memory_limit: float | None = None,
+    out: Annotated[Path, typer.Option("--out", show_default=False, help="The VTU file to write.")],
+    at: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--at",
+            metavar="NAME=VALUE",
+            help="A parameter, loss, mass or control that is not nominal; may come again.",
+        ),
+    ] = None,
+    replace: ReplaceOption = False,
+    memory_limit: MemoryLimitOption = None,
 ) -> None:
-    """Solve the full structure under all its loads, and write its field as VTU for ParaView."""
+    """Solve the full structure under all its loads, and write its field as VTU for ParaView.
+
+    Example: `uav-twin structure field bracket --out bracket.vtu --at z_heel=0.4`
+    """
+    from fe.structure.operators import write_structure_vtu
+
     refuse_existing(out, replace=replace)
-    structure = assembled(file, memory_limit)
+    structure = _assemble_mesh(file, memory_limit)
     values = _values_at(at or (), structure.ranges)
     with stage("Solving and writing the field"):
-        parts.write_structure_vtu(out, structure, values)
+        write_structure_vtu(out, structure, values)
     terminal.say(
         f"{out}: {len(structure.mesh.cells):,} cells, displacement, strain, material, region, loss"
     )
@@ -318,27 +241,66 @@ def _values_at(texts: Sequence[str], ranges: Mapping[str, tuple[float, float]]) 
 
 
 def reduce(
-    file: Path, *, states: int = 4, memory_limit: float | None = None, json: bool = False
+    file: StructureArgument,
+    *,
+    states: Annotated[
+        int,
+        typer.Option(
+            "--states",
+            min=0,
+            max=1000,
+            help="Random states at which it is compared with the full model.",
+        ),
+    ] = 4,
+    memory_limit: MemoryLimitOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Make the reduced model of a structure, keep it in the cache, and measure its errors."""
-    model = parts.reduced_model(located(file), memory_limit=in_bytes(memory_limit))
+    """Make the reduced model of a structure, keep it in the cache, and measure its errors.
+
+    Example: `uav-twin structure reduce bracket --states 10`
+    """
+    from fe.reduction.model_cache import reduced_model
+    from fe.reduction.reduced_basis import measured_errors
+
+    model = reduced_model(find_structure(file), memory_limit=_in_bytes(memory_limit))
     errors = None
     if states:
-        structure = assembled_of_any(file, memory_limit)
+        structure = _assemble(file, memory_limit)
         with stage("Comparing it with the full model"):
-            errors = parts.measured_errors(structure, model, states)
-    record = {
-        "name": model.name,
-        "design_hash": model.design_hash,
-        "static_basis": len(model.static_load.T),
-        "modal_basis": len(model.modal_load.T),
-        "ranges": {name: list(limits) for name, limits in model.validity.items()},
-        "errors": None if errors is None else asdict(errors),
-    }
-    answer("structure reduce", record=record, json=json, model=model, kinds=_input_kinds(model))
+            errors = measured_errors(structure, model, states)
+    if json:
+        terminal.print_json(
+            {
+                "name": model.name,
+                "design_hash": model.design_hash,
+                "static_basis": len(model.static_load.T),
+                "modal_basis": len(model.modal_load.T),
+                "ranges": {name: list(limits) for name, limits in model.validity.items()},
+                "errors": None if errors is None else asdict(errors),
+            }
+        )
+        return
+    _print_reduced_model(model)
+    if errors is not None:
+        _print_errors(errors)
 
 
-def _input_kinds(model: "parts.ReducedModel") -> dict[str, str]:
+def _print_reduced_model(model: "ReducedModel") -> None:
+    """Print the ranges of a reduced model's inputs, and how many vectors and outputs it has."""
+    kinds = _input_kinds(model)
+    rows = []
+    for (name, (low, high)), nominal in zip(model.validity.items(), model.nominal, strict=True):
+        rows.append((kinds[name], name, f"{low:g}", f"{nominal:g}", f"{high:g}"))
+    if rows:
+        terminal.print_table(("what", "name", "least", "nominal", "largest"), rows)
+    terminal.say(
+        f"{model.name}: {len(model.static_load.T)} static and {len(model.modal_load.T)} modal "
+        f"basis vectors; gauges {len(model.gauges)}, displacements {len(model.displacements)}, "
+        f"accelerations {len(model.accelerations)}, modes {model.mode_count}."
+    )
+
+
+def _input_kinds(model: "ReducedModel") -> dict[str, str]:
     """Return the kind of each input of a reduced model, by its name."""
     kinds = dict.fromkeys(model.parameters, "parameter")
     kinds |= dict.fromkeys(model.regions, "stiffness loss")
@@ -348,26 +310,64 @@ def _input_kinds(model: "parts.ReducedModel") -> dict[str, str]:
     return kinds
 
 
+def _print_errors(errors: "MeasuredErrors") -> None:
+    """Print the largest errors of a reduced model; those of outputs that it lacks are left out."""
+    values = {
+        "strains, of the largest": errors.strain,
+        "displacements, of the largest": errors.displacement,
+        "certified bound of both": errors.bound,
+        "frequencies": errors.frequency,
+    }
+    rows = [(name, f"{value:.2g}") for name, value in values.items() if not isnan(value)]
+    rows.append(("states in which an error exceeds its bound", str(errors.broken)))
+    terminal.print_table(("of", f"largest error at {errors.states} random states"), rows)
+
+
 def fmu(
-    file: Path,
+    file: StructureArgument,
     *,
-    out: Path | None = None,
-    kind: Literal["python", "compiled", "source"] = "python",
-    fmi: int = 2,
-    binding: Path | None = None,
-    rig: Path | None = None,
-    replace: bool = False,
-    memory_limit: float | None = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            help="The FMU to write; by default beside the structure file, with its name.",
+        ),
+    ] = None,
+    kind: FmuKindOption = "python",
+    fmi: FmiOption = 2,
+    binding: Annotated[
+        Path | None,
+        typer.Option("--binding", help="Write the binding of the FMU to this file, too."),
+    ] = None,
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            "--rig",
+            help="Write the file by which `calibrate campaign` and `discrepancy` take the FMU as a "
+            "model.",
+        ),
+    ] = None,
+    replace: ReplaceOption = False,
+    memory_limit: MemoryLimitOption = None,
 ) -> None:
-    """Pack the reduced model of a structure as an FMU; equal input gives equal bytes."""
+    """Pack the reduced model of a structure as an FMU; equal input gives equal bytes.
+
+    Example: `uav-twin structure fmu bracket --out bracket.fmu --binding bracket.toml`
+    """
+    from fe.reduction.model_cache import reduced_model
+    from fe.structure.design import load_structure
+    from fmu_asset.packing.contents import checked_target
+    from fmu_asset.packing.structure_fmu import build_fmu, check_form
+    from fmu_asset.structures import rig_text, structure_binding_text
+
     version: Literal[2, 3] = 3 if fmi == 3 else 2
-    parts.check_form(kind, version)
+    check_form(kind, version)
     if version == 3 and (binding is not None or rig is not None):
         raise typer.BadParameter(
             "--binding and --rig are for FMI 2.0; `uav-twin fmu bind` drafts a binding."
         )
-    source = located(file)
-    target = parts.checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
+    source = find_structure(file)
+    target = checked_target(file.with_suffix(".fmu") if out is None else out, replace=replace)
     used_paths = {source.resolve(): "the structure file", target.resolve(): "the FMU"}
     for option, path in (("--binding", binding), ("--rig", rig)):
         if path is None:
@@ -379,18 +379,23 @@ def fmu(
         used_paths[path.resolve()] = f"the file of {option}"
         refuse_existing(path, replace=replace, option=option)
     # texts of further files, before anything is built or written
-    design = parts.load_structure(source)
-    binding_text = parts.structure_binding_text(design) if binding is not None else ""
-    rig_text = parts.rig_text(design, relpath(target, rig.parent)) if rig is not None else ""
-    model = parts.reduced_model(source, memory_limit=in_bytes(memory_limit))
-    packed = parts.build_fmu(model, target, kind=kind, fmi=version, replace=replace)
-    show("packed", info=packed)
+    design = load_structure(source)
+    binding_text = structure_binding_text(design) if binding is not None else ""
+    model_text = rig_text(design, relpath(target, rig.parent)) if rig is not None else ""
+    model = reduced_model(source, memory_limit=_in_bytes(memory_limit))
+    print_packed_fmu(build_fmu(model, target, kind=kind, fmi=version, replace=replace))
     if binding is not None:
         atomic_write_text(binding, binding_text)
         terminal.say(f"{binding}: its binding")
     if rig is not None:
-        atomic_write_text(rig, rig_text)
+        atomic_write_text(rig, model_text)
         terminal.say(
             f"{rig}: the model of `uav-twin calibrate campaign` and "
             f"`discrepancy run CAMPAIGN --model {rig}`"
         )
+
+
+def print_packed_fmu(packed: "FmuInfo") -> None:
+    """Print the file of an FMU that was packed, its size and its GUID."""
+    design = f", design {packed.design_hash[:12]}" if packed.design_hash else ""
+    terminal.say(f"{packed.path}: {packed.size / 1024:.0f} KiB, GUID {packed.guid}{design}")

@@ -13,6 +13,7 @@ from discrepancy.catalogue.effect_in_setting import DYNAMIC
 from discrepancy.catalogue.entry import Effect, EffectParameter, Setting, ShapeParameter
 from discrepancy.errors import CatalogueError
 from fe.runtime.patch import SENSORS, ModelPatch, Window
+from reporting.choices import did_you_mean
 
 THEMES = (
     "structure",
@@ -100,6 +101,7 @@ def effect_by_identifier(identifier: str, effects: Iterable[Effect]) -> Effect:
     if identifier not in known:
         raise CatalogueError(
             f"The catalogue has no effect {identifier!r}; it has {', '.join(known)}."
+            f"{did_you_mean(identifier, known)}"
         )
     return known[identifier]
 

@@ -30,6 +30,7 @@ from discrepancy.system.lumped_sections import (
     as_list,
 )
 from discrepancy.system.model_file import ModelDescription
+from reporting.choices import did_you_mean
 from reporting.toml_file import Fault, Positive
 from reporting.words import counted
 
@@ -123,9 +124,10 @@ class LumpedDescription(ModelDescription):
         if not file.suffix and not file.exists():
             file = SHIPPED_MODELS / f"{path}.toml"
             if not file.exists():
-                shipped = ", ".join(sorted(model.stem for model in SHIPPED_MODELS.glob("*.toml")))
+                shipped = sorted(model.stem for model in SHIPPED_MODELS.glob("*.toml"))
                 raise ModelError(
-                    f"No lumped model is {str(path)!r}; shipped are {shipped}, or give a file."
+                    f"No lumped model is {str(path)!r}; shipped are {', '.join(shipped)}, or give "
+                    f"a file.{did_you_mean(str(path), shipped)}"
                 )
         return super().read(file)
 

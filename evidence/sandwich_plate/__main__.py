@@ -22,8 +22,7 @@ from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import run_command_line
-from uav_twin.options import show
-from uav_twin.structure import end_with
+from uav_twin.check_table import exit_if_broken, print_checks
 
 
 def compare(
@@ -36,8 +35,8 @@ def compare(
     wing = load_design(design)
     mesh = wing.changed(mesh={"refinement": QUICK_REFINEMENTS[0]}) if quick else wing
     checks = list(plate_checks(assemble(mesh), limited=not quick))
-    show("checks", checks=checks)
-    end_with(checks)
+    print_checks(checks)
+    exit_if_broken(checks)
 
 
 def plate_checks(operators: AffineOperators, *, limited: bool = True) -> Iterator[Check]:

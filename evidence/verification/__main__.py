@@ -22,8 +22,7 @@ from fe.wing.design import load_design
 from fe.wing.operators import AffineOperators, assemble
 from reporting import terminal
 from twin_master.command import run_command_line
-from uav_twin.options import show
-from uav_twin.structure import end_with
+from uav_twin.check_table import exit_if_broken, print_checks
 
 # R. H. MacNeal and R. L. Harder (1985), table 3, HEX20: in plane and out of plane.
 MACNEAL_HARDER = {"regular": (0.970, 0.961), "trapezoid": (0.886, 0.920), "parallelogram": (0.967, 0.941)}
@@ -39,8 +38,8 @@ def check(
         coarse = assemble(load_design(design).changed(mesh={"refinement": 0.25}))
         with tempfile.TemporaryDirectory(prefix="uav-twin-") as folder:
             checks += ring_down_checks(coarse, Path(folder), 0.25 if quick else 5.0)
-    show("checks", checks=checks)
-    end_with(checks)
+    print_checks(checks)
+    exit_if_broken(checks)
 
 
 def element_checks() -> Iterator[Check]:

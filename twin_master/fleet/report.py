@@ -16,8 +16,7 @@ import numpy as np
 from reporting.arrays import Float, Index
 from reporting.files import atomic_write_text
 from reporting.page import Page, PageColumn, Words, number_column
-from reporting.templates import in_one_line
-from reporting.words import counted
+from reporting.words import counted, in_one_line
 from twin_master.errors import FleetError, TwinMasterError
 from twin_master.fleet.configuration import KIND, WATCHED_KIND, fleet_config
 from twin_master.fleet.flight import endings_of

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from reporting.figures import to_png, to_svg
 from reporting.files import atomic_write_bytes, atomic_write_text
 from reporting.page import Page, ReportFigure
-from reporting.templates import in_one_line
+from reporting.words import in_one_line
 from twin_master.assets.asset_source import calibration_sentence
 from twin_master.assets.reduced_model import FIELD_NAME
 from twin_master.errors import RunFolderError

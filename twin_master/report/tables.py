@@ -7,8 +7,7 @@ import numpy as np
 
 from reporting.arrays import Float
 from reporting.page import Page, PageColumn, Table, number_column
-from reporting.templates import in_one_line
-from reporting.words import between, listing, number
+from reporting.words import between, in_one_line, listing, number
 from twin_master.report.captions import WORDS
 from twin_master.report.learnt import (
     mean_and_interval,

@@ -7,6 +7,7 @@ from math import prod
 from pathlib import Path
 from typing import Any
 
+from reporting.choices import did_you_mean
 from reporting.former_names import with_present_names
 from reporting.toml_file import read_toml, validate
 from reporting.words import brief
@@ -156,7 +157,7 @@ def find_scenario(name: str) -> Path:
         return path
     raise ScenarioError(
         f"There is no scenario `{name}`: give the path of a TOML file or one of "
-        f"{', '.join(shipped)}."
+        f"{', '.join(shipped)}.{did_you_mean(name, shipped)}"
     )
 
 

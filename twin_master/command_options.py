@@ -1,0 +1,73 @@
+"""Arguments and options that several commands on missions share, as annotations for Typer."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from scenarios import scenario_files
+
+
+def complete_scenario(incomplete: str) -> list[str]:
+    """Return the shipped scenarios whose names begin with what was typed, for the shell."""
+    return [name for name in scenario_files() if name.startswith(incomplete)]
+
+
+ScenarioArgument = Annotated[
+    str,
+    typer.Argument(
+        show_default=False,
+        metavar="SCENARIO",
+        autocompletion=complete_scenario,
+        help="A shipped scenario, or a TOML file.",
+    ),
+]
+
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--calibration",
+        help="Fly with this calibration, a calibration.nc of `uav-twin calibrate`.",
+    ),
+]
+CertificateOption = Annotated[
+    Path | None,
+    typer.Option("--ca-file", help="Certificate of the authority of an mqtts:// broker."),
+]
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        help="Fly on the Dask cluster of this scheduler, such as tcp://host:8786.",
+    ),
+]
+FleetFolderOption = Annotated[
+    Path | None, typer.Option("--out", show_default="runs/NAME", help="The folder to make.")
+]
+LibraryOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--library",
+        help="Believe this observation library, made by `uav-twin library sample`.",
+    ),
+]
+SeedOption = Annotated[
+    int | None,
+    typer.Option("--seed", min=0, help="Seed of the run; by default that of the scenario."),
+]
+FleetSeedOption = Annotated[
+    int | None, typer.Option("--seed", min=0, help="Seed, in the place of that of the file.")
+]
+ViewOption = Annotated[
+    bool,
+    typer.Option("--view", help="Show the flight in a browser of this machine while it goes on."),
+]
+WorkersOption = Annotated[
+    int | None,
+    typer.Option(
+        "--workers",
+        min=0,
+        show_default="one for each processor",
+        help="Worker processes; 0 flies in this process.",
+    ),
+]
