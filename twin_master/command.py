@@ -337,14 +337,8 @@ def run_command_line(application: Callable[[], None], *further_errors: type[Exce
     except Exception as error:
         if terminal.loudness.verbose:
             traceback.print_exc()
-        our_errors = (
-            TwinMasterError,
-            parts.FmuError,
-            parts.FiniteElementError,
-            parts.CalibrationError,
-            ReportingError,
-            *further_errors,
-        )
+        lower_layers = (parts.FmuError, parts.FiniteElementError, parts.CalibrationError)
+        our_errors = (TwinMasterError, ReportingError, *lower_layers, *further_errors)
         # The system's refusals, such as a full disk, are no defects of the program either.
         if not isinstance(error, (OSError, *our_errors)):
             raise
@@ -560,7 +554,7 @@ def _print_decision(watched: "parts.Watch", decision: Decision, *, flush: bool) 
         return _write_to_output(json.dumps(decision) + "\n", flush=flush)
     if "control" not in decision:  # before the first observation nothing is decided
         return True
-    return _write_to_output(decision_line(watched.scenario, decision) + "\n", flush=True)
+    return _write_to_output(parts.decision_line(watched.scenario, decision) + "\n", flush=True)
 
 
 def _write_to_output(text: str, *, flush: bool) -> bool:
@@ -575,22 +569,6 @@ def _write_to_output(text: str, *, flush: bool) -> bool:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return False
     return True
-
-
-def decision_line(scenario: "parts.Scenario", decision: Decision) -> str:
-    """Return a decision as a line of text for people."""
-    health = "no state is believed"
-    if decision.get("state_believed", True):
-        texts = parts.health_in_words(decision)
-        health = ", ".join(f"{name} {text}" for name, text in texts.items())
-    line = (
-        f"{scenario.mission.step_name} {decision['step']}: {decision['control']}, {health}; "
-        f"next {decision['next_control']} with probability {decision['probability']:.3f}"
-    )
-    hypothesis = decision.get("decided_by", "model")
-    if hypothesis == "model":
-        return line
-    return f"{line}; by {hypothesis} ({decision['hypotheses'][hypothesis]:.2f})"
 
 
 def view(
@@ -645,15 +623,9 @@ def list_scenarios() -> None:
     for name, path in files.items():
         scenario = parts.load_scenario(path).scenario
         levels = {factor.name: len(factor.levels) for factor in scenario.state}
-        rows.append(
-            [
-                name,
-                scenario.mission.title,
-                str(scenario.mission.steps),
-                _levels_in_words(levels),
-                ", ".join(scenario.control_names),
-            ]
-        )
+        controls = ", ".join(scenario.control_names)
+        steps = str(scenario.mission.steps)
+        rows.append([name, scenario.mission.title, steps, _levels_in_words(levels), controls])
     terminal.print_table(["scenario", "title", "steps", "states", "controls"], rows)
     folder = next(iter(files.values())).parent
     terminal.say(f"The files, to copy and change: {folder}")

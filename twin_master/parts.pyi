@@ -38,6 +38,7 @@ from twin_master.fleet.view import serve_fleet as serve_fleet
 from twin_master.fleet.watched_asset import WatchedAsset as WatchedAsset
 from twin_master.fleet.watched_asset import counts_of as counts_of
 from twin_master.fleet.watching import FleetWatch as FleetWatch
+from twin_master.mission.decision_record import decision_line as decision_line
 from twin_master.mission.decision_record import health_in_words as health_in_words
 from twin_master.mission.planning import ComparedPolicy as ComparedPolicy
 from twin_master.mission.planning import compare_simple_rules as compare_simple_rules

@@ -92,3 +92,19 @@ def health_in_words(decision: Mapping[str, Any]) -> dict[str, str]:
         deviation = scale * moments["standard_deviation"]
         texts[name] = f"{mean:{digits}} ± {deviation:{digits}} {unit}"
     return texts
+
+
+def decision_line(scenario: Scenario, decision: Mapping[str, Any]) -> str:
+    """Return a decision as a line of text for people."""
+    health = "no state is believed"
+    if decision.get("state_believed", True):
+        texts = health_in_words(decision)
+        health = ", ".join(f"{name} {text}" for name, text in texts.items())
+    line = (
+        f"{scenario.mission.step_name} {decision['step']}: {decision['control']}, {health}; "
+        f"next {decision['next_control']} with probability {decision['probability']:.3f}"
+    )
+    hypothesis = decision.get("decided_by", "model")
+    if hypothesis == "model":
+        return line
+    return f"{line}; by {hypothesis} ({decision['hypotheses'][hypothesis]:.2f})"

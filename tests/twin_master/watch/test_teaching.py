@@ -15,8 +15,8 @@ from fe.runtime.patch import ModelPatch, SensorGain, SensorSaturation
 from reporting.figures import new_figure, to_svg
 from tests.twin_master.runs import check_same, figures_of, journal, patch_record, written
 from tests.twin_master.watch.conftest import ran, viewed, wait_until, watchful, write_csv
-from twin_master.command import decision_line
 from twin_master.errors import MissionInputError
+from twin_master.mission.decision_record import decision_line
 from twin_master.mission.journal import JOURNAL_NAME
 from twin_master.mission.preparation import load_knowledge, save_knowledge
 from twin_master.mission.replay import replay
